@@ -1,0 +1,20 @@
+"""Shared fixtures: where real sequences are, one thread for the same bytes everywhere."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def v3d_data() -> Path:
+    """Folder of real and composed sequences: ``$V3D_DATA``, else ``../shared/data`` beside the checkout."""
+    root = Path(os.environ.get("V3D_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not root.is_dir():
+        pytest.skip(f"no real data: {root} is not there; set V3D_DATA to a folder of TUM-layout sequences")
+    return root

@@ -1,0 +1,134 @@
+"""Chamfer distance against the full distance matrix and scikit-learn's nearest neighbours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.neighbors import NearestNeighbors
+from torch import Tensor
+
+from v3d_torch.errors import InputError
+from v3d_torch.objects.chamfer import ChamferDistance, chamfer_distance
+
+DTYPES = [torch.float32, torch.float64]
+
+
+def matrix_reference(p: Tensor, q: Tensor) -> Tensor:
+    """The paper's equation with every distance written out."""
+    squares = (p[:, None] - q[None]).square().sum(dim=-1)
+    return squares.amin(dim=1).mean() + squares.amin(dim=0).mean()
+
+
+def random_pair(batch: int, n: int, m: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """Clouds of an object 3 m away, where float32 matrix products lose the digits of squared distances."""
+    generator = torch.Generator().manual_seed(n + m)
+    offset = torch.tensor([0.0, 0.0, 3.0], dtype=dtype)
+    p = torch.rand(batch, n, 3, generator=generator, dtype=dtype) + offset
+    return p, torch.rand(batch, m, 3, generator=generator, dtype=dtype) + offset + 0.01
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (300, 200)])
+def test_equals_the_equation(n: int, m: int, dtype: torch.dtype) -> None:
+    p, q = random_pair(3, n, m, dtype)
+    distance = chamfer_distance(p, q)
+    assert distance.dtype == dtype
+    expected = torch.stack([matrix_reference(a, b) for a, b in zip(p.double(), q.double(), strict=True)])
+    torch.testing.assert_close(distance.double(), expected, rtol=1e-12 if dtype == torch.float64 else 1e-5, atol=1e-9)
+
+
+def test_large_clouds() -> None:
+    p, q = random_pair(1, 20_000, 15_000, torch.float32)
+    distance = chamfer_distance(p, q)
+    a, b = p[0].double().numpy(), q[0].double().numpy()
+    expected = sum(
+        np.square(NearestNeighbors(n_neighbors=1, algorithm="ball_tree").fit(y).kneighbors(x)[0]).mean()
+        for x, y in [(a, b), (b, a)]
+    )
+    assert abs(float(distance) - expected) < 1e-6 * expected
+
+
+def test_memory_is_linear() -> None:
+    status = Path("/proc/self/status")
+    p, q = random_pair(1, 20_000, 15_000, torch.float32)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+    except OSError:
+        pytest.skip("the peak of memory can be reset on Linux only")
+
+    def kilobytes(key: str) -> int:
+        return int(status.read_text().split(f"{key}:")[1].split()[0])
+
+    before = kilobytes("VmRSS")
+    chamfer_distance(p, q)
+    assert kilobytes("VmHWM") - before < 100_000  # the distance matrix in float32: 1.2 GB
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    p=st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=1, max_size=80),
+    q=st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=1, max_size=80),
+)
+def test_any_clouds(p: list[tuple[int, int, int]], q: list[tuple[int, int, int]]) -> None:
+    clouds = [torch.tensor(cloud, dtype=torch.float64)[None] for cloud in (p, q)]
+    distance = chamfer_distance(*clouds)
+    torch.testing.assert_close(distance[0], matrix_reference(clouds[0][0], clouds[1][0]))
+    torch.testing.assert_close(distance, chamfer_distance(*clouds[::-1]))  # symmetric
+    assert chamfer_distance(clouds[0], clouds[0]).item() == 0
+
+
+def test_convention_sum_of_mean_squares() -> None:
+    p = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+    q = torch.tensor([[[0.0, 2.0, 0.0]]])
+    # p to q: (4 + 5) / 2; q to p: 4.
+    assert chamfer_distance(p, q).tolist() == [8.5]
+
+
+def test_padding_does_not_matter() -> None:
+    p, q = random_pair(4, 60, 50)
+    generator = torch.Generator().manual_seed(1)
+    p_valid = torch.rand(4, 60, generator=generator) < 0.6
+    q_valid = torch.rand(4, 50, generator=generator) < 0.6
+    p[~p_valid], q[~q_valid] = torch.nan, 3.0
+    distance = ChamferDistance()(p, q, p_valid, q_valid)
+    for b in range(4):
+        torch.testing.assert_close(distance[b], matrix_reference(p[b, p_valid[b]], q[b, q_valid[b]]))
+
+
+def test_empty_is_undefined_and_leaves_gradients_alone() -> None:
+    p, q = (cloud.requires_grad_() for cloud in random_pair(3, 6, 5))
+    q_valid = torch.ones(3, 5, dtype=torch.bool)
+    q_valid[1] = False
+    distance = chamfer_distance(p, q, q_valid=q_valid)
+    assert distance.isnan().tolist() == [False, True, False]
+    distance[[0, 2]].sum().backward()
+    assert p.grad is not None and p.grad.isfinite().all() and p.grad[0].any() and not p.grad[1].any()
+    assert chamfer_distance(torch.zeros(2, 0, 3), torch.zeros(2, 4, 3)).isnan().all()
+    assert chamfer_distance(torch.zeros(0, 3, 3), torch.zeros(0, 4, 3)).shape == (0,)
+
+
+def test_gradcheck() -> None:
+    p, q = (cloud.requires_grad_() for cloud in random_pair(2, 7, 5))
+    p_valid = torch.ones(2, 7, dtype=torch.bool)
+    p_valid[0, 4:] = False
+    assert torch.autograd.gradcheck(lambda p, q: chamfer_distance(p, q, p_valid), (p, q))
+
+
+def test_order_of_points_does_not_matter_and_runs_repeat() -> None:
+    p, q = random_pair(2, 400, 300, torch.float32)
+    shuffled = torch.randperm(400, generator=torch.Generator().manual_seed(2))
+    distance = chamfer_distance(p, q)
+    assert torch.equal(distance, chamfer_distance(p, q))
+    torch.testing.assert_close(distance, chamfer_distance(p[:, shuffled], q))
+
+
+def test_refuses_points_that_are_not_finite() -> None:
+    p, q = random_pair(1, 4, 4)
+    q[0, 1, 0] = torch.inf
+    with pytest.raises(InputError, match="not finite"):
+        chamfer_distance(p, q)

@@ -1,0 +1,80 @@
+"""The configuration: layers, refusals, round trip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from v3d_torch.config import Config, dump_config, load_config
+from v3d_torch.errors import ConfigError
+
+
+def test_the_command_line_goes_over_the_file_over_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("seed: 3\nobjects:\n  voting:\n    vote_threshold: 4\n    distance_threshold: 0.1\n")
+    config = load_config(file, ["objects.voting.distance_threshold=0.05"])
+    assert (config.seed, config.objects.voting.vote_threshold) == (3, 4)
+    assert config.objects.voting.distance_threshold == 0.05
+    assert config.objects.clouds == Config().objects.clouds
+
+
+def test_a_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
+    config = load_config(None, ["objects.voting.baselines=[0.0, 0.5]", "loop.enabled=false"])
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_config(config))
+    assert load_config(file) == config
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("objects.votng.vote_threshold=2", "did you mean objects.voting?"),
+        ("objects.voting.votes=2", "did you mean objects.voting.vote_threshold?"),
+        ("sed=2", "did you mean seed?"),
+        ("seed", "write section.key=value"),
+        ("seed=-1", "greater than or equal to 0"),
+        ("seed=abc", "valid integer"),
+        ("objects=3", "valid dictionary"),
+        ("seed=[", "not valid YAML"),
+        ("segmentation.height=481", "multiple of 32"),
+    ],
+)
+def test_what_is_wrong_is_refused_with_the_cure(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match="--set") as raised:
+        load_config(None, [override])
+    assert message in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("!!python/object/apply:os.system ['true']", "not valid YAML"),
+        ("- 1\n- 2\n", "holds a list"),
+        ("seeed: 1\n", "did you mean seed?"),
+    ],
+)
+def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match="bad.yaml") as raised:
+        load_config(file)
+    assert message in str(raised.value)
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read"):
+        load_config(tmp_path / "none.yaml")
+
+
+def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "empty.yaml"
+    file.write_text("# nothing\n")
+    assert load_config(file) == Config()
+
+
+def test_every_shipped_configuration_loads() -> None:
+    files = sorted((Path(__file__).parents[1] / "configs").rglob("*.yaml"))
+    assert files
+    for file in files:
+        load_config(file)

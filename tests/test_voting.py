@@ -1,0 +1,147 @@
+"""Hough voting against Algorithm 1 of the paper as it is printed, with dictionaries."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from v3d_torch.objects.voting import HoughVoting, hough_vote
+
+Objects = dict[str, tuple[float, float, float]]
+
+
+def pairwise_center_dist(objects: Objects) -> dict[tuple[str, str], float]:
+    """Distance from every object to every other; the first of a key is the object that gets the vote."""
+    return {(i, j): math.dist(objects[i], objects[j]) for i in objects for j in objects if i != j}
+
+
+def algorithm_1(previous: Objects, current: Objects, T_d: float, T_v: int) -> tuple[dict[str, int], set[str]]:
+    """Accumulator and dynamic objects."""
+    dist_p, dist_c = pairwise_center_dist(previous), pairwise_center_dist(current)
+    accumulator: dict[str, int] = defaultdict(int)
+    for k_p in dist_p:
+        for k_c in dist_c:
+            if k_p == k_c and abs(dist_p[k_p] - dist_c[k_c]) >= T_d:
+                accumulator[k_c[0]] += 1
+    return accumulator, {key for key, votes in accumulator.items() if votes >= T_v}
+
+
+def scene(count: int, moving: list[int], by: float, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Objects in a room from two poses of the camera; some have moved ``by`` metres along x."""
+    generator = torch.Generator().manual_seed(seed)
+    world = 3 * torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    moved = world.clone()
+    moved[moving, 0] += by
+    turn = torch.from_numpy(Rotation.from_rotvec([0.1, -0.4, 0.2]).as_matrix())
+    return world, moved @ turn.T + torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    names=st.lists(st.sampled_from("abcdefgh"), unique=True),
+    data=st.data(),
+    T_v=st.integers(1, 4),
+)
+def test_equals_algorithm_1(names: list[str], data: st.DataObject, T_v: int) -> None:
+    frames: list[Objects] = []
+    seen = []
+    for _ in range(2):
+        seen.append(data.draw(st.lists(st.booleans(), min_size=len(names), max_size=len(names))))
+        centroid = st.tuples(*[st.integers(-3, 3).map(float)] * 3)
+        frames.append({name: data.draw(centroid) for name, is_seen in zip(names, seen[-1], strict=True) if is_seen})
+    nowhere = (math.nan,) * 3
+    rows = [torch.tensor([f.get(name, nowhere) for name in names], dtype=torch.float64).reshape(-1, 3) for f in frames]
+    present = torch.tensor(seen[0], dtype=torch.bool) & torch.tensor(seen[1], dtype=torch.bool)
+    result = hough_vote(*rows, present, distance_threshold=0.3, vote_threshold=T_v)
+    accumulator, dynamic = algorithm_1(*frames, T_d=0.3, T_v=T_v)
+    assert result.votes.tolist() == [accumulator[name] for name in names]
+    assert result.dynamic.tolist() == [name in dynamic for name in names]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_finds_the_one_that_moves_without_the_pose(dtype: torch.dtype) -> None:
+    previous, current = (frame.to(dtype) for frame in scene(6, [2], by=0.8))
+    result = hough_vote(previous, current, torch.ones(6, dtype=torch.bool), 0.02, vote_threshold=2)
+    assert result.votes.dtype == dtype
+    assert result.dynamic.tolist() == [False, False, True, False, False, False]
+    assert result.votes[2] == 5 and (result.votes[[0, 1, 3, 4, 5]] == 1).all()
+    still = result.change[[0, 1, 3, 4, 5]][:, [0, 1, 3, 4, 5]]
+    assert still.max() < 1e-5
+
+
+def test_convention_thresholds_are_reached_at_equality() -> None:
+    previous = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    current = torch.tensor([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0]])
+    result = HoughVoting(distance_threshold=0.5, vote_threshold=1)(previous, current, torch.ones(2, dtype=torch.bool))
+    assert result.dynamic.all()
+    assert result.change.tolist() == [[0.0, 0.5], [0.5, 0.0]]
+
+
+def test_leading_dimensions_and_absent_rows() -> None:
+    frames = [scene(5, [k], by=0.7, seed=k) for k in range(4)]
+    previous = torch.stack([p for p, _ in frames]).reshape(2, 2, 5, 3)
+    current = torch.stack([c for _, c in frames]).reshape(2, 2, 5, 3)
+    present = torch.rand(2, 2, 5, generator=torch.Generator().manual_seed(0)) < 0.8
+    previous[~present] = torch.nan
+    result = hough_vote(previous, current, present, 0.02, 2)
+    assert result.pair.shape == result.change.shape == (2, 2, 5, 5)
+    for i in range(2):
+        for j in range(2):
+            rows = present[i, j]
+            alone = hough_vote(
+                previous[i, j, rows], current[i, j, rows], torch.ones(rows.sum(), dtype=torch.bool), 0.02, 2
+            )
+            torch.testing.assert_close(result.votes[i, j, rows], alone.votes)
+            assert torch.equal(result.dynamic[i, j, rows], alone.dynamic)
+    assert not result.votes[~present].any() and not result.dynamic[~present].any()
+    assert not result.change.isnan().any()
+
+
+def test_permutation_of_objects_moves_the_votes_with_them() -> None:
+    previous, current = scene(7, [1, 4], by=0.6)
+    order = torch.randperm(7, generator=torch.Generator().manual_seed(5))
+    everyone = torch.ones(7, dtype=torch.bool)
+    votes = hough_vote(previous, current, everyone, 0.05, 2).votes
+    assert torch.equal(hough_vote(previous[order], current[order], everyone, 0.05, 2).votes, votes[order])
+
+
+def test_soft_vote_becomes_hard_as_it_cools() -> None:
+    previous, current = scene(6, [0, 3], by=0.9)
+    everyone = torch.ones(6, dtype=torch.bool)
+    hard = hough_vote(previous, current, everyone, 0.05, 2)
+    soft = hough_vote(previous, current, everyone, 0.05, 2, temperature=1e-5)
+    torch.testing.assert_close(soft.votes, hard.votes, atol=1e-3, rtol=0.0)
+    at_threshold = hough_vote(previous, current, everyone, float(hard.change[0, 1]), 2, temperature=0.1)
+    assert at_threshold.pair[0, 1] == pytest.approx(0.5)
+    assert not at_threshold.pair.diagonal().any()  # nobody votes for himself, not even softly
+
+
+def test_gradcheck_and_gradients_with_absent_and_coinciding_objects() -> None:
+    previous, current = (frame.requires_grad_() for frame in scene(5, [1], by=0.5))
+    present = torch.tensor([True, True, True, True, False])
+
+    def soft(p: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+        result = hough_vote(p, c, present, 0.1, 2, temperature=0.05)
+        return result.votes, result.pair
+
+    # Only what has changed: at a change of 0 the absolute value has a kink.
+    assert torch.autograd.gradcheck(lambda p, c: soft(p, c)[1][1, [0, 2, 3]], (previous, current))
+
+    with torch.no_grad():
+        previous[4] = torch.nan
+        previous[3] = previous[2]
+    soft(previous, current)[0].sum().backward()
+    assert previous.grad is not None and previous.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_to_vote(count: int) -> None:
+    result = hough_vote(torch.rand(count, 3), torch.rand(count, 3), torch.ones(count, dtype=torch.bool), 0.1, 1)
+    assert result.votes.tolist() == [0.0] * count and not result.dynamic.any()

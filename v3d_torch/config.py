@@ -1,0 +1,329 @@
+"""Typed configuration: a section per stage, each constant with its unit and its reason.
+
+Values come from the defaults here, then a YAML file, then ``section.key=value`` from the command line; the resolved
+whole is written beside each result.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from v3d_torch.errors import ConfigError
+
+
+class Section(BaseModel):
+    """A part of the configuration: immutable, and refuses keys that it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SegmentationConfig(Section):
+    """Instance segmentation (paper, Sec. III-A)."""
+
+    source: Literal["yolo", "masks", "none"] = "yolo"
+    """Where instances come from: the network, a folder of id images, or nowhere (the baseline without masks)."""
+    model: Literal["yolov8n-seg", "yolo11n-seg", "yolo26n-seg"] = "yolov8n-seg"
+    """The paper names YOLOv8; the nano model is the one that runs on a CPU beside everything else."""
+    height: int = Field(480, gt=0, multiple_of=32)
+    """Rows of the network's input, pixels: the size of the usual RGB-D image, so that nothing is letterboxed."""
+    width: int = Field(640, gt=0, multiple_of=32)
+    """Columns of the network's input, pixels."""
+    score_threshold: float = Field(0.25, ge=0, le=1)
+    """Least class score. The paper leaves it open; 0.25 is the authors of YOLOv8's own. A missed person costs more
+    than a false one."""
+    iou_threshold: float = Field(0.7, ge=0, le=1)
+    """Boxes of one class that overlap more than this are one instance (non-maximum suppression; YOLOv8's own)."""
+    max_instances: int = Field(32, gt=0)
+    """Most instances kept in an image, by score: bounds memory, far above what a room shows."""
+    threads: int = Field(2, gt=0)
+    """Threads of the inference engine."""
+
+
+class DepthConfig(Section):
+    """Depth re-estimation (paper, Sec. III-B.1)."""
+
+    kernel_size: int = Field(5, gt=0)
+    """Side of the Gaussian window, pixels (the authors' code)."""
+    sigma: float = Field(1.0, gt=0)
+    """Standard deviation of the Gaussian, pixels (the authors' code)."""
+    edge: float = Field(0.05, gt=0)
+    """Neighbours whose depth differs by more than this share of the centre's lie behind an edge and stay out."""
+
+
+class CloudConfig(Section):
+    """Instance clouds and their outlier rejection (paper, Sec. III-B.2)."""
+
+    stride: int = Field(2, gt=0)
+    """Every n-th pixel of a mask becomes a point; 2 still puts several points into a voxel up to 5 m."""
+    max_depth: float = Field(6.0, gt=0)
+    """Farther points are left out, metres: a Kinect's depth is good to 10 cm there, as much as what is to be found."""
+    voxel_size: float = Field(0.02, gt=0)
+    """Side of a voxel, metres (the authors' code)."""
+    eps: float = Field(0.08, gt=0)
+    """DBSCAN's radius, metres: four voxels bridge the stripes of a Kinect at 4 m, not a person and the wall behind."""
+    min_samples: int = Field(5, gt=0)
+    """DBSCAN's core size, points."""
+    min_points: int = Field(30, gt=0)
+    """A cluster with fewer voxels is no object: its centroid would be noise."""
+
+
+class IdentityConfig(Section):
+    """Ids of objects over frames, and objects that the network misses for a while (paper, Sec. III)."""
+
+    max_distance: float = Field(0.8, gt=0)
+    """Centroids farther apart than this are two objects, metres: 4 m/s at 5 frames a second."""
+    max_gap: float = Field(0.5, gt=0)
+    """An object that is not seen is predicted for so long, seconds: about a step of a person who walks."""
+    velocity_gain: float = Field(0.5, gt=0, le=1)
+    """Share of the newest displacement in an object's velocity: halves the centroid noise, follows within 3 frames."""
+    history: float = Field(1.0, gt=0)
+    """Centroids are remembered for so long, seconds: bounds the longest baseline of the vote."""
+
+
+class VotingConfig(Section):
+    """Spatial-reasoned Hough voting (paper, Sec. III-C, Alg. 1)."""
+
+    enabled: bool = True
+    """Off for the ablation."""
+    distance_threshold: float = Field(0.05, gt=0)
+    """T_d, metres: a change of the distance between two centroids that counts as a vote."""
+    vote_threshold: int = Field(2, gt=0)
+    """T_v, votes that make an object dynamic (authors' code: more than one)."""
+    baselines: tuple[float, ...] = (0.0, 0.3)
+    """Distances now are compared with those so many seconds ago; 0 is the frame before, the paper's rule. A walker at
+    1 m/s changes by 3 cm in 1/30 s, no more than a centroid's noise, and by 30 cm in 0.3 s."""
+    withdraw: bool = True
+    """An object voted dynamic loses its own votes: else two walkers would outvote every chair."""
+    background: bool = True
+    """The background votes as one more object that never moves, seen through the camera's motion: it decides where
+    fewer than three objects are in view."""
+
+
+class ChamferConfig(Section):
+    """Intra-object motion by Chamfer distance (paper, Sec. III-D)."""
+
+    enabled: bool = True
+    """Off for the ablation."""
+    distance_threshold: float = Field(0.025, gt=0)
+    """Root mean nearest-neighbour distance that means deformation, metres: sqrt(D / 2) with D the paper's sum of two
+    mean squares. Two samplings of a still surface by 2 cm voxels differ by 1 cm, Kinect noise at 3 m adds as much."""
+    baseline: float = Field(0.3, ge=0)
+    """The cloud is compared with the one so many seconds ago; 0 is the frame before, the paper's rule."""
+    include_deforming: bool = False
+    """Whether features on deforming objects are kept. The paper's text says both; its code leaves them out."""
+
+
+class MaskConfig(Section):
+    """What is left out of tracking."""
+
+    confirm_still: float = Field(1.0, ge=0)
+    """A person is taken for moving until seen still for so long, seconds (the paper sets persons aside until judged)."""
+    hold_dynamic: float = Field(1.0, ge=0)
+    """An object judged dynamic or deforming stays so for this long after the last evidence, seconds: gaits pause."""
+    margin: int = Field(8, ge=0)
+    """Pixels by which a left-out mask grows: a network mask at a quarter of the resolution errs by about two of its
+    pixels, and an ORB patch near the border sees both sides."""
+
+
+class ObjectsConfig(Section):
+    """The object stage: clouds, ids, who moves."""
+
+    clouds: CloudConfig = CloudConfig()
+    identity: IdentityConfig = IdentityConfig()
+    voting: VotingConfig = VotingConfig()
+    chamfer: ChamferConfig = ChamferConfig()
+    mask: MaskConfig = MaskConfig()
+
+
+class FeaturesConfig(Section):
+    """ORB features (paper, Sec. III-A and III-E)."""
+
+    count: int = Field(2500, gt=0)
+    """Features asked of the detector. More than ORB-SLAM2's 1000: people take their share, and a feature that the
+    next frame detects again is worth more than one chosen well (three times as many inliers from frame to frame)."""
+    levels: int = Field(8, gt=0)
+    """Levels of the scale pyramid (ORB-SLAM2)."""
+    scale: float = Field(1.2, gt=1)
+    """Ratio of neighbouring levels (ORB-SLAM2)."""
+    cell: int = Field(32, gt=0)
+    """Side of the cells over which features are spread where not all are used, pixels."""
+    max_depth: float = Field(8.0, gt=0)
+    """Depth beyond is taken for none, metres: the Kinect's error there is 0.2 m and more."""
+
+
+class MotionConfig(Section):
+    """Camera motion between two frames (paper, Sec. III-E)."""
+
+    count: int = Field(1000, gt=0)
+    """Features of the earlier frame that are matched to all of the later one, spread over the image."""
+    max_ratio: float = Field(0.8, gt=0, le=1)
+    """Lowe's ratio between the best and the second Hamming distance."""
+    max_hamming: int = Field(64, gt=0, le=256)
+    """Farther descriptors do not match, bits of 256."""
+    epipolar_threshold: float = Field(2.0, gt=0)
+    """Sampson distance of inliers to the epipolar constraint, pixels."""
+    pnp_threshold: float = Field(4.0, gt=0)
+    """Reprojection error of inliers of PnP-RANSAC, pixels."""
+    iterations: int = Field(300, gt=0)
+    """Most hypotheses of either RANSAC: finds a sample of 5 at half outliers with probability 0.9999."""
+    min_inliers: int = Field(12, gt=0)
+    """Fewer do not make a motion."""
+
+
+class TrackingConfig(Section):
+    """Frames against the local map."""
+
+    search_radius: float = Field(10.0, gt=0)
+    """Radius around a landmark's projection in which it is looked for, pixels at level 0; grows with the level."""
+    max_hamming: int = Field(64, gt=0, le=256)
+    """Farther descriptors do not match, bits of 256."""
+    max_ratio: float = Field(0.9, gt=0, le=1)
+    """Lowe's ratio among the candidates within the radius."""
+    inverse_depth_sigma: float = Field(0.01, gt=0)
+    """Standard deviation of inverse depth, 1/m: a structured-light camera errs by this times z^2. On a still plane
+    that is 0.0014 (Khoshelham and Elberink, Sensors 2012); a hand-held camera's corners lie on depth edges, and its
+    colour and depth are taken at different times: what remains on TUM's fr1 has a median of 0.005."""
+    pixel_sigma: float = Field(1.0, gt=0)
+    """Standard deviation of a feature's place at level 0, pixels."""
+    min_inliers: int = Field(20, gt=0)
+    """Fewer landmarks found: the camera is lost."""
+    local_keyframes: int = Field(15, gt=0)
+    """Keyframes whose landmarks make up the local map."""
+
+
+class MappingConfig(Section):
+    """Keyframes and landmarks."""
+
+    max_gap: int = Field(20, gt=0)
+    """At the latest after so many frames there is a new keyframe, frames."""
+    min_tracked_ratio: float = Field(0.7, gt=0, le=1)
+    """A frame that finds fewer landmarks than this share of its reference keyframe's becomes a keyframe."""
+    min_tracked: int = Field(100, gt=0)
+    """So does one that finds fewer landmarks than this."""
+    restart_after: float = Field(1.0, gt=0)
+    """A camera lost for so long maps on from where it is guessed to be, seconds; its poses are flagged as adrift."""
+    max_landmark_depth: float = Field(4.0, gt=0)
+    """New landmarks lie nearer, metres: beyond, a single depth is worth little."""
+    landmarks_per_keyframe: int = Field(1000, gt=0)
+    """Landmarks that a keyframe sees at most, old and new (ORB-SLAM2's number of features)."""
+    bundle_keyframes: int = Field(8, ge=0)
+    """Keyframes that move in a local bundle adjustment; 0 turns it off."""
+    bundle_iterations: int = Field(5, gt=0)
+    """Levenberg-Marquardt steps of a local bundle adjustment."""
+
+
+class DenseMapConfig(Section):
+    """The coloured map of what stands still."""
+
+    stride: int = Field(4, gt=0)
+    """Every n-th pixel of a keyframe goes into the map."""
+    max_depth: float = Field(4.0, gt=0)
+    """Farther pixels stay out, metres: their noise would blur the map."""
+    voxel_size: float = Field(0.01, gt=0)
+    """Side of a voxel, metres: about the depth noise at 2 m."""
+
+
+class LoopConfig(Section):
+    """Loop closing and pose graph (paper, Sec. III-E)."""
+
+    enabled: bool = True
+    """Off for the ablation."""
+    candidates: int = Field(3, gt=0)
+    """Places looked at for each keyframe."""
+    min_gap: int = Field(10, gt=0)
+    """Keyframes nearer in time than this are no loop."""
+    min_inliers: int = Field(40, gt=0)
+    """Inliers of the geometric verification."""
+
+
+class Config(Section):
+    """The whole configuration of a run."""
+
+    seed: int = Field(0, ge=0)
+    """Seed of every random choice."""
+    threads: int = Field(2, gt=0)
+    """Threads of torch."""
+    segmentation: SegmentationConfig = SegmentationConfig()
+    depth: DepthConfig = DepthConfig()
+    objects: ObjectsConfig = ObjectsConfig()
+    features: FeaturesConfig = FeaturesConfig()
+    motion: MotionConfig = MotionConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    mapping: MappingConfig = MappingConfig()
+    loop: LoopConfig = LoopConfig()
+    dense_map: DenseMapConfig = DenseMapConfig()
+
+
+def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Defaults, then a YAML file, then ``section.key=value`` overrides.
+
+    Args:
+        path: YAML file with any part of the tree; None for the defaults.
+        overrides: texts such as ``objects.voting.distance_threshold=0.05``; values are read as YAML.
+
+    Raises:
+        ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        tree = _read_yaml(path)
+    for override in overrides:
+        _apply_override(tree, override)
+    source = f"{path}" if path is not None else "--set"
+    _refuse_unknown_keys(tree, Config, source)
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{source}: {key}: {first['msg'].lower()}, got {first['input']!r}") from error
+
+
+def dump_config(config: Config) -> str:
+    """The resolved configuration as YAML that `load_config` reads back."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path given as --config") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is not valid YAML ({str(error).splitlines()[0]})") from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: holds a {type(tree).__name__}; a configuration is a mapping of sections")
+    return tree
+
+
+def _apply_override(tree: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {override!r}: write section.key=value, such as objects.voting.vote_threshold=2")
+    *sections, leaf = key.strip().split(".")
+    for section in sections:
+        tree = tree.setdefault(section, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"--set {override!r}: {section!r} is a value, it has no keys below it")
+    try:
+        tree[leaf] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {override!r}: the value is not valid YAML") from error
+
+
+def _refuse_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
+    for key, value in tree.items():
+        field = section.model_fields.get(str(key))
+        if field is None:
+            near = difflib.get_close_matches(str(key), section.model_fields, n=1, cutoff=0.0)[0]
+            raise ConfigError(f"{source}: there is no {prefix}{key}; did you mean {prefix}{near}?")
+        if isinstance(value, Mapping) and isinstance(field.annotation, type) and issubclass(field.annotation, Section):
+            _refuse_unknown_keys(value, field.annotation, source, f"{prefix}{key}.")

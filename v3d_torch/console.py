@@ -1,0 +1,176 @@
+"""What the run command shows: progress, verdicts, scores, errors in one sentence."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from v3d_torch.config import load_config
+from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.base import RGBDSequence
+from v3d_torch.errors import InputError, V3DError
+from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.tables import paper_table
+from v3d_torch.mapping.recorder import Status
+from v3d_torch.objects.dynamics import Scene
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.results import write_results
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.coco import COCO_NAMES
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame
+
+_LOG = logging.getLogger("v3d_torch")
+
+
+@contextmanager
+def exit_on_error() -> Iterator[None]:
+    """Turn an error that the user can act on into one sentence on stderr and exit code 2."""
+    try:
+        yield
+    except V3DError as error:
+        Console(stderr=True, soft_wrap=True, highlight=False).print(f"[bold red]error:[/] {error}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        Console(stderr=True).print("[bold red]error:[/] interrupted before the first frame; nothing was computed")
+        sys.exit(2)
+
+
+def run_sequence(
+    name: str,
+    *,
+    data_root: Path | None,
+    camera: str | None,
+    config_path: Path | None,
+    overrides: Sequence[str],
+    masks: Path | None,
+    weights: Path | None,
+    out: Path | None,
+    save_masks: bool,
+) -> None:
+    """Run one sequence with everything shown and written; see ``python -m v3d_torch.run --help``.
+
+    Raises:
+        V3DError: on bad input, or when the sequence ended early (the results up to there are written).
+    """
+    console = Console(soft_wrap=True)
+    config = load_config(config_path, overrides)
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    with _progress(console) as progress:
+        sequence = load_sequence(name, data_root=data_root, camera=camera, progress=_Bar(progress, "sequence"))
+        segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
+    folder = _result_folder(out, sequence.name)
+    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), folder / "masks" if save_masks else None)
+    with _log_to(folder / "run.log"):
+        _LOG.info("%s: %d frames", sequence.name, len(sequence))
+        with _progress(console) as progress:
+            run = pipeline(_Verdicts(progress, len(sequence)))
+        evaluation = write_results(folder, pipeline)
+        if run.failure:
+            _LOG.error(run.failure)
+    console.print(_summary(pipeline, evaluation))
+    if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
+        console.print(table)
+    console.print(f"results: {folder}")
+    if run.failure:
+        raise InputError(f"{run.failure}; the results of the frames before are in {folder}")
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+class _Bar:
+    """A bar for a job that reports (done, total), such as a download."""
+
+    def __init__(self, progress: Progress, what: str) -> None:
+        self._progress, self._what = progress, what
+        self._task: TaskID | None = None
+
+    def __call__(self, done: int, total: int | None) -> None:
+        if self._task is None:
+            self._task = self._progress.add_task(self._what, note="")
+        self._progress.update(self._task, completed=done, total=total)
+
+
+class _Verdicts:
+    """The bar of a run: frames a second, and what the objects in view are judged to be."""
+
+    def __init__(self, progress: Progress, frames: int) -> None:
+        self._progress = progress
+        self._task = progress.add_task("tracking", total=frames, note="")
+        self._start = time.perf_counter()
+        self._frames = 0
+
+    def __call__(self, frame: RGBDFrame, scene: Scene, status: Status) -> None:
+        self._frames += 1
+        rate = self._frames / (time.perf_counter() - self._start)
+        verdicts = Counter(f"{COCO_NAMES[judged.label]} {judged.verdict.value}" for judged in scene.objects)
+        objects = ", ".join(f"{count} {what}" for what, count in sorted(verdicts.items()) if "static" not in what)
+        self._progress.update(self._task, advance=1, note=f"{rate:.1f} frames/s  {status.value}  {objects}")
+        _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, status.value, objects or "nothing moves")
+
+
+def _result_folder(out: Path | None, sequence: str) -> Path:
+    """The folder given, else a new one by the time, which ``latest`` beside it points to."""
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        return out
+    runs = Path("results") / sequence.replace("/", "_")
+    folder = runs / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    folder.mkdir(parents=True, exist_ok=True)
+    latest = runs / "latest"
+    latest.unlink(missing_ok=True)
+    latest.symlink_to(folder.name)
+    return folder
+
+
+@contextmanager
+def _log_to(path: Path) -> Iterator[None]:
+    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    _LOG.addHandler(handler)
+    _LOG.setLevel(logging.INFO)
+    _LOG.propagate = False
+    try:
+        yield
+    finally:
+        _LOG.removeHandler(handler)
+        handler.close()
+
+
+def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
+    slam, run = pipeline.slam, pipeline.run
+    statuses = Counter(slam.poses.statuses)
+    verdicts = Counter(str(row["verdict"]) for row in run.dynamics)
+    table = Table(title=f"V3D-SLAM on {pipeline.sequence.name}", show_header=False)
+    table.add_row("frames", f"{len(slam.poses.statuses)} of {len(pipeline.sequence)}")
+    table.add_row("found", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
+    table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes)}, {slam.loops.count}")
+    table.add_row("objects judged", ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none")
+    table.add_row("frames a second", f"{len(slam.poses.statuses) / run.seconds:.1f}" if run.seconds else "-")
+    if evaluation is not None:
+        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")
+        if evaluation.rpe is not None:
+            table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
+    return table

@@ -1,0 +1,122 @@
+"""Cameras from files: ``camera.yaml``, ``K.txt`` and the presets that come with the package."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.errors import InputError
+
+_PRESETS = resources.files("v3d_torch.datasets") / "presets"
+PRESETS: tuple[str, ...] = tuple(
+    sorted(entry.name.removesuffix(".yaml") for entry in _PRESETS.iterdir() if entry.name.endswith(".yaml"))
+)
+"""Names that `load_camera` knows without a file."""
+
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _CameraFile(BaseModel):
+    """The keys of a ``camera.yaml``; no default for what would be wrong without a word on another camera."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    fx: _Positive
+    fy: _Positive
+    cx: _Finite
+    cy: _Finite
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    distortion: tuple[_Finite, _Finite, _Finite, _Finite, _Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_scale: _Positive
+
+
+def load_camera(path_or_name: str | Path) -> PinholeCamera:
+    """Read a camera.
+
+    Args:
+        path_or_name: a preset (`PRESETS`, such as ``tum_fr3``), or a file. ``*.yaml`` holds the fields of
+            `PinholeCamera` by name. Any other file holds numbers: ``fx fy cx cy depth_scale width height``, or a 3x3
+            camera matrix, then of 640x480 pixels and 5000 depth units per metre.
+
+    Raises:
+        InputError: neither a preset nor a file, or a file without a camera in it.
+    """
+    if str(path_or_name) in PRESETS:
+        return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name))
+    path = Path(path_or_name)
+    if not path.is_file():
+        near = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
+        hint = f"did you mean {near[0]}?" if near else f"the presets are {', '.join(PRESETS)}"
+        raise InputError(f"{path_or_name}: is neither a camera file nor a preset; {hint}")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file; a camera is a YAML file or a K.txt") from error
+    return _from_yaml(text, str(path)) if path.suffix in (".yaml", ".yml") else _from_numbers(text, str(path))
+
+
+def find_camera(folder: Path) -> PinholeCamera:
+    """The camera of a sequence's folder: its ``camera.yaml``, its ``K.txt``, else the TUM camera that its name tells.
+
+    Raises:
+        InputError: the folder says nothing about its camera, or what it says is wrong.
+    """
+    for name in ("camera.yaml", "K.txt"):
+        if (folder / name).is_file():
+            return load_camera(folder / name)
+    if match := re.search(r"(?:freiburg|fr)_?([123])(?!\d)", folder.resolve().name.lower()):
+        return load_camera(f"tum_fr{match[1]}")
+    raise InputError(
+        f"{folder}: says nothing about its camera; put a camera.yaml there (fx, fy, cx, cy, width, height, depth_scale)"
+        f" or give --camera with a file or one of {', '.join(PRESETS)}"
+    )
+
+
+def _from_yaml(text: str, source: str) -> PinholeCamera:
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{source}: is not valid YAML ({str(error).splitlines()[0]})") from error
+    if not isinstance(tree, dict):
+        raise InputError(f"{source}: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys")
+    return _checked(tree, source)
+
+
+def _from_numbers(text: str, source: str) -> PinholeCamera:
+    words = re.sub(r"#.*", "", text).replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{source}: holds something that is not a number ({error})") from error
+    if len(numbers) == 7:
+        fx, fy, cx, cy, depth_scale, width, height = numbers
+    elif len(numbers) == 9 and numbers[1] == numbers[3] == numbers[6] == numbers[7] == 0.0 and numbers[8] == 1.0:
+        fx, cx, fy, cy = numbers[0], numbers[2], numbers[4], numbers[5]
+        depth_scale, width, height = PinholeCamera.depth_scale, PinholeCamera.width, PinholeCamera.height
+    else:
+        raise InputError(
+            f"{source}: holds {len(numbers)} numbers that are no camera; write fx fy cx cy depth_scale width height,"
+            " or a 3x3 camera matrix without skew"
+        )
+    fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, "depth_scale": depth_scale}
+    return _checked(fields, source)
+
+
+def _checked(fields: dict[Any, Any], source: str) -> PinholeCamera:
+    try:
+        return PinholeCamera(**_CameraFile.model_validate(fields).model_dump())
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{source}: {key}: {first['msg'].lower()}, got {first['input']!r}") from error

@@ -1,0 +1,109 @@
+"""The text files of the TUM layout: lists of stamped images, and pairs of them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from v3d_torch.datasets.association import associate
+from v3d_torch.datasets.images import is_depth
+from v3d_torch.errors import InputError
+
+_T = TypeVar("_T")
+
+MAX_DIFFERENCE = 0.02
+"""Colour and depth farther apart than this are no pair, seconds (the benchmark's own choice)."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A colour and a depth image that belong together; files relative to the sequence's folder."""
+
+    stamp: float
+    colour: str
+    depth: str
+
+
+def read_image_list(path: Path) -> list[tuple[float, str]]:
+    """Read lines of ``stamp file``, in order of time.
+
+    The file's name is all that follows the stamp, spaces included. Comments, blank lines, a byte order mark and either
+    line ending are allowed; of equal stamps the first counts.
+
+    Returns:
+        (seconds, file), stamps strictly increasing.
+
+    Raises:
+        InputError: the list cannot be read, is empty, or a line is not a stamp and a file.
+    """
+    entries = []
+    for number, line in _lines(path):
+        match = re.fullmatch(r"([^\s,]+)[\s,]+(.+)", line)
+        if match is None:
+            raise InputError(f"{path}: line {number} is {line[:80]!r} where a stamp and a file are expected")
+        entries.append((_stamp(match[1], path, number), match[2]))
+    return _in_order(entries, path)
+
+
+def read_associations(path: Path) -> list[Pair]:
+    """Read lines of ``stamp file stamp file``, in order of the colour stamps.
+
+    Colour may come first or depth: both are in use, and a look at the images of the first line tells.
+
+    Raises:
+        InputError: as `read_image_list`.
+    """
+    rows = []
+    for number, line in _lines(path):
+        # The first name ends with a suffix and a number follows: names may hold spaces.
+        match = re.fullmatch(r"([^\s,]+)[\s,]+(.+?\.\w+)[\s,]+([-+\d.e]+)[\s,]+(.+)", line)
+        if match is None:
+            raise InputError(f"{path}: line {number} is {line[:80]!r} where stamp, file, stamp, file are expected")
+        rows.append((_stamp(match[1], path, number), match[2], _stamp(match[3], path, number), match[4]))
+    if rows and is_depth(path.parent / rows[0][1]) and not is_depth(path.parent / rows[0][3]):
+        rows = [(stamp, colour, other, depth) for other, depth, stamp, colour in rows]
+    ordered = _in_order(((stamp, (colour, depth)) for stamp, colour, _, depth in rows), path)
+    return [Pair(stamp, *files) for stamp, files in ordered]
+
+
+def pair_images(colour: list[tuple[float, str]], depth: list[tuple[float, str]]) -> list[Pair]:
+    """Join two lists one to one by nearest stamps, at most `MAX_DIFFERENCE` apart; the colour stamp is the pair's."""
+    indices = associate([stamp for stamp, _ in colour], [stamp for stamp, _ in depth], MAX_DIFFERENCE)
+    return [Pair(*colour[i], depth[j][1]) for i, j in indices]
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Lines that hold something, with their numbers from 1."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file in UTF-8") from error
+    for number, line in enumerate(text.split("\n"), start=1):
+        if (line := line.strip()) and not line.startswith("#"):
+            yield number, line
+
+
+def _stamp(word: str, path: Path, number: int) -> float:
+    try:
+        stamp = float(word)
+    except ValueError:
+        stamp = math.nan
+    if not math.isfinite(stamp):
+        raise InputError(f"{path}: line {number} has {word!r} where a stamp in seconds is expected")
+    return stamp
+
+
+def _in_order(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[float, _T]]:
+    """Sorted by stamp, the first of equal ones kept."""
+    first: dict[float, _T] = {}
+    for stamp, value in entries:
+        first.setdefault(stamp, value)
+    if not first:
+        raise InputError(f"{path}: lists no images")
+    return sorted(first.items(), key=lambda entry: entry[0])

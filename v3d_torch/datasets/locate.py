@@ -1,0 +1,80 @@
+"""Where a sequence's folder is: given, among the user's data, in the cache, or to be downloaded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock
+
+from v3d_torch.datasets.names import canonical_name, download_url, short_name, unknown_name
+from v3d_torch.download import Progress, cache_dir, fetch
+from v3d_torch.errors import DownloadError, InputError, OutputError
+from v3d_torch.extract import extract_tar
+
+
+def sequence_folder(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
+    """The folder of a sequence.
+
+    Looked for in this order: ``name`` as a folder; in ``data_root``, else ``$V3D_DATA``; in the cache
+    (`v3d_torch.download.cache_dir`). In the latter two a folder may be called by any name of the sequence. Last, a TUM
+    sequence is downloaded into ``data_root`` where it is given, else into the cache; ``$V3D_DATA`` is only read, it may
+    be shared.
+
+    Raises:
+        InputError: no such folder and no such sequence.
+        DownloadError: the sequence is not here and cannot be downloaded; the message says how to get it by hand.
+    """
+    if (folder := Path(name).expanduser()).is_dir():
+        return folder
+    full_name = canonical_name(name)
+    shared = os.environ.get("V3D_DATA")
+    search = data_root or (Path(shared) if shared else cache_dir())
+    for root in (search, cache_dir()):
+        if found := _find(root, name, full_name):
+            return found
+    if full_name is None:
+        raise unknown_name(name)
+    put = f"by hand, unpack it and put the folder {full_name} into {search}"
+    if not download:
+        raise InputError(f"{short_name(full_name)} is not in {search}; get {download_url(full_name)} {put}")
+    try:
+        return _download(full_name, data_root or cache_dir(), progress)
+    except DownloadError as error:
+        raise DownloadError(f"{short_name(full_name)} is not in {search}: {error}; get that file {put}") from error
+
+
+def _find(root: Path, name: str, full_name: str | None) -> Path | None:
+    """A folder under ``root`` that is called so, or by another name of the same sequence."""
+    if (root / name).is_dir():
+        return root / name
+    if full_name is None or not root.is_dir():
+        return None
+    folders = (entry for entry in sorted(root.iterdir()) if canonical_name(entry.name) == full_name)
+    return next((folder for folder in folders if folder.is_dir()), None)
+
+
+def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
+    folder, archive = root / full_name, root / f"{full_name}.tgz"
+    with _alone(full_name):
+        if not folder.is_dir():
+            fetch(download_url(full_name), archive, progress=progress)
+            try:
+                extract_tar(archive, folder)
+            finally:
+                archive.unlink()
+    return folder
+
+
+@contextmanager
+def _alone(full_name: str) -> Iterator[None]:
+    """Let one process at a time download a sequence: two would write into the same file."""
+    lock = cache_dir() / f".{full_name}.lock"
+    try:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(lock):
+            yield
+    except OSError as error:
+        raise OutputError(f"{lock}: cannot be written ({error.strerror}); set V3D_CACHE to another folder") from error

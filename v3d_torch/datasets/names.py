@@ -1,0 +1,125 @@
+"""Names of the TUM RGB-D sequences: the full one, the short one of the paper's tables, and what people type."""
+
+from __future__ import annotations
+
+import difflib
+import re
+
+from v3d_torch.errors import InputError
+
+_PREFIX = "rgbd_dataset_"
+
+_SEQUENCES = {
+    "freiburg1": "360 desk desk2 floor plant room rpy teddy xyz",
+    "freiburg2": "360_hemisphere 360_kidnap coke desk desk_with_person dishes flowerbouquet"
+    " flowerbouquet_brownbackground large_no_loop large_with_loop metallic_sphere metallic_sphere2 pioneer_360"
+    " pioneer_slam pioneer_slam2 pioneer_slam3 rpy xyz",
+    "freiburg3": "cabinet large_cabinet long_office_household nostructure_notexture_far"
+    " nostructure_notexture_near_withloop nostructure_texture_far nostructure_texture_near_withloop"
+    " sitting_halfsphere sitting_rpy sitting_static sitting_xyz structure_notexture_far structure_notexture_near"
+    " structure_texture_far structure_texture_near teddy walking_halfsphere walking_rpy walking_static walking_xyz",
+}
+_WITHOUT_VALIDATION = {
+    "freiburg1_floor",
+    "freiburg1_teddy",
+    "freiburg2_large_no_loop",
+    "freiburg2_large_with_loop",
+    "freiburg2_coke",
+    "freiburg2_dishes",
+    "freiburg2_flowerbouquet",
+    "freiburg2_flowerbouquet_brownbackground",
+    "freiburg2_metallic_sphere",
+    "freiburg2_metallic_sphere2",
+    "freiburg2_pioneer_slam",
+    "freiburg2_pioneer_slam2",
+    "freiburg2_pioneer_slam3",
+    "freiburg3_teddy",
+}
+_PLAIN = [f"{camera}_{tail}" for camera, tails in _SEQUENCES.items() for tail in tails.split()]
+
+SEQUENCES: tuple[str, ...] = tuple(
+    _PREFIX + name for name in _PLAIN + [f"{name}_validation" for name in _PLAIN if name not in _WITHOUT_VALIDATION]
+)
+"""Every sequence of the benchmark, by its folder's name."""
+
+PAPER_SEQUENCES: tuple[str, ...] = tuple(
+    f"{_PREFIX}freiburg3_{people}_{motion}"
+    for people in ("sitting", "walking")
+    for motion in ("xyz", "halfsphere", "static", "rpy")
+)
+"""The eight sequences of the paper's evaluation (Sec. IV)."""
+
+_WORDS = {
+    "s": "sitting",
+    "sit": "sitting",
+    "w": "walking",
+    "walk": "walking",
+    "half": "halfsphere",
+    "hs": "halfsphere",
+    "stat": "static",
+    "str": "structure",
+    "nstr": "nostructure",
+    "tex": "texture",
+    "ntex": "notexture",
+    "val": "validation",
+}
+"""Short words for the parts of a name."""
+
+_TAILS = {
+    "office": "long_office_household",
+    "long_office": "long_office_household",
+    "person": "desk_with_person",
+    "desk_person": "desk_with_person",
+    "large_loop": "large_with_loop",
+    "nostructure_notexture_near": "nostructure_notexture_near_withloop",
+    "nostructure_texture_near": "nostructure_texture_near_withloop",
+}
+"""Short forms of what follows the camera in a name."""
+
+
+def canonical_name(name: str) -> str | None:
+    """The full name of a sequence, from any usual way to write it.
+
+    Args:
+        name: such as ``fr3/w/xyz``, ``fr3_walking_xyz``, ``freiburg3-walking-xyz``, ``walking_xyz`` (where only one
+            camera has it) or the full name.
+
+    Returns:
+        Such as ``rgbd_dataset_freiburg3_walking_xyz``; None when no sequence is called so.
+    """
+    text = re.sub(r"[\s/\\.\-_]+", "_", name.strip().lower()).strip("_").removeprefix("tum_").removeprefix(_PREFIX)
+    match = re.fullmatch(r"(?:(?:freiburg|fr)_?([123])_)?(.+)", text)
+    if match is None:
+        return None
+    camera = f"freiburg{match[1]}" if match[1] else r"freiburg\d"
+    words = [_WORDS.get(word, word) for word in match[2].split("_")]
+    validation = ["validation"] if words[-1] == "validation" else []
+    tail = "_".join(words[: len(words) - len(validation)])
+    tail = "_".join([_TAILS.get(tail, tail), *validation])
+    found = [full for full in SEQUENCES if re.fullmatch(_PREFIX + camera + "_" + re.escape(tail), full)]
+    return found[0] if len(found) == 1 else None
+
+
+def short_name(name: str) -> str:
+    """The name for tables: ``fr3/w/xyz`` as in the paper, ``fr1/desk``; a name that is no TUM sequence stays itself."""
+    full = canonical_name(name)
+    if full is None:
+        return name
+    camera, tail = full.removeprefix(_PREFIX).replace("freiburg", "fr").split("_", maxsplit=1)
+    tail = re.sub(r"^(s|w)(?:itting|alking)_", r"\1/", tail).replace("/halfsphere", "/half")
+    return f"{camera}/{tail}"
+
+
+def download_url(full_name: str) -> str:
+    """Where the benchmark keeps a sequence's archive."""
+    camera = full_name.removeprefix(_PREFIX).split("_")[0]
+    return f"https://cvg.cit.tum.de/rgbd/dataset/{camera}/{full_name}.tgz"
+
+
+def unknown_name(name: str) -> InputError:
+    """The error for a name that is neither a folder nor a sequence; it offers the nearest names."""
+    choices = {short_name(full): full for full in SEQUENCES}
+    spellings = {spelling: short for short, full in choices.items() for spelling in (short, full)} | {"demo": "demo"}
+    near = difflib.get_close_matches(name.strip().lower(), spellings, n=3, cutoff=0.5)
+    offers = list(dict.fromkeys(spellings[spelling] for spelling in near)) or ["demo", "fr3/w/xyz"]
+    return InputError(f"{name}: is neither a folder nor the name of a sequence; did you mean {' or '.join(offers)}?")

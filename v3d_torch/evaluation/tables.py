@@ -1,0 +1,99 @@
+"""The paper's tables I-III as data, and a result beside their rows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import NamedTuple
+
+import yaml
+from rich.table import Table
+
+from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
+from v3d_torch.evaluation.report import Evaluation
+
+
+class Score(NamedTuple):
+    """One entry of the paper's tables; None where it has a dash."""
+
+    rmse: float | None
+    sd: float | None
+
+
+_HEADINGS = {"ate": "ATE, m", "rpe_trans": "RPE, m/s", "rpe_rot": "RPE, deg/s"}
+
+
+@cache
+def paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
+    """The paper's numbers as ``[metric][sequence][method]``.
+
+    Metrics are ``ate`` (metres), ``rpe_trans`` (metres over 1 s) and ``rpe_rot`` (degrees over 1 s), sequences
+    ``fr3/s/xyz`` to ``fr3/w/rpy``, methods ``ORB-SLAM2`` to ``V3D-SLAM``.
+    """
+    tables = yaml.safe_load(files(__package__).joinpath("paper_tables.yaml").read_text(encoding="utf-8"))
+    return {
+        metric: {
+            sequence: {method: Score(*scores) for method, scores in row.items()} for sequence, row in table.items()
+        }
+        for metric, table in tables.items()
+    }
+
+
+def paper_sequence(name: str) -> str | None:
+    """Which of the paper's sequences a name or the path of a file speaks of.
+
+    Args:
+        name: such as ``fr3/w/xyz``, ``results/fr3_w_xyz/latest/trajectory.txt`` or ``freiburg3_walking_xyz``.
+
+    Returns:
+        Such as ``fr3/w/xyz``; None when it is none of the eight.
+    """
+    named = r"(?:freiburg|fr)_?3[/_-][a-z]+[/_-](?:xyz|half(?:sphere)?|static|rpy)(?![a-z]|_?validation)"
+    spoken = {canonical_name(text) for text in [name, *re.findall(named, name.lower())]}
+    found = [full for full in PAPER_SEQUENCES if full in spoken]
+    return short_name(found[0]) if len(found) == 1 else None
+
+
+def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
+    """Set a result beside the paper's rows for the same sequence, the best RMSE of each column in green.
+
+    Args:
+        sequence: name of the sequence, in any usual way to write it.
+        evaluation: of an estimate on it.
+
+    Returns:
+        None when the sequence is not in the paper.
+    """
+    short = paper_sequence(sequence)
+    if short is None:
+        return None
+    scores = paper_scores()
+    rows = {method: [scores[metric][short][method] for metric in _HEADINGS] for method in scores["ate"][short]}
+    rows["this result"] = _scores(evaluation)
+    best = [
+        min(score.rmse for score in column if score.rmse is not None) for column in zip(*rows.values(), strict=True)
+    ]
+
+    table = Table(title=f"{short}: the paper's tables and this result")
+    table.add_column("method")
+    for heading in _HEADINGS.values():
+        table.add_column(f"{heading} RMSE", justify="right")
+        table.add_column("SD", justify="right")
+    for method, row in rows.items():
+        cells = [cell for score, lowest in zip(row, best, strict=True) for cell in _cells(score, lowest)]
+        table.add_row(method, *cells, style="bold" if method == "this result" else None)
+    return table
+
+
+def _scores(evaluation: Evaluation) -> list[Score]:
+    """A result in the columns of the paper, whose RPE is over one second."""
+    rpe = evaluation.rpe if evaluation.rpe is not None and evaluation.rpe.delta == 1 else None
+    measured = [evaluation.ate, rpe.trans if rpe else None, rpe.rot if rpe else None]
+    return [Score(s.rmse, s.std) if s is not None else Score(None, None) for s in measured]
+
+
+def _cells(score: Score, lowest: float) -> tuple[str, str]:
+    rmse, sd = ("-" if value is None else f"{value:.4f}" for value in score)
+    return (f"[green]{rmse}[/]" if score.rmse == lowest else rmse), sd

@@ -1,0 +1,57 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.errors import OutputError
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Give a temporary name beside ``path`` to write to, and rename it to ``path`` when the block ends well.
+
+    The temporary name keeps the suffix, by which some writers choose the format.
+
+    Raises:
+        OutputError: when the folder cannot be written or the disk is full.
+    """
+    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror or error}); free the disk or choose another folder"
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write UTF-8 text whole or not at all.
+
+    Raises:
+        OutputError: see :func:`written_whole`.
+    """
+    with written_whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an 8-bit image, shape (H, W) or (H, W, 3) RGB, whole or not at all.
+
+    Raises:
+        OutputError: see :func:`written_whole`.
+    """
+    encoded = cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1]
+    with written_whole(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())

@@ -1,0 +1,1 @@
+"""Loop closing: places, pose graph (paper, Sec. III-E)."""

@@ -1,0 +1,119 @@
+"""Loop closing: recognise a place, verify it by geometry, correct the pose graph and the map with it (paper, Sec. III-E)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from v3d_torch.config import LoopConfig
+from v3d_torch.lie import invert
+from v3d_torch.loop.places import PlaceIndex
+from v3d_torch.loop.pose_graph import optimise_pose_graph
+from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.odometry.motion import MotionEstimator
+from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.tracker import MapTracker, Tracking
+
+
+@dataclass(frozen=True)
+class Place:
+    """A known place that a view was recognised to show.
+
+    Attributes:
+        keyframe: that saw it before.
+        tracking: the view's pose and landmarks in the map around that keyframe.
+    """
+
+    keyframe: Keyframe
+    tracking: Tracking
+
+
+class LoopCloser:
+    """Finds known places again, for a lost camera and for a camera that has come around.
+
+    Args:
+        config: how many candidates, how strict.
+        motion: registers two views by their features.
+        tracker: refines a pose in the map.
+        local_keyframes: keyframes that make up a local map.
+    """
+
+    _COVISIBLE = 30  # landmarks shared by two keyframes that the pose graph ties together (ORB-SLAM2 takes 100 of 2000)
+
+    def __init__(
+        self, config: LoopConfig, motion: MotionEstimator, tracker: MapTracker, local_keyframes: int
+    ) -> None:
+        self._config = config
+        self._motion = motion
+        self._tracker = tracker
+        self._local_keyframes = local_keyframes
+        self._index = PlaceIndex()
+        self._loops: list[tuple[int, int, Tensor]] = []
+
+    @property
+    def count(self) -> int:
+        """Loops closed so far."""
+        return len(self._loops)
+
+    def recognise(self, features: Features, sparse_map: SparseMap, exclude: Iterable[int] = ()) -> Place | None:
+        """Recognise where ``features`` were seen before, outside of the excluded keyframes.
+
+        Returns:
+            The first candidate that passes: a motion from its keyframe to the view, confirmed by the map around it.
+        """
+        for index, _ in self._index.query(features.descriptors, self._config.candidates, exclude):
+            keyframe = sparse_map.keyframes[index]
+            motion = self._motion(keyframe.features, features)
+            if motion is None:
+                continue
+            known = keyframe.landmarks[keyframe.landmarks >= 0]
+            local = sparse_map.local(known, self._local_keyframes)
+            carried = torch.full((len(features),), -1, dtype=torch.int64)
+            carried[motion.pairs[:, 1]] = keyframe.landmarks[motion.pairs[:, 0]]
+            tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, carried)
+            if tracking is not None and tracking.count >= self._config.min_inliers:
+                return Place(keyframe, tracking)
+        return None
+
+    def close(self, keyframe: Keyframe, sparse_map: SparseMap) -> Tensor | None:
+        """Look for a loop that ends at ``keyframe``, and correct keyframes and landmarks when there is one.
+
+        The keyframe becomes a place that can be recognised from now on.
+
+        Returns:
+            The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`; None without a loop.
+        """
+        place = self._find(keyframe, sparse_map) if self._config.enabled else None
+        self._index.add(keyframe.index, keyframe.features.descriptors)
+        if place is None:
+            return None
+        # T_ij is the pose of camera j in camera i: old keyframe i, new keyframe j, as the place says it.
+        T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
+        self._loops.append((place.keyframe.index, keyframe.index, T_ij))
+        T_cw_before = keyframe.T_cw
+        self._correct(sparse_map)
+        sparse_map.fuse(keyframe, place.tracking.landmarks)
+        for other in sparse_map.keyframes:
+            other.adrift &= place.keyframe.adrift
+        return invert(keyframe.T_cw) @ T_cw_before
+
+    def _find(self, keyframe: Keyframe, sparse_map: SparseMap) -> Place | None:
+        """A place seen before that neither time nor the map connects with the keyframe."""
+        near = sparse_map.shared(keyframe.landmarks[keyframe.landmarks >= 0]).nonzero()[:, 0].tolist()
+        recent = range(keyframe.index - self._config.min_gap, keyframe.index + 1)
+        return self.recognise(keyframe.features, sparse_map, {*near, *recent})
+
+    def _correct(self, sparse_map: SparseMap) -> None:
+        T_cw = torch.stack([keyframe.T_cw for keyframe in sparse_map.keyframes])
+        edges = sparse_map.covisibility(self._COVISIBLE)
+        measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
+        loops = torch.tensor([[i, j] for i, j, _ in self._loops])
+        solved = optimise_pose_graph(
+            invert(T_cw),
+            torch.cat([edges, loops]),
+            torch.cat([measured, torch.stack([T_ij for _, _, T_ij in self._loops])]),
+        )
+        sparse_map.move_keyframes(invert(solved.T_wc))

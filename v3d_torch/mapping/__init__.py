@@ -1,0 +1,1 @@
+"""The map: keyframes, landmarks, bundle adjustment, the pose of every frame."""

@@ -1,0 +1,224 @@
+"""The map: keyframes, landmarks, and who sees whom (ORB-SLAM2, Sec. III; Mur-Artal and Tardos, T-RO 2017)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import FeaturesConfig, MappingConfig
+from v3d_torch.lie import invert
+from v3d_torch.mapping.table import Table
+from v3d_torch.odometry.orb import Features, spread
+from v3d_torch.odometry.tracker import LocalMap, Tracking
+
+
+@dataclass
+class Keyframe:
+    """A frame that the map keeps.
+
+    Attributes:
+        index: number of the keyframe, from 0.
+        frame: index of its frame in the sequence.
+        stamp: seconds.
+        T_cw: world to camera, float64, shape :math:`(4, 4)`; the back end moves it.
+        features: on pixels that stood still.
+        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
+        adrift: whether only a guess joins it to the rest of the map.
+    """
+
+    index: int
+    frame: int
+    stamp: float
+    T_cw: Tensor
+    features: Features
+    landmarks: Tensor
+    adrift: bool = False
+
+
+class SparseMap:
+    """Keyframes and landmarks with their observations, as tables of tensors.
+
+    Args:
+        config: which landmarks are made.
+        features: scale pyramid of the features.
+        camera: lifts features with depth to landmarks.
+    """
+
+    def __init__(self, config: MappingConfig, features: FeaturesConfig, camera: PinholeCamera) -> None:
+        self._config = config
+        self._features = features
+        self._camera = camera
+        self.keyframes: list[Keyframe] = []
+        self.landmarks = Table(
+            point=((3,), torch.float64),
+            direction=((3,), torch.float64),
+            reach=((), torch.float64),
+            descriptor=((32,), torch.uint8),
+            keyframe=((), torch.int64),  # that made it
+            found=((), torch.int64),  # frames that matched it
+            visible=((), torch.int64),  # frames that should have
+            alive=((), torch.bool),
+        )
+        self.observations = Table(
+            keyframe=((), torch.int64),
+            landmark=((), torch.int64),
+            uv=((2,), torch.float64),
+            inverse_depth=((), torch.float64),
+            octave=((), torch.int64),
+            valid=((), torch.bool),  # until a bundle adjustment finds that it does not fit
+        )
+
+    def insert(self, frame: int, stamp: float, T_cw: Tensor, features: Features, landmarks: Tensor) -> Keyframe:
+        """Make a keyframe; features with depth that match no landmark become landmarks.
+
+        Args:
+            frame: index of the frame.
+            stamp: seconds.
+            T_cw: world-to-camera pose.
+            features: on pixels that stand still.
+            landmarks: id behind each feature, -1 for none, int64, shape :math:`(N,)`.
+        """
+        index = len(self.keyframes)
+        landmarks = landmarks.clone()
+        fresh = self._fresh(features, landmarks)
+        landmarks[fresh] = self._create(index, T_cw, features[fresh])
+        keyframe = Keyframe(index, frame, stamp, T_cw, features, landmarks)
+        self.keyframes.append(keyframe)
+        matched = landmarks >= 0
+        self.observations.append(
+            keyframe=torch.full((int(matched.sum()),), index),
+            landmark=landmarks[matched],
+            uv=features.uv[matched],
+            inverse_depth=features.inverse_depth[matched],
+            octave=features.octave[matched],
+            valid=torch.ones(int(matched.sum()), dtype=torch.bool),
+        )
+        return keyframe
+
+    def record(self, tracking: Tracking) -> None:
+        """Count which landmarks a frame found of those it should have seen."""
+        found = tracking.landmarks[tracking.landmarks >= 0]
+        self.landmarks["found"][found] += 1
+        self.landmarks["visible"][tracking.visible] += 1
+
+    def covisible(self, landmarks: Tensor, count: int) -> Tensor:
+        """The keyframes that see most of the given landmarks, best first.
+
+        Args:
+            landmarks: ids, int64, shape :math:`(L,)`.
+            count: most keyframes.
+
+        Returns:
+            Indices of keyframes that see at least one, int64, shape :math:`(<= count,)`.
+        """
+        shared = self.shared(landmarks)
+        order = torch.argsort(shared, descending=True, stable=True)[:count]
+        return order[shared[order] > 0]
+
+    def shared(self, landmarks: Tensor) -> Tensor:
+        """How many of the given landmarks each keyframe sees, int64, shape :math:`(K,)`."""
+        wanted = torch.zeros(len(self.landmarks), dtype=torch.bool)
+        wanted[landmarks] = True
+        seeing = self.observations["keyframe"][self.observations["valid"] & wanted[self.observations["landmark"]]]
+        return torch.bincount(seeing, minlength=len(self.keyframes))
+
+    def local(self, landmarks: Tensor, count: int) -> LocalMap:
+        """What a frame may see that saw ``landmarks`` just now: all that its ``count`` best keyframes see."""
+        chosen = torch.zeros(len(self.keyframes), dtype=torch.bool)
+        chosen[self.covisible(landmarks, count)] = True
+        seen = torch.zeros(len(self.landmarks), dtype=torch.bool)
+        seen[self.observations["landmark"][chosen[self.observations["keyframe"]]]] = True
+        ids = torch.nonzero(seen & self.landmarks["alive"])[:, 0]
+        return LocalMap(
+            ids=ids,
+            points=self.landmarks["point"][ids],
+            directions=self.landmarks["direction"][ids],
+            reach=self.landmarks["reach"][ids],
+            descriptors=self.landmarks["descriptor"][ids],
+        )
+
+    def covisibility(self, least: int) -> Tensor:
+        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and all consecutive ones.
+
+        Returns:
+            int64, shape :math:`(E, 2)`, sorted.
+        """
+        valid = self.observations["valid"]
+        rows, columns = self.observations["keyframe"][valid].numpy(), self.observations["landmark"][valid].numpy()
+        shape = (len(self.keyframes), len(self.landmarks))
+        seen = scipy.sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
+        shared = scipy.sparse.triu(seen @ seen.T, k=1).tocoo()
+        enough = shared.data >= least
+        pairs = torch.from_numpy(np.stack([shared.row[enough], shared.col[enough]], axis=1).astype(np.int64))
+        first = torch.arange(len(self.keyframes) - 1)
+        return torch.cat([pairs, torch.stack([first, first + 1], dim=1)]).unique(dim=0)
+
+    def move_keyframes(self, T_cw: Tensor) -> None:
+        """Put all keyframes at new poses; each landmark goes along with the keyframe that made it.
+
+        Args:
+            T_cw: world to camera, shape :math:`(K, 4, 4)`.
+        """
+        old = torch.stack([keyframe.T_cw for keyframe in self.keyframes])
+        T_new_old = (invert(T_cw) @ old)[self.landmarks["keyframe"]]
+        R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
+        self.landmarks["point"][:] = (R @ self.landmarks["point"][..., None])[..., 0] + t
+        self.landmarks["direction"][:] = (R @ self.landmarks["direction"][..., None])[..., 0]
+        for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
+            keyframe.T_cw = pose
+
+    def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> None:
+        """Let the landmarks of a keyframe become others that turned out to be the same.
+
+        Args:
+            keyframe: whose features were found again.
+            landmarks: id of the known landmark behind each of its features, -1 for none, int64, shape :math:`(N,)`.
+        """
+        same = (keyframe.landmarks >= 0) & (landmarks >= 0) & (keyframe.landmarks != landmarks)
+        becomes = torch.arange(len(self.landmarks))
+        becomes[keyframe.landmarks[same]] = landmarks[same]
+        self.landmarks["alive"][keyframe.landmarks[same]] = False
+        self.observations["landmark"][:] = becomes[self.observations["landmark"]]
+        for other in self.keyframes:
+            other.landmarks = torch.where(other.landmarks >= 0, becomes[other.landmarks.clamp(min=0)], -1)
+
+    def cull(self) -> None:
+        """Forget landmarks that few of the frames found that should have, and those that no second keyframe saw."""
+        age = len(self.keyframes) - 1 - self.landmarks["keyframe"]
+        seen_by = torch.bincount(
+            self.observations["landmark"][self.observations["valid"]], minlength=len(self.landmarks)
+        )
+        elusive = self.landmarks["found"] < 0.25 * self.landmarks["visible"]  # ORB-SLAM2's rule
+        lonely = (age == 3) & (seen_by < 2)
+        self.landmarks["alive"][(elusive & (age > 0)) | lonely] = False
+
+    def _fresh(self, features: Features, landmarks: Tensor) -> Tensor:
+        """Features that become landmarks: unmatched, with good depth, as many as the map wants, spread."""
+        near = (features.depth > 0) & (features.depth <= self._config.max_landmark_depth)
+        if int(near.sum()) < self._config.min_tracked:
+            near = features.depth > 0  # a far scene is better than none
+        fresh = torch.nonzero((landmarks < 0) & near)[:, 0]
+        wanted = max(self._config.landmarks_per_keyframe - int((landmarks >= 0).sum()), 0)
+        return fresh[spread(features.pixel[fresh], wanted, self._features.cell)]
+
+    def _create(self, keyframe: int, T_cw: Tensor, features: Features) -> Tensor:
+        T_wc = invert(T_cw)
+        points = self._camera.lift(features.uv, features.depth) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        sight = points - T_wc[:3, 3]
+        distance = sight.norm(dim=1)
+        ones = torch.ones(len(features), dtype=torch.int64)
+        return self.landmarks.append(
+            point=points,
+            direction=sight / distance[:, None],
+            reach=distance * self._features.scale ** features.octave.to(torch.float64),
+            descriptor=features.descriptors,
+            keyframe=keyframe * ones,
+            found=ones,
+            visible=ones,
+            alive=ones.to(torch.bool),
+        )

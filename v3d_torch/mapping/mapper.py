@@ -1,0 +1,69 @@
+"""Decides when a frame becomes a keyframe, and grows and adjusts the map with it (ORB-SLAM2, local mapping)."""
+
+from __future__ import annotations
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import Config
+from v3d_torch.mapping.adjust import adjust_locally
+from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.recorder import Estimate, Status
+from v3d_torch.odometry.orb import Features
+from v3d_torch.types import RGBDFrame
+
+
+class Mapper:
+    """Grows a map.
+
+    Args:
+        config: of the whole system.
+        camera: of the frames.
+    """
+
+    def __init__(self, config: Config, camera: PinholeCamera) -> None:
+        self._config = config
+        self._camera = camera
+        self._most_tracked = 0  # landmarks found by a frame since the last keyframe
+        self._lost_since: float | None = None
+        self.map = SparseMap(config.mapping, config.features, camera)
+
+    def __call__(
+        self, frame: RGBDFrame, static: Features, estimate: Estimate, reference: Keyframe | None
+    ) -> Keyframe | None:
+        """Make ``frame`` a keyframe if the map needs one.
+
+        Args:
+            frame: newest.
+            static: its features on what stands still.
+            estimate: its pose.
+            reference: the keyframe that the frame is tied to; None while there is none.
+
+        Returns:
+            The new keyframe, or None.
+        """
+        if not self._wants(frame, static, estimate):
+            return None
+        keyframe = self.map.insert(frame.index, frame.stamp, estimate.T_cw, static, estimate.landmarks)
+        keyframe.adrift = reference is not None and (estimate.status is Status.LOST or reference.adrift)
+        self._most_tracked, self._lost_since = 0, None
+        adjust_locally(self.map, keyframe, self._config, self._camera)
+        self.map.cull()
+        return keyframe
+
+    def _wants(self, frame: RGBDFrame, static: Features, estimate: Estimate) -> bool:
+        config = self._config.mapping
+        self._most_tracked = max(self._most_tracked, estimate.count)
+        if estimate.status is Status.LOST:
+            return self._may_start(frame.stamp, static)
+        self._lost_since = None
+        if estimate.status is Status.ODOMETRY:
+            return True
+        weak = estimate.count < max(config.min_tracked, config.min_tracked_ratio * self._most_tracked)
+        return weak or frame.index - self.map.keyframes[-1].frame >= config.max_gap
+
+    def _may_start(self, stamp: float, static: Features) -> bool:
+        """A camera without a map, or lost for long, starts where it is guessed to be, once it sees enough."""
+        if self._lost_since is None:
+            self._lost_since = stamp
+        patience = self._config.mapping.restart_after if self.map.keyframes else 0.0
+        enough = int((static.depth > 0).sum()) >= self._config.mapping.min_tracked
+        return enough and stamp - self._lost_since >= patience

@@ -1,0 +1,138 @@
+"""The pose of every frame, tied to a keyframe so that it follows when the map is corrected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import torch
+from torch import Tensor
+
+from v3d_torch.lie import invert, rigid, se3_exp, se3_log
+from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.types import Trajectory
+
+
+class Status(StrEnum):
+    """How a frame's pose was found."""
+
+    TRACKED = "tracked"  # in the map
+    ODOMETRY = "odometry"  # by its motion since the frame before
+    ADRIFT = "adrift"  # in a part of the map that only a guess joins to the rest
+    LOST = "lost"  # not at all: predicted, and interpolated once the camera is found again
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A frame's pose as it was found.
+
+    Attributes:
+        status: how.
+        T_cw: world to camera, float64, shape :math:`(4, 4)`.
+        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
+    """
+
+    status: Status
+    T_cw: Tensor
+    landmarks: Tensor
+
+    @property
+    def count(self) -> int:
+        """Number of landmarks found."""
+        return int((self.landmarks >= 0).sum())
+
+
+@dataclass(frozen=True)
+class _Entry:
+    stamp: float
+    status: Status
+    keyframe: Keyframe | None  # None before the first
+    T_ck: Tensor
+
+    @property
+    def T_cw(self) -> Tensor:
+        return self.T_ck if self.keyframe is None else self.T_ck @ self.keyframe.T_cw
+
+
+class PoseRecorder:
+    """Remembers the pose of each frame relative to a keyframe, and predicts the next one."""
+
+    _MAX_PREDICTION = 0.2  # seconds: a hand changes its motion within that; then a lost camera stands still
+
+    def __init__(self) -> None:
+        self._entries: list[_Entry] = []
+        self._velocity = torch.zeros(6, dtype=torch.float64)  # twist per second, in the camera frame
+        self.landmarks = torch.zeros(0, dtype=torch.int64)  # seen by the last frame that was found
+
+    @property
+    def status(self) -> Status | None:
+        """Of the last frame; None before the first."""
+        return self._entries[-1].status if self._entries else None
+
+    @property
+    def statuses(self) -> list[Status]:
+        """Of all frames."""
+        return [entry.status for entry in self._entries]
+
+    @property
+    def T_cw(self) -> Tensor:
+        """World to camera of the last frame, float64, shape :math:`(4, 4)`."""
+        return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
+
+    def predict(self, stamp: float) -> Tensor:
+        """``T_cw`` at ``stamp`` with constant velocity."""
+        if not self._entries:
+            return self.T_cw
+        elapsed = min(stamp - self._entries[-1].stamp, self._MAX_PREDICTION)
+        return se3_exp(self._velocity * elapsed) @ self.T_cw
+
+    def record(self, stamp: float, estimate: Estimate, keyframe: Keyframe | None) -> None:
+        """Note a frame's pose relative to ``keyframe``."""
+        status = estimate.status
+        if status is Status.TRACKED and keyframe is not None and keyframe.adrift:
+            status = Status.ADRIFT
+        T_kw = keyframe.T_cw if keyframe is not None else torch.eye(4, dtype=torch.float64)
+        if self._entries:
+            elapsed = stamp - self._entries[-1].stamp
+            if estimate.status is Status.LOST:
+                self._velocity = self._velocity * (stamp - self._last_found() < self._MAX_PREDICTION)
+            elif self.status is not Status.LOST and elapsed > 0:
+                self._velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
+        self._entries.append(_Entry(stamp, status, keyframe, rigid(estimate.T_cw @ invert(T_kw))))
+        if estimate.count:
+            self.landmarks = estimate.landmarks[estimate.landmarks >= 0]
+
+    def anchor(self, keyframe: Keyframe) -> None:
+        """The last frame became a keyframe: from now on its pose is the keyframe's, and so is what it saw."""
+        status = self._entries[-1].status
+        if keyframe.adrift:
+            status = Status.ADRIFT
+        elif status is Status.LOST:
+            status = Status.TRACKED  # the first of all
+        self._entries[-1] = _Entry(keyframe.stamp, status, keyframe, torch.eye(4, dtype=torch.float64))
+        self.landmarks = keyframe.landmarks[keyframe.landmarks >= 0]
+
+    def trajectory(self) -> Trajectory:
+        """All frames after all corrections; lost ones interpolated between their neighbours that were found."""
+        stamps = torch.tensor([entry.stamp for entry in self._entries], dtype=torch.float64)
+        T_cw = torch.stack([entry.T_cw for entry in self._entries])
+        found = torch.tensor([entry.status is not Status.LOST for entry in self._entries])
+        return Trajectory(stamps, invert(_interpolate(stamps, T_cw, found)))
+
+    def _last_found(self) -> float:
+        found = (entry.stamp for entry in reversed(self._entries) if entry.status is not Status.LOST)
+        return next(found, -torch.inf)
+
+
+def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:
+    """Poses where ``found`` is false on the geodesic between the nearest that were found; the ends stay as they are."""
+    known = torch.nonzero(found)[:, 0]
+    if known.shape[0] == 0:
+        return T
+    after = torch.searchsorted(known, torch.arange(stamps.shape[0]))
+    between = torch.nonzero(~found & (after > 0) & (after < known.shape[0]))[:, 0]
+    a, b = known[after[between] - 1], known[after[between].clamp(max=known.shape[0] - 1)]
+    share = (stamps[between] - stamps[a]) / (stamps[b] - stamps[a])
+    T = T.clone()
+    T[between] = se3_exp(share[:, None] * se3_log(T[b] @ invert(T[a]))) @ T[a]
+    return T

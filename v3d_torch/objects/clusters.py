@@ -1,0 +1,36 @@
+"""Which clusters of a cloud belong to the object: the largest ones (paper, Sec. III-B.2)."""
+
+from __future__ import annotations
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor
+
+
+def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_points: int = 1) -> Tensor:
+    """Keep the points of the ``n`` largest clusters of every cloud.
+
+    The paper keeps as many clusters of a scene as it recognises instances; with one cloud per instance that is the
+    largest of each, ``n=1``.
+
+    Args:
+        labels: cluster of each point, -1 = noise, int64, shape :math:`(B, N)`.
+        valid: which points exist, bool, shape :math:`(B, N)`.
+        n: clusters to keep, one number for all clouds or int64 of shape :math:`(B,)`. Of two clusters of the same size
+            the lower label goes first.
+        min_points: a cluster with fewer points is never kept.
+
+    Returns:
+        Points that are kept, bool, shape :math:`(B, N)`.
+    """
+    KORNIA_CHECK_SHAPE(labels, ["B", "N"])
+    KORNIA_CHECK_SHAPE(valid, [str(size) for size in labels.shape])
+    if labels.numel() == 0:
+        return torch.zeros_like(valid)
+    clustered = valid & (labels >= 0)
+    cluster = torch.where(clustered, labels, 0)
+    size = labels.new_zeros(labels.shape[0], int(cluster.max()) + 1).scatter_add_(1, cluster, clustered.to(torch.int64))
+    order = size.argsort(dim=1, descending=True, stable=True)
+    rank = torch.empty_like(order).scatter_(1, order, torch.arange(order.shape[1]).expand_as(order))
+    kept = (rank < torch.as_tensor(n).reshape(-1, 1)) & (size >= min_points)
+    return clustered & kept.gather(1, cluster)

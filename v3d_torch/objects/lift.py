@@ -1,0 +1,79 @@
+"""Instances to clean clouds: back-project, voxel pool, DBSCAN, keep the largest clusters (paper, Sec. III-B.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import BackProjector, PinholeCamera
+from v3d_torch.config import CloudConfig
+from v3d_torch.objects.clusters import largest_clusters
+from v3d_torch.objects.dbscan import dbscan
+from v3d_torch.objects.voxel import voxel_pool
+from v3d_torch.types import Instances
+
+
+@dataclass(frozen=True)
+class ObjectClouds:
+    """A cloud per instance, padded to one length.
+
+    Attributes:
+        points: voxel means in the camera frame, metres, float32, shape :math:`(N, P, 3)`.
+        valid: which are points and not padding, bool, shape :math:`(N, P)`.
+        centroid: mean of the points, float32, shape :math:`(N, 3)`; nan where a cloud has too few points.
+    """
+
+    points: Tensor
+    valid: Tensor
+    centroid: Tensor
+
+    def __len__(self) -> int:
+        return self.points.shape[0]
+
+
+class CloudLifter:
+    """Lifts instances into 3D and rejects what does not belong to them.
+
+    Args:
+        config: resolution and clustering.
+        camera: back-projects the depth.
+    """
+
+    def __init__(self, config: CloudConfig, camera: PinholeCamera) -> None:
+        self._config = config
+        self._project = BackProjector(camera)
+
+    def __call__(self, depth: Tensor, instances: Instances) -> ObjectClouds:
+        """Lift all instances of a frame at once.
+
+        Args:
+            depth: re-estimated, metres, float32, shape :math:`(1, H, W)`; 0 = none.
+            instances: of the same image.
+        """
+        config = self._config
+        points, valid = self._gather(depth, instances)
+        points, valid, _ = voxel_pool(points, valid, config.voxel_size)
+        labels = dbscan(points, valid, config.eps, config.min_samples)
+        # The paper keeps as many blobs as there are instances; here each instance has its own cloud and keeps one.
+        valid = largest_clusters(labels, valid, 1)
+        count = valid.sum(dim=1)
+        centroid = (points * valid[..., None]).sum(dim=1) / count.clamp(min=1)[:, None]
+        centroid[count < config.min_points] = torch.nan
+        return ObjectClouds(points, valid, centroid)
+
+    def _gather(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor]:
+        """Every n-th masked pixel with depth as a padded set of points, :math:`(N, P, 3)` and :math:`(N, P)`."""
+        step = self._config.stride
+        cloud = self._project(depth[None])[0, ::step, ::step].reshape(-1, 3)
+        z = depth[0, ::step, ::step].reshape(-1)
+        masks = instances.masks[:, ::step, ::step].flatten(1)
+        masks = masks & (z > 0) & (z <= self._config.max_depth)
+        instance, pixel = torch.nonzero(masks, as_tuple=True)
+        count = masks.sum(dim=1)
+        longest = int(count.max()) if len(instances) else 0
+        place = torch.arange(instance.shape[0]) - (count.cumsum(0) - count)[instance]
+        points = torch.zeros(len(instances), max(longest, 1), 3)
+        points[instance, place] = cloud[pixel]
+        return points, torch.arange(max(longest, 1)) < count[:, None]

@@ -1,0 +1,1 @@
+"""The camera stage: features, matching, RANSAC, pose (paper, Sec. III-E)."""

@@ -1,0 +1,86 @@
+"""Camera motion between two frames: match, epipolar RANSAC, PnP-RANSAC with depth (paper, Sec. III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import FeaturesConfig, MotionConfig
+from v3d_torch.odometry.matching import match_descriptors
+from v3d_torch.odometry.orb import Features, spread
+from v3d_torch.odometry.ransac import epipolar_inliers, pnp_ransac
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Rigid motion of the camera between a known view "a" and a new view "b".
+
+    Attributes:
+        T_ba: maps points of camera a to camera b, float64, shape :math:`(4, 4)`.
+        pairs: inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`.
+    """
+
+    T_ba: Tensor
+    pairs: Tensor
+
+
+class MotionEstimator:
+    """Estimates the camera's motion from features that stand still.
+
+    Args:
+        config: thresholds of matching and RANSAC.
+        features: grid of the features.
+        camera: gives ``K``.
+        seed: of both RANSACs.
+    """
+
+    def __init__(self, config: MotionConfig, features: FeaturesConfig, camera: PinholeCamera, seed: int) -> None:
+        self._config = config
+        self._cell = features.cell
+        self._camera = camera
+        self._seed = seed
+
+    def __call__(self, a: Features, b: Features, usable: Tensor | None = None) -> Motion | None:
+        """Motion from view ``a`` to view ``b``.
+
+        Args:
+            a: known view; its features with depth take part.
+            b: new view.
+            usable: which features of ``b`` take part, bool, shape :math:`(N,)`; all of them when None.
+
+        Returns:
+            None when fewer than ``min_inliers`` matches agree on one motion.
+        """
+        config = self._config
+        candidates = torch.arange(len(b)) if usable is None else torch.nonzero(usable)[:, 0]
+        chosen = torch.nonzero(a.depth > 0)[:, 0]
+        chosen = chosen[spread(a.pixel[chosen], config.count, self._cell)]
+        pairs = match_descriptors(
+            a.descriptors[chosen], b.descriptors[candidates], max_hamming=config.max_hamming, max_ratio=config.max_ratio
+        )
+        pairs = torch.stack([chosen[pairs[:, 0]], candidates[pairs[:, 1]]], dim=1)
+        if pairs.shape[0] < config.min_inliers:
+            return None
+        epipolar = epipolar_inliers(
+            a.uv[pairs[:, 0]],
+            b.uv[pairs[:, 1]],
+            threshold=config.epipolar_threshold,
+            iterations=config.iterations,
+            seed=self._seed,
+        )
+        pairs = pairs[epipolar]
+        pose = pnp_ransac(
+            self._camera.lift(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]]),
+            b.uv[pairs[:, 1]],
+            self._camera.K,
+            threshold=config.pnp_threshold,
+            iterations=config.iterations,
+            seed=self._seed,
+        )
+        if pose is None or int(pose[1].sum()) < config.min_inliers:
+            return None
+        T_ba, inliers = pose
+        return Motion(T_ba, pairs[inliers])

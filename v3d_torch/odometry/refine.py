@@ -1,0 +1,238 @@
+"""Pose of one camera from landmarks it sees: robust least squares on pixels and depth (ORB-SLAM2, Sec. III-B and III-C).
+
+Mur-Artal and Tardos, "ORB-SLAM2", T-RO 2017: motion-only bundle adjustment. What it minimises (`reprojection`,
+`huber`) and how (`levenberg_marquardt`) is shared with the bundle adjustment of the map and with the pose graph.
+
+Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with ``xi = [translation, rotation]``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.lie import rigid, se3_exp
+
+State = TypeVar("State")
+System = TypeVar("System")
+
+_NEAREST = 0.05  # metres: no camera sees nearer; keeps 1/z finite for points that a step puts behind the camera
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurements:
+    """Where the camera sees landmarks, and how far away.
+
+    Attributes:
+        uv: undistorted pixels, float64, shape :math:`(M, 2)`.
+        inverse_depth: of the measured depth along z, 1/m, float64, shape :math:`(M,)`; 0 = not measured.
+        pixel_sigma: standard deviation of u and of v, pixels, :math:`(M,)`.
+        inverse_depth_sigma: standard deviation of inverse depth, 1/m. Constant, as of the disparity of any stereo or
+            structured-light camera: depth itself errs by this times z^2 (Khoshelham and Elberink, Sensors 2012).
+    """
+
+    uv: Tensor
+    inverse_depth: Tensor
+    pixel_sigma: Tensor
+    inverse_depth_sigma: float
+
+    @property
+    def limit(self) -> Tensor:
+        """Squared error in sigmas that 95 % of good observations stay below: chi-square of 3 or 2 degrees of freedom."""
+        return torch.where(self.inverse_depth > 0, 7.815, 5.991).to(torch.float64)
+
+
+def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
+    """Errors of (u, v, 1/z) in standard deviations, and how they change when the camera moves.
+
+    Args:
+        points: landmark of each observation in the camera frame, metres, float64, shape :math:`(M, 3)`.
+        measured: where they were seen.
+        camera: intrinsics.
+
+    Returns:
+        residuals, shape :math:`(M, 3)`, the third 0 where no depth was measured, and their Jacobian by the left
+        perturbation of ``T_cw``, shape :math:`(M, 3, 6)`. Its first three columns are the Jacobian by ``points``.
+    """
+    w = 1 / points[:, 2].clamp(min=_NEAREST)
+    x, y = points[:, 0] * w, points[:, 1] * w
+    u, v = measured.uv.unbind(-1)
+    per_depth = (measured.inverse_depth > 0) / measured.inverse_depth_sigma
+    residuals = torch.stack(
+        [
+            (camera.fx * x + camera.cx - u) / measured.pixel_sigma,
+            (camera.fy * y + camera.cy - v) / measured.pixel_sigma,
+            (w - measured.inverse_depth) * per_depth,
+        ],
+        dim=-1,
+    )
+    fx, fy, o = camera.fx * w / measured.pixel_sigma, camera.fy * w / measured.pixel_sigma, torch.zeros_like(w)
+    by_point = torch.stack(
+        [
+            *(fx, o, -fx * x),
+            *(o, fy, -fy * y),
+            *(o, o, -per_depth * w * w),
+        ],
+        dim=-1,
+    ).unflatten(-1, (3, 3))
+    # A small motion moves a point p by translation + rotation x p, and a . (rotation x p) = rotation . (p x a).
+    jacobian = torch.cat([by_point, torch.linalg.cross(points[:, None], by_point, dim=-1)], dim=-1)
+    return residuals, jacobian
+
+
+def chi_square(points: Tensor, residuals: Tensor) -> Tensor:
+    """Squared error of each observation in sigmas, :math:`(M,)`; infinite for points that are not in front."""
+    return torch.where(points[:, 2] > _NEAREST, (residuals * residuals).sum(dim=-1), torch.inf)
+
+
+def huber(squared: Tensor, limit: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Huber's kernel: quadratic below the limit, linear above.
+
+    Args:
+        squared: squared errors s, shape :math:`(M,)`.
+        limit: square of the error at which the kernel turns linear.
+
+    Returns:
+        costs rho(s) and weights d rho / d s, both :math:`(M,)`.
+    """
+    weights = (limit / squared.clamp(min=1e-300)).sqrt().clamp(max=1.0)
+    return torch.where(weights < 1, 2 * weights * squared - limit, squared), weights
+
+
+@dataclass(frozen=True)
+class Minimum(Generic[State, System]):
+    """What `levenberg_marquardt` found.
+
+    Attributes:
+        state: at the least cost.
+        system: normal equations there, undamped.
+        cost_before: at the start.
+        cost_after: at ``state``.
+        iterations: steps tried.
+        converged: whether it ended because the cost no longer changed.
+    """
+
+    state: State
+    system: System
+    cost_before: float
+    cost_after: float
+    iterations: int
+    converged: bool
+
+
+def levenberg_marquardt(
+    state: State,
+    linearise: Callable[[State], tuple[float, System]],
+    step: Callable[[State, System, float], State],
+    iterations: int,
+    tolerance: float = 1e-6,
+) -> Minimum[State, System]:
+    """Damped Gauss-Newton: a step that lowers the cost is taken and the damping relaxed, else it is tightened.
+
+    Args:
+        state: where to start.
+        linearise: state to its cost and normal equations.
+        step: state, its normal equations and the damping (relative to their diagonal) to the next state.
+        iterations: most steps tried.
+        tolerance: relative change of the cost that ends the search.
+    """
+    cost, system = linearise(state)
+    cost_before, damping, tried, converged = cost, 1e-5, 0, False
+    while tried < iterations and not converged:
+        candidate = step(state, system, damping)
+        new_cost, new_system = linearise(candidate)
+        tried += 1
+        # A step damped to nothing changes nothing either: only one that was free to move tells of convergence.
+        converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
+        if new_cost < cost:
+            state, cost, system = candidate, new_cost, new_system
+            damping = max(damping / 10, 1e-9)
+        else:
+            damping = min(damping * 10, 1e9)
+    return Minimum(state, system, cost_before, cost, tried, converged)
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """A pose and what supports it.
+
+    Attributes:
+        T_cw: world to camera, float64, shape :math:`(4, 4)`.
+        inliers: observations that agree with it, bool, shape :math:`(N,)`.
+        chi2: squared error of each in sigmas, float64, shape :math:`(N,)`; infinite behind the camera.
+        information: inverse covariance of the pose's left perturbation, float64, shape :math:`(6, 6)`.
+    """
+
+    T_cw: Tensor
+    inliers: Tensor
+    chi2: Tensor
+    information: Tensor
+
+
+@torch.no_grad()
+def refine_pose(
+    T_cw: Tensor,
+    points: Tensor,
+    uv: Tensor,
+    inverse_depth: Tensor,
+    pixel_sigma: Tensor,
+    camera: PinholeCamera,
+    *,
+    inverse_depth_sigma: float,
+    rounds: int = 4,
+    iterations: int = 5,
+) -> PoseRefinement:
+    """Refine a predicted pose; observations are judged inliers or outliers anew after each round.
+
+    Args:
+        T_cw: predicted world-to-camera pose, shape :math:`(4, 4)`.
+        points: landmarks, world frame, metres, float64, shape :math:`(N, 3)`.
+        uv: where they are seen, undistorted pixels, float64, shape :math:`(N, 2)`.
+        inverse_depth: measured, 1/m, float64, shape :math:`(N,)`; 0 = not measured.
+        pixel_sigma: standard deviation of ``uv``, pixels, shape :math:`(N,)`.
+        camera: intrinsics.
+        inverse_depth_sigma: standard deviation of ``inverse_depth``, 1/m.
+        rounds: of optimisation and judgement; Huber's kernel guards the first half, the rest polishes the inliers.
+        iterations: most steps in a round.
+
+    Returns:
+        The pose; the prediction itself, without inliers, where nothing supports any pose.
+    """
+    measured = Measurements(
+        uv=uv, inverse_depth=inverse_depth, pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma
+    )
+
+    def linearise(T_cw: Tensor, kept: Tensor, limit: Tensor | float) -> tuple[float, _PoseSystem]:
+        in_camera = points @ T_cw[:3, :3].T + T_cw[:3, 3]
+        residuals, jacobian = reprojection(in_camera, measured, camera)
+        chi2 = chi_square(in_camera, residuals)
+        costs, weights = huber((residuals * residuals).sum(dim=-1), limit)
+        J = jacobian.flatten(0, 1)
+        weighted = (jacobian * (weights * kept)[:, None, None]).flatten(0, 1)
+        return float((costs * kept).sum()), (weighted.T @ J, weighted.T @ residuals.flatten(), chi2)
+
+    inliers = torch.ones(points.shape[0], dtype=torch.bool)
+    for turn in range(rounds):
+        robust = 2 * turn < rounds
+        problem = partial(linearise, kept=inliers, limit=measured.limit if robust else torch.inf)
+        found = levenberg_marquardt(T_cw, problem, _step, iterations, tolerance=1e-4)
+        T_cw, before, (information, _, chi2) = found.state, inliers, found.system
+        inliers = chi2 <= measured.limit
+        if not robust and torch.equal(inliers, before):
+            break
+    return PoseRefinement(rigid(T_cw), inliers, chi2, information)
+
+
+_PoseSystem = tuple[Tensor, Tensor, Tensor]  # J^T W J, J^T W r, and the squared error of each observation
+
+
+def _step(T_cw: Tensor, system: _PoseSystem, damping: float) -> Tensor:
+    H, gradient, _ = system
+    diagonal = damping * H.diagonal() + 1e-9  # solvable even where nothing is seen
+    return se3_exp(-torch.linalg.solve(H + diagonal.diag(), gradient)) @ T_cw

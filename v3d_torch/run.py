@@ -1,0 +1,54 @@
+"""``python -m v3d_torch.run --seq ...``: a sequence in, trajectory, map and scores out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@app.command()
+def main(
+    seq: Annotated[str, typer.Option(help="demo, a TUM RGB-D sequence (fr3/w/xyz), or a folder in TUM layout.")],
+    data_root: Annotated[
+        Path | None, typer.Option(envvar="V3D_DATA", help="Where named sequences are, or are downloaded to.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="camera.yaml, K.txt or a preset (tum_fr3), where the folder does not say.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="YAML file over the defaults, such as configs/paper.yaml.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="A value, such as objects.voting.distance_threshold=0.05.")
+    ] = None,
+    segmenter: Annotated[str | None, typer.Option(help="yolo, masks or none.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of id images for --segmenter masks.")] = None,
+    weights: Annotated[Path | None, typer.Option(help="Checkpoint or ONNX file of the network.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
+    save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
+) -> None:
+    """Track an RGB-D camera in a room where people move, and map what stands still."""
+    from v3d_torch.console import exit_on_error, run_sequence
+
+    overrides = list(set_ or [])
+    overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
+    overrides += [f"seed={seed}"] if seed is not None else []
+    with exit_on_error():
+        run_sequence(
+            seq,
+            data_root=data_root,
+            camera=camera,
+            config_path=config,
+            overrides=overrides,
+            masks=masks,
+            weights=weights,
+            out=out,
+            save_masks=save_masks,
+        )
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,41 @@
+"""Mask prototypes: the images whose linear combinations are instance masks (YOLACT, Bolya et al., ICCV 2019)."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from v3d_torch.segmentation.networks.blocks import Conv
+
+PROTOTYPES = 32
+
+
+class Proto(nn.Module):
+    """Prototypes at a quarter of the image's size, from the finest level of the pyramid alone."""
+
+    def __init__(self, channels: int, hidden: int = 64) -> None:
+        super().__init__()
+        self.cv1 = Conv(channels, hidden, 3)
+        self.upsample = nn.ConvTranspose2d(hidden, hidden, 2, 2)
+        self.cv2 = Conv(hidden, hidden, 3)
+        self.cv3 = Conv(hidden, PROTOTYPES)
+
+    def forward(self, pyramid: list[Tensor]) -> Tensor:
+        """Prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""
+        return self.cv3(self.cv2(self.upsample(self.cv1(pyramid[0]))))
+
+
+class MultiScaleProto(Proto):
+    """YOLO26's prototypes: the coarser levels are reduced, enlarged and added before."""
+
+    def __init__(self, channels: tuple[int, int, int]) -> None:
+        super().__init__(channels[0])
+        self.feat_refine = nn.ModuleList([Conv(coarse, channels[0]) for coarse in channels[1:]])
+        self.feat_fuse = Conv(channels[0], channels[0], 3)
+
+    def forward(self, pyramid: list[Tensor]) -> Tensor:
+        """Prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""
+        finest, *coarser = pyramid
+        fused = finest
+        for level, refine, coarse in zip((1, 2), self.feat_refine, coarser, strict=True):
+            fused = fused + nn.functional.interpolate(refine(coarse), scale_factor=float(2**level), mode="nearest")
+        return super().forward([self.feat_fuse(fused)])

@@ -1,0 +1,102 @@
+"""Instance segmentation with a YOLO network on onnxruntime (paper, Sec. III-A)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import onnxruntime
+import torch
+from torch import Tensor
+
+from v3d_torch.config import SegmentationConfig
+from v3d_torch.errors import WeightsError
+from v3d_torch.segmentation.coco import COCO_NAMES
+from v3d_torch.segmentation.decode import decode
+from v3d_torch.segmentation.export import exported
+from v3d_torch.segmentation.letterbox import CELL, letterbox
+from v3d_torch.segmentation.networks.head import STRIDES
+from v3d_torch.segmentation.networks.prototypes import PROTOTYPES
+from v3d_torch.segmentation.weights import REGISTRY, resolve
+from v3d_torch.types import Instances, RGBDFrame
+
+
+class YOLOSegmenter:
+    """Finds instances of the 80 COCO classes in colour images.
+
+    Args:
+        config: model, input size, thresholds, threads.
+        weights: the model's published ``.pt`` file, or an ``.onnx`` file with the raw head (`_check_layout`), whose
+            input size then takes the place of the configured one; None looks in the cache and downloads.
+
+    Raises:
+        WeightsError: if the weights cannot be found or are not what they should be.
+    """
+
+    def __init__(self, config: SegmentationConfig, weights: Path | None = None) -> None:
+        if weights is not None and weights.suffix == ".onnx":
+            path = weights
+        else:
+            path = exported(config.model, resolve(config.model, weights), config.height, config.width)
+        self.config = config
+        self._session = _open_session(path, config.threads)
+        self._input = self._session.get_inputs()[0].name
+        self.height, self.width = _check_layout(self._session, path)
+        self._iou_threshold = None if REGISTRY[config.model].one_to_one else config.iou_threshold
+
+    def __call__(self, frame: RGBDFrame) -> Instances:
+        """Instances in a frame's colour image."""
+        return self.segment(frame.image)
+
+    def segment(self, image: Tensor) -> Instances:
+        """Instances in an image of any size.
+
+        Args:
+            image: uint8 RGB, shape :math:`(3, H, W)`.
+
+        Returns:
+            Masks of shape :math:`(N, H, W)`, best score first; boxes are the edges of pixels: pixel u lies in a box
+            where left <= u < right.
+        """
+        canvas, window = letterbox(image, self.height, self.width)
+        predictions, prototypes = self._session.run(None, {self._input: canvas.numpy()})
+        return decode(
+            torch.from_numpy(predictions)[0],
+            torch.from_numpy(prototypes)[0],
+            window,
+            score_threshold=self.config.score_threshold,
+            iou_threshold=self._iou_threshold,
+            max_instances=self.config.max_instances,
+        )
+
+
+def _open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
+    if not path.is_file():
+        raise WeightsError(f"{path}: there is no such file; check the path given as --weights")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.use_deterministic_compute = True
+    # Threads that spin while they wait take the processor from torch, which works in between.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions have no common base of their own
+        raise WeightsError(f"{path}: onnxruntime cannot open it; delete the file or export it again") from error
+
+
+def _check_layout(session: onnxruntime.InferenceSession, path: Path) -> tuple[int, int]:
+    """Height and width of the input, after a check that inputs and outputs are those of a raw segmentation head."""
+    inputs = [(node.type, node.shape) for node in session.get_inputs()]
+    outputs = [(node.type, node.shape) for node in session.get_outputs()]
+    match inputs:
+        case [("tensor(float)", [1, 3, int(height), int(width)])] if height % STRIDES[-1] == width % STRIDES[-1] == 0:
+            cells = sum(height * width // stride**2 for stride in STRIDES)
+            raw = [[1, 4 + len(COCO_NAMES) + PROTOTYPES, cells], [1, PROTOTYPES, height // CELL, width // CELL]]
+            if outputs == [("tensor(float)", shape) for shape in raw]:
+                return height, width
+    raise WeightsError(
+        f"{path}: is not a raw segmentation head with one float input (1, 3, H, W), H and W fixed multiples of 32, and"
+        f" outputs (1, 116, N) and (1, 32, H/4, W/4), but maps {inputs} to {outputs};"
+        " export it with a fixed size and without NMS"
+    )

@@ -1,0 +1,93 @@
+"""Trajectory files in the layout of the TUM RGB-D benchmark: ``stamp tx ty tz qx qy qz qw`` of ``T_wc``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from v3d_torch.errors import InputError
+from v3d_torch.files import write_text
+from v3d_torch.types import Trajectory
+
+_COLUMNS = "stamp tx ty tz qx qy qz qw"
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read camera poses.
+
+    Comments (#), blank lines, a byte order mark, either line ending and commas for spaces are allowed. Quaternions are
+    normalised, poses come out in order of time, and of equal stamps the first counts.
+
+    Args:
+        path: lines of ``stamp tx ty tz qx qy qz qw``: seconds, metres, unit quaternion with the scalar last.
+
+    Returns:
+        Convention: ``T_wc`` maps camera to world, as the benchmark's files do.
+
+    Raises:
+        InputError: the file cannot be read, holds no pose, or a line is not eight finite numbers with a rotation.
+    """
+    numbers, poses = _parse(path)
+    for wrong, what in (
+        (~np.isfinite(poses).all(axis=1), "a number that is not finite"),
+        (~poses[:, 4:].any(axis=1), "a quaternion of zeros, which is no rotation"),
+    ):
+        if wrong.any():
+            raise InputError(f"{path}: line {numbers[wrong.argmax()]} has {what}; remove or repair it")
+    stamps, order = np.unique(poses[:, 0], return_index=True)
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(len(stamps), 1, 1)
+    T_wc[:, :3, :3] = torch.from_numpy(Rotation.from_quat(poses[order, 4:]).as_matrix())
+    T_wc[:, :3, 3] = torch.from_numpy(poses[order, 1:4])
+    return Trajectory(torch.from_numpy(stamps), T_wc)
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write camera poses whole or not at all: stamps with 6 decimals, the rest with 9, quaternions with qw >= 0.
+
+    Args:
+        path: file to write; its folder is made when it is not there.
+        trajectory: poses; none make an empty file.
+
+    Raises:
+        OutputError: when the folder cannot be written or the disk is full.
+    """
+    T_wc = trajectory.T_wc.detach().numpy()
+    lines = []
+    if len(trajectory):
+        quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
+        poses = np.concatenate([T_wc[:, :3, 3], quaternions], axis=1).round(9) + 0.0  # + 0.0: no "-0.000000000"
+        lines = [
+            f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in pose) + "\n"
+            for stamp, pose in zip(trajectory.stamps.tolist(), poses.tolist(), strict=True)
+        ]
+    write_text(path, "".join(lines))
+
+
+def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
+    """Line numbers from 1, and the eight numbers of each line, shape (N, 8)."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file in UTF-8; a trajectory has lines of {_COLUMNS}") from error
+    numbers, poses = [], []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            pose = [float(word) for word in words]
+        except ValueError:
+            pose = []
+        if len(pose) != len(_COLUMNS.split()):
+            raise InputError(f"{path}: line {number} is {line.strip()[:80]!r} where {_COLUMNS} is expected")
+        numbers.append(number)
+        poses.append(pose)
+    if not poses:
+        raise InputError(f"{path}: holds no pose; lines of {_COLUMNS} are expected")
+    return numbers, np.array(poses, dtype=np.float64)

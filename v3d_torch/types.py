@@ -1,0 +1,76 @@
+"""The data that flows between stages: frozen dataclasses of tensors.
+
+Conventions (see also README, "How it is built"): ``T_wc`` maps camera to world, ``p_w = T_wc @ p_c``; the camera looks
+along +z with x right and y down; pixel centres lie at integers and (u, v) = (column, row); depth is in metres and 0
+means "no measurement"; stamps are seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class RGBDFrame:
+    """One colour image and the depth image that belongs to it.
+
+    Attributes:
+        index: position in the sequence, from 0.
+        stamp: time of the colour image, seconds.
+        image: colour, uint8 RGB, shape :math:`(3, H, W)`, as the camera delivers it (distorted).
+        depth: metres, float32, shape :math:`(1, H, W)`, pixel by pixel on the colour image; 0 = no measurement.
+    """
+
+    index: int
+    stamp: float
+    image: Tensor
+    depth: Tensor
+
+
+@dataclass(frozen=True)
+class Instances:
+    """What the segmentation sees in one image, best score first.
+
+    Attributes:
+        masks: bool, shape :math:`(N, H, W)`; masks may overlap.
+        labels: COCO class index (0 = person, 0..79), int64, shape :math:`(N,)`.
+        scores: float32 in [0, 1], shape :math:`(N,)`.
+        boxes: float32, shape :math:`(N, 4)`: left, top, right, bottom in pixels.
+    """
+
+    masks: Tensor
+    labels: Tensor
+    scores: Tensor
+    boxes: Tensor
+
+    def __len__(self) -> int:
+        return self.labels.shape[0]
+
+    @staticmethod
+    def empty(height: int, width: int) -> Instances:
+        """No instances in an image of ``height`` x ``width`` pixels."""
+        return Instances(
+            masks=torch.zeros(0, height, width, dtype=torch.bool),
+            labels=torch.zeros(0, dtype=torch.int64),
+            scores=torch.zeros(0),
+            boxes=torch.zeros(0, 4),
+        )
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses over time.
+
+    Attributes:
+        stamps: seconds, float64, shape :math:`(N,)`, strictly increasing.
+        T_wc: camera-to-world, float64, shape :math:`(N, 4, 4)`.
+    """
+
+    stamps: Tensor
+    T_wc: Tensor
+
+    def __len__(self) -> int:
+        return self.stamps.shape[0]
