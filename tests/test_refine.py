@@ -24,7 +24,7 @@ CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
 DEPTH_SIGMA = 0.0025
 
 
-def view(count: int, outliers: float = 0.0, seed: int = 0) -> tuple[Tensor, Tensor, Measurements, Tensor]:
+def view(count: int, outliers: float = 0.0, seed: int = 1) -> tuple[Tensor, Tensor, Measurements, Tensor]:
     """A pose, landmarks, what is measured of them with the noise that it claims, and which of that is right."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -45,9 +45,7 @@ def view(count: int, outliers: float = 0.0, seed: int = 0) -> tuple[Tensor, Tens
     inverse_depth[::3] = 0.0
     good = uniform(count) >= outliers
     uv[~good] = uniform(count, 2)[~good] * 400
-    measured = Measurements(
-        uv=uv, inverse_depth=inverse_depth, pixel_sigma=sigma, inverse_depth_sigma=DEPTH_SIGMA
-    )
+    measured = Measurements(uv=uv, inverse_depth=inverse_depth, pixel_sigma=sigma, inverse_depth_sigma=DEPTH_SIGMA)
     return T_cw, points, measured, good
 
 
@@ -164,7 +162,8 @@ def test_same_optimum_as_gtsam() -> None:
 def test_outliers_are_found_and_do_not_matter(outliers: float) -> None:
     T_cw, points, measured, good = view(500, outliers)
     refined = refine(nearby(T_cw), points, measured)
-    assert (refined.inliers & good).sum() >= 0.92 * good.sum()  # the limits keep 95 %
+    kept = float((refined.inliers & good).sum() / good.sum())
+    assert abs(kept - 0.95) < 0.03  # what the limits are made for
     assert (refined.inliers & ~good).sum() <= 0.02 * len(good)
     error = se3_log(refined.T_cw @ invert(T_cw))
     # squared error in sigmas of six unknowns: 99.99 % stay below 28

@@ -77,7 +77,7 @@ def _twist(xi: Tensor) -> Tensor:
 def _so3_log(R: Tensor) -> Tensor:
     """Rotation vectors, :math:`(..., 3, 3)` to :math:`(..., 3)`, by way of quaternions: well conditioned up to pi."""
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in R.unbind(-2))
-    # The sixteen numbers 4 q q^T of the quaternion q = (w, x, y, z): each row is a multiple of q, the longest the safest.
+    # The sixteen numbers 4 q q^T of the quaternion q = (w, x, y, z): each row a multiple of q, the longest the safest.
     rows = torch.stack(
         [
             *(1 + a + e + i, h - f, c - g, d - b),

@@ -57,7 +57,7 @@ def align(T_gc: Tensor, T_ec: Tensor, *, oriented: bool = True) -> Alignment:
     """
     p_g, p_e = T_gc[:, :3, 3], T_ec[:, :3, 3]
     mean_g, mean_e = p_g.mean(dim=0), p_e.mean(dim=0)
-    if False:
+    if oriented and not spans_plane(p_g):
         source = RotationSource.ORIENTATIONS
         R_ge = _nearest_rotation((T_gc[:, :3, :3] @ T_ec[:, :3, :3].mT).sum(dim=0))
     else:

@@ -15,9 +15,9 @@ from torch import Tensor
 class PlaceIndex:
     """Remembers keyframes by their descriptors; grows with the map, needs no training.
 
-    A descriptor of the query votes for every keyframe that has one in the same bucket (equal first 16 bits) that differs
-    in less than 50 of all 256. Votes weigh as words do in text retrieval: what every keyframe shows tells no place from
-    another.
+    A descriptor of the query votes for every keyframe that has one in the same bucket (equal first 16 bits) that
+    differs in less than 50 of all 256. Votes weigh as words do in text retrieval: what every keyframe shows tells no
+    place from another.
     """
 
     _KEY_BITS = 16  # finds as many places as the exhaustive search does (20 finds fewer) in a hundredth of the time
@@ -51,14 +51,14 @@ class PlaceIndex:
             exclude: ids that do not count, such as recent or covisible keyframes.
 
         Returns:
-            (id, score) with score > 0, best first, the older first where scores are equal. The score is the mean vote of a
-            descriptor; it ranks within one query and is no probability.
+            (id, score) with score > 0, best first, the older first where scores are equal. The score is the mean vote
+            of a descriptor; it ranks within one query and is no probability.
         """
         count = len(self._ids)
         if count == 0 or descriptors.shape[0] == 0:
             return []
         bounds, _, found = self._index.range_search(descriptors.contiguous().numpy(), self._RADIUS)
-        voter = np.repeat(np.arange(descriptors.shape[0]), np.diff(bounds.astype(np.int64)))
+        voter = np.repeat(np.arange(descriptors.shape[0]), np.diff(bounds).astype(np.int64))
         # A descriptor has one vote for each keyframe, however often a pattern repeats in it.
         voter, keyframe = np.divmod(np.unique(voter * count + self._owner[found]), count)
         weight = np.log1p(count / np.bincount(voter, minlength=1)[voter])

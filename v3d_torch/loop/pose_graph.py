@@ -1,7 +1,8 @@
-"""Pose-graph optimisation: poses that agree best with measured relative motions (paper, Sec. III-E; Grisetti et al., 2010).
+"""Pose-graph optimisation: poses that agree best with measured relative motions (paper, Sec. III-E).
 
-Lie groups and their Jacobians are PyPose's; the normal equations are sparse, 6x6 blocks where an edge joins two poses,
-and are factorised by SciPy's SuperLU.
+Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. Lie groups and
+their Jacobians are PyPose's; the normal equations are sparse, 6x6 blocks where an edge joins two poses, and factorised by
+SciPy's SuperLU.
 
 Convention: poses ``T_wc`` are perturbed on the right, ``T_wc @ exp(xi)``, with ``xi = [translation, rotation]`` in the
 camera's frame; the error of an edge is ``log(T_ij^-1 T_wi^-1 T_wj)``, in the same order.

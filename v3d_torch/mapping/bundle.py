@@ -1,7 +1,7 @@
 """Bundle adjustment: keyframe poses and landmarks that explain all observations best (ORB-SLAM2, local mapping).
 
 Levenberg-Marquardt on robust errors in pixels and inverse depth; landmarks are eliminated by the Schur complement
-(Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000), and what is left, 6 unknowns per keyframe, is solved densely.
+(Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000); what is left, 6 unknowns per pose, is solved densely.
 
 Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with ``xi = [translation, rotation]``.
 """
@@ -61,7 +61,7 @@ class NormalEquations:
     Attributes:
         U: pose by pose, shape :math:`(F, 6, 6)`.
         V: point by point, shape :math:`(P, 3, 3)`.
-        W: point by pose, shape :math:`(P, 3, 6F)`: dense, as a local map is small and nearly every pose sees much of it.
+        W: point by pose, shape :math:`(P, 3, 6F)`: dense, as a local map is small and most poses see much of it.
         pose_gradient: shape :math:`(6F,)`.
         point_gradient: shape :math:`(P, 3)`.
     """

@@ -67,6 +67,7 @@ class SparseMap:
         self.observations = Table(
             keyframe=((), torch.int64),
             landmark=((), torch.int64),
+            feature=((), torch.int64),  # of the keyframe
             uv=((2,), torch.float64),
             inverse_depth=((), torch.float64),
             octave=((), torch.int64),
@@ -93,6 +94,7 @@ class SparseMap:
         self.observations.append(
             keyframe=torch.full((int(matched.sum()),), index),
             landmark=landmarks[matched],
+            feature=torch.nonzero(matched)[:, 0],
             uv=features.uv[matched],
             inverse_depth=features.inverse_depth[matched],
             octave=features.octave[matched],
@@ -186,6 +188,13 @@ class SparseMap:
         self.observations["landmark"][:] = becomes[self.observations["landmark"]]
         for other in self.keyframes:
             other.landmarks = torch.where(other.landmarks >= 0, becomes[other.landmarks.clamp(min=0)], -1)
+
+    def forget(self, rows: Tensor) -> None:
+        """Take back observations that do not fit, given by their rows in the table."""
+        self.observations["valid"][rows] = False
+        owners, features = self.observations["keyframe"][rows], self.observations["feature"][rows]
+        for index in owners.unique().tolist():
+            self.keyframes[index].landmarks[features[owners == index]] = -1
 
     def cull(self) -> None:
         """Forget landmarks that few of the frames found that should have, and those that no second keyframe saw."""

@@ -1,6 +1,6 @@
-"""Pose of one camera from landmarks it sees: robust least squares on pixels and depth (ORB-SLAM2, Sec. III-B and III-C).
+"""Pose of one camera from landmarks it sees: robust least squares on pixels and depth (paper, Sec. III-E).
 
-Mur-Artal and Tardos, "ORB-SLAM2", T-RO 2017: motion-only bundle adjustment. What it minimises (`reprojection`,
+The motion-only bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos, T-RO 2017). What it minimises (`reprojection`,
 `huber`) and how (`levenberg_marquardt`) is shared with the bundle adjustment of the map and with the pose graph.
 
 Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with ``xi = [translation, rotation]``.
@@ -44,8 +44,11 @@ class Measurements:
 
     @property
     def limit(self) -> Tensor:
-        """Squared error in sigmas that 95 % of good observations stay below: chi-square of 3 or 2 degrees of freedom."""
-        return torch.where(self.inverse_depth > 0, 7.815, 5.991).to(torch.float64)
+        """Squared error in sigmas that 95 % of good observations stay below, :math:`(M,)`.
+
+        It is the quantile of chi-square with 3 degrees of freedom, or 2 without depth.
+        """
+        return torch.full_like(self.inverse_depth, 5.991).masked_fill_(self.inverse_depth > 0, 7.815)
 
 
 def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
@@ -63,7 +66,7 @@ def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) 
     w = 1 / points[:, 2].clamp(min=_NEAREST)
     x, y = points[:, 0] * w, points[:, 1] * w
     u, v = measured.uv.unbind(-1)
-    per_depth = (measured.inverse_depth > 0) / measured.inverse_depth_sigma
+    per_depth = (measured.inverse_depth > 0).to(w.dtype) / measured.inverse_depth_sigma
     residuals = torch.stack(
         [
             (camera.fx * x + camera.cx - u) / measured.pixel_sigma,
@@ -221,7 +224,8 @@ def refine_pose(
     for turn in range(rounds):
         robust = 2 * turn < rounds
         problem = partial(linearise, kept=inliers, limit=measured.limit if robust else torch.inf)
-        found = levenberg_marquardt(T_cw, problem, _step, iterations, tolerance=1e-4)
+        # Steps shrink quadratically: the one that gains a thousandth ends a thousandth of a sigma from the optimum.
+        found = levenberg_marquardt(T_cw, problem, _step, iterations, tolerance=1e-3)
         T_cw, before, (information, _, chi2) = found.state, inliers, found.system
         inliers = chi2 <= measured.limit
         if not robust and torch.equal(inliers, before):
