@@ -57,7 +57,7 @@ def test_what_is_wrong_is_refused_with_the_cure(override: str, message: str) -> 
 def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text(text)
-    with pytest.raises(ConfigError, match="bad.yaml") as raised:
+    with pytest.raises(ConfigError, match=r"bad\.yaml") as raised:
         load_config(file)
     assert message in str(raised.value)
 

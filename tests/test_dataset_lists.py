@@ -7,7 +7,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from v3d_torch.datasets.association import associate
+from v3d_torch.association import associate
 from v3d_torch.datasets.lists import read_associations, read_image_list
 from v3d_torch.errors import InputError
 

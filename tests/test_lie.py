@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.lie import invert, se3_exp, se3_log
+from v3d_torch.lie import invert, rigid, se3_exp, se3_log
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
@@ -71,6 +71,20 @@ def test_convention_translation_first() -> None:
     quarter = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2], dtype=torch.float64))
     x = quarter[:3, :3] @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(x, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+
+
+def test_rigid_puts_bent_rotations_right() -> None:
+    T = se3_exp(tangents(2.0))
+    torch.testing.assert_close(rigid(T), T, rtol=0, atol=1e-14)
+    bent = T.clone()
+    bent[:, :3, :3] += 1e-3 * torch.sin(torch.arange(64 * 9, dtype=torch.float64)).reshape(64, 3, 3)
+    straight = rigid(bent)
+    R = straight[:, :3, :3]
+    torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(64, 3, 3), rtol=0, atol=1e-14)
+    torch.testing.assert_close(straight, T, rtol=0, atol=5e-3)
+    # The nearest rotation R makes R^T M symmetric (polar decomposition).
+    stretch = R.mT @ bent[:, :3, :3]
+    torch.testing.assert_close(stretch, stretch.mT, rtol=0, atol=1e-14)
 
 
 def test_batches_of_any_shape() -> None:

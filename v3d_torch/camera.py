@@ -122,8 +122,7 @@ class BackProjector(torch.nn.Module):
 
     def __init__(self, camera: PinholeCamera) -> None:
         super().__init__()
-        self.register_buffer("rays", camera.rays, persistent=False)
-        self.register_buffer("K", camera.K.to(torch.float32), persistent=False)
+        self._camera = camera
 
     def forward(self, depth: Tensor) -> Tensor:
         """Back-project; differentiable in ``depth``.
@@ -134,5 +133,5 @@ class BackProjector(torch.nn.Module):
         Returns:
             Points in the camera frame, metres, shape :math:`(B, H, W, 3)`; (0, 0, 0) where there is no depth.
         """
-        rays = self.rays.to(depth.dtype).expand(depth.shape[0], -1, -1, -1)
-        return depth_to_3d_v2(depth[:, 0], self.K.to(depth.dtype), xyz_grid=rays)
+        rays = self._camera.rays.to(depth.dtype).expand(depth.shape[0], -1, -1, -1)
+        return depth_to_3d_v2(depth[:, 0], self._camera.K.to(depth.dtype), xyz_grid=rays)

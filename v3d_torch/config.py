@@ -123,7 +123,7 @@ class MaskConfig(Section):
     """What is left out of tracking."""
 
     confirm_still: float = Field(1.0, ge=0)
-    """A person is taken for moving until seen still for so long, seconds (the paper sets persons aside until judged)."""
+    """A person is taken for moving until seen still for so long, seconds (the paper sets persons aside till judged)."""
     hold_dynamic: float = Field(1.0, ge=0)
     """An object judged dynamic or deforming stays so for this long after the last evidence, seconds: gaits pause."""
     margin: int = Field(8, ge=0)

@@ -18,7 +18,6 @@ from rich.table import Table
 
 from v3d_torch.config import load_config
 from v3d_torch.datasets import load_sequence
-from v3d_torch.datasets.base import RGBDSequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
@@ -40,10 +39,10 @@ def exit_on_error() -> Iterator[None]:
     try:
         yield
     except V3DError as error:
-        Console(stderr=True, soft_wrap=True, highlight=False).print(f"[bold red]error:[/] {error}")
+        print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        Console(stderr=True).print("[bold red]error:[/] interrupted before the first frame; nothing was computed")
+        print("error: interrupted before the first frame; nothing was computed", file=sys.stderr)
         sys.exit(2)
 
 

@@ -1,14 +1,15 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and by one process at a time."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
+from filelock import FileLock
 from numpy.typing import NDArray
 
 from v3d_torch.errors import OutputError
@@ -23,17 +24,18 @@ def written_whole(path: Path) -> Iterator[Path]:
     Raises:
         OutputError: when the folder cannot be written or the disk is full.
     """
-    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        os.replace(temporary, path)
+        temporary.replace(path)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror or error}); free the disk or choose another folder"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -55,3 +57,22 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     encoded = cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1]
     with written_whole(path) as temporary:
         temporary.write_bytes(encoded.tobytes())
+
+
+@contextmanager
+def one_process_makes(target: Path) -> Iterator[None]:
+    """Let other processes that want to make the same file or folder wait; they should look again whether it is there.
+
+    Raises:
+        OutputError: when the folder cannot be written.
+    """
+    lock = FileLock(target.with_name(f".{target.name}.lock"))
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written ({error.strerror}); set V3D_CACHE to another folder") from error
+    try:
+        yield
+    finally:
+        lock.release()

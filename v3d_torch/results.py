@@ -6,6 +6,7 @@ import json
 import platform
 import resource
 import sys
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import dump_config
+from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
@@ -69,8 +71,9 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
         stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
         write_trajectory(folder / "keyframes.txt", Trajectory(stamps, T_wc))
     evaluation = None
-    if sequence.groundtruth is not None and len(trajectory) >= 3:
-        evaluation = evaluate(sequence.groundtruth, trajectory, frames=len(sequence))
+    if sequence.groundtruth is not None:
+        with suppress(InputError):  # too few poses to score are still worth writing
+            evaluation = evaluate(sequence.groundtruth, trajectory, frames=len(sequence))
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     with written_whole(folder / "dynamics.parquet") as path:
         pq.write_table(pa.Table.from_pylist(pipeline.run.dynamics, schema=_DYNAMICS), path)
@@ -127,13 +130,12 @@ def _write_ply(path: Path, points: Tensor, colours: Tensor) -> None:
 
 
 def _draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
-    with written_whole(folder / "trajectory.png") as path:
-        trajectory_figure(pipeline.sequence.groundtruth, trajectory, path, title=pipeline.sequence.name)
+    groundtruth = pipeline.sequence.groundtruth
+    trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", title=pipeline.sequence.name)
     snapshots = pipeline.run.snapshots
     if snapshots:
         overlays = [
             [(judged.mask, f"{COCO_NAMES[judged.label]} {judged.id}", judged.verdict.value) for judged in shot.objects]
             for shot in snapshots
         ]
-        with written_whole(folder / "masks.png") as path:
-            mask_strip([shot.image for shot in snapshots], overlays, path)
+        mask_strip([shot.image for shot in snapshots], overlays, folder / "masks.png")

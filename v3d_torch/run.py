@@ -19,7 +19,9 @@ def main(
     camera: Annotated[
         str | None, typer.Option(help="camera.yaml, K.txt or a preset (tum_fr3), where the folder does not say.")
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="YAML file over the defaults, such as configs/paper.yaml.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file over the defaults, such as configs/paper.yaml.")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="A value, such as objects.voting.distance_threshold=0.05.")
     ] = None,

@@ -83,7 +83,8 @@ class V3DSLAM:
             keep = features.on(scene.static)
             static = features[keep]
         with self.clock("tracking"):  # III-E: the pose in the local map
-            estimate = self._localise(static, T_cw, None if motion is None else self._carry(motion, len(features))[keep])
+            carried = self._carry(motion, len(features))[keep]
+            estimate = self._localise(static, T_cw, carried, moved=motion is not None)
         with self.clock("mapping"):  # keyframes, landmarks, local bundle adjustment
             reference = self._reference(estimate)
             self.poses.record(frame.stamp, estimate, reference)
@@ -97,25 +98,26 @@ class V3DSLAM:
                     self.judge.tracker.move_world(T_new_old)
         return scene
 
-    def _carry(self, motion: Motion, count: int) -> Tensor:
+    def _carry(self, motion: Motion | None, count: int) -> Tensor:
         """Ids of the landmarks that the motion's matches carry over from the last frame, -1 for none, (count,)."""
         landmarks = torch.full((count,), -1, dtype=torch.int64)
-        landmarks[motion.pairs[:, 1]] = self._last.landmarks[motion.pairs[:, 0]]
+        if motion is not None and self._last is not None:
+            landmarks[motion.pairs[:, 1]] = self._last.landmarks[motion.pairs[:, 0]]
         return landmarks
 
-    def _localise(self, static: Features, T_cw: Tensor, carried: Tensor | None) -> Estimate:
+    def _localise(self, static: Features, T_cw: Tensor, carried: Tensor, *, moved: bool) -> Estimate:
         """Pose in the local map, else in a place seen before, else by the motion alone, else lost."""
-        nothing = torch.full((len(static),), -1, dtype=torch.int64)
         if self.mapper.map.keyframes:
             local = self.mapper.map.local(self.poses.landmarks, self.config.tracking.local_keyframes)
-            tracking = self.track(static, T_cw, local, nothing if carried is None else carried)
+            tracking = self.track(static, T_cw, local, carried)
             if tracking is None:
                 place = self.loops.recognise(static, self.mapper.map)
                 tracking = place.tracking if place is not None else None
             if tracking is not None:
                 self.mapper.map.record(tracking)
                 return Estimate(Status.TRACKED, tracking.T_cw, tracking.landmarks)
-        known = carried is not None and self.poses.status in (Status.TRACKED, Status.ODOMETRY)
+        known = moved and self.poses.status in (Status.TRACKED, Status.ODOMETRY)
+        nothing = torch.full((len(static),), -1, dtype=torch.int64)
         return Estimate(Status.ODOMETRY if known else Status.LOST, T_cw, nothing)
 
     def _reference(self, estimate: Estimate) -> Keyframe | None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from v3d_torch.datasets.association import associate
+from v3d_torch.association import associate
 from v3d_torch.datasets.images import is_depth
 from v3d_torch.errors import InputError
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-
-from filelock import FileLock
 
 from v3d_torch.datasets.names import canonical_name, download_url, short_name, unknown_name
 from v3d_torch.download import Progress, cache_dir, fetch
-from v3d_torch.errors import DownloadError, InputError, OutputError
+from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.extract import extract_tar
+from v3d_torch.files import one_process_makes
 
 
 def sequence_folder(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
@@ -58,7 +55,7 @@ def _find(root: Path, name: str, full_name: str | None) -> Path | None:
 
 def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
     folder, archive = root / full_name, root / f"{full_name}.tgz"
-    with _alone(full_name):
+    with one_process_makes(cache_dir() / full_name):  # in the cache: the data may be on a file system without locks
         if not folder.is_dir():
             fetch(download_url(full_name), archive, progress=progress)
             try:
@@ -66,15 +63,3 @@ def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
             finally:
                 archive.unlink()
     return folder
-
-
-@contextmanager
-def _alone(full_name: str) -> Iterator[None]:
-    """Let one process at a time download a sequence: two would write into the same file."""
-    lock = cache_dir() / f".{full_name}.lock"
-    try:
-        lock.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(lock):
-            yield
-    except OSError as error:
-        raise OutputError(f"{lock}: cannot be written ({error.strerror}); set V3D_CACHE to another folder") from error

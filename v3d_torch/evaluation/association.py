@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.association import associate
+from v3d_torch.association import associate
 from v3d_torch.types import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.02

@@ -1,4 +1,4 @@
-"""Loop closing: recognise a place, verify it by geometry, correct the pose graph and the map with it (paper, Sec. III-E)."""
+"""Loop closing: recognise a place, verify it by geometry, correct pose graph and map (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
@@ -43,9 +43,7 @@ class LoopCloser:
 
     _COVISIBLE = 30  # landmarks shared by two keyframes that the pose graph ties together (ORB-SLAM2 takes 100 of 2000)
 
-    def __init__(
-        self, config: LoopConfig, motion: MotionEstimator, tracker: MapTracker, local_keyframes: int
-    ) -> None:
+    def __init__(self, config: LoopConfig, motion: MotionEstimator, tracker: MapTracker, local_keyframes: int) -> None:
         self._config = config
         self._motion = motion
         self._tracker = tracker

@@ -1,7 +1,7 @@
 """Pose-graph optimisation: poses that agree best with measured relative motions (paper, Sec. III-E).
 
 Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. Lie groups and
-their Jacobians are PyPose's; the normal equations are sparse, 6x6 blocks where an edge joins two poses, and factorised by
+their Jacobians are PyPose's; the normal equations are sparse, 6x6 blocks where an edge joins two poses, factorised by
 SciPy's SuperLU.
 
 Convention: poses ``T_wc`` are perturbed on the right, ``T_wc @ exp(xi)``, with ``xi = [translation, rotation]`` in the

@@ -1,4 +1,4 @@
-"""Who moves: votes between objects, deformation within them, and the mask of what stands still (paper, Sec. III-C, D)."""
+"""Who moves: votes between objects, deformation within them, the mask of what stands still (paper, III-C, III-D)."""
 
 from __future__ import annotations
 
@@ -80,9 +80,7 @@ class ObjectDynamics:
         self._camera = camera
         self.tracker = InstanceTracker(config.identity, camera, config.clouds.voxel_size)
 
-    def __call__(
-        self, stamp: float, instances: Instances, clouds: ObjectClouds, depth: Tensor, T_wc: Tensor
-    ) -> Scene:
+    def __call__(self, stamp: float, instances: Instances, clouds: ObjectClouds, depth: Tensor, T_wc: Tensor) -> Scene:
         """Judge the objects of a frame.
 
         Args:
@@ -169,8 +167,8 @@ class ObjectDynamics:
                 continue
             if judged.verdict is not Verdict.STATIC:
                 left_out |= judged.mask
-        size = 2 * self._config.mask.margin + 1
-        grown = cv2.dilate(left_out.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+        side = 2 * self._config.mask.margin + 1
+        grown = cv2.dilate(left_out.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
         return torch.from_numpy(grown == 0)
 
 

@@ -1,4 +1,4 @@
-"""Ids of objects over frames by optimal assignment, and prediction of objects that the network misses (paper, Sec. II)."""
+"""Ids of objects over frames by optimal assignment; objects that the network misses are predicted (paper, Sec. II)."""
 
 from __future__ import annotations
 

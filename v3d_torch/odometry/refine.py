@@ -224,7 +224,7 @@ def refine_pose(
     for turn in range(rounds):
         robust = 2 * turn < rounds
         problem = partial(linearise, kept=inliers, limit=measured.limit if robust else torch.inf)
-        # Steps shrink quadratically: the one that gains a thousandth ends a thousandth of a sigma from the optimum.
+        # Convergence is quadratic: after a step that gained a thousandth nothing worth a step is left.
         found = levenberg_marquardt(T_cw, problem, _step, iterations, tolerance=1e-3)
         T_cw, before, (information, _, chi2) = found.state, inliers, found.system
         inliers = chi2 <= measured.limit

@@ -93,8 +93,8 @@ class MapTracker:
         if first is None:
             return None
         # From the refined pose, what the prediction had put out of reach is found as well, within half the radius.
-        T_cw = first.T_cw
-        return self._refine(features, T_cw, local, self._search(features, T_cw, local, 0.5 * self._config.search_radius))
+        pairs = self._search(features, first.T_cw, local, 0.5 * self._config.search_radius)
+        return self._refine(features, first.T_cw, local, pairs)
 
     def _search(self, features: Features, T_cw: Tensor, local: LocalMap, radius: float) -> Tensor:
         """Pairs (row in ``local``, feature) that lie near each other in the image and look alike."""

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from v3d_torch.download import cache_dir
 from v3d_torch.errors import WeightsError
-from v3d_torch.files import written_whole
+from v3d_torch.files import one_process_makes, written_whole
 from v3d_torch.segmentation.checkpoint import read_checkpoint
 from v3d_torch.segmentation.networks import one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
-from v3d_torch.segmentation.weights import REGISTRY, one_process_makes
+from v3d_torch.segmentation.weights import REGISTRY
 
 _VERSION = 1
 """Of what this file makes of a checkpoint: raised with every change, so that older files in the cache are not used."""

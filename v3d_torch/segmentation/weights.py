@@ -13,16 +13,12 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from filelock import FileLock
-
 from v3d_torch.download import cache_dir, fetch
-from v3d_torch.errors import DownloadError, OutputError, WeightsError
-from v3d_torch.files import written_whole
+from v3d_torch.errors import DownloadError, WeightsError
+from v3d_torch.files import one_process_makes, written_whole
 
 _CONNECT_TIMEOUT = 3.0
 """Longest wait for an answer, seconds: without a network each source has to fail soon."""
@@ -131,25 +127,6 @@ def obtain(published: Published, folder: Path) -> Path:
         return target
     with one_process_makes(target):
         return target if _is_whole(target, published) else _download(published, target)
-
-
-@contextmanager
-def one_process_makes(target: Path) -> Iterator[None]:
-    """Let others that want the same file of the cache wait; they should look again whether it is there.
-
-    Raises:
-        OutputError: if the folder cannot be written.
-    """
-    lock = FileLock(target.with_name(f".{target.name}.lock"))
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror}); set V3D_CACHE to another folder") from error
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _is_whole(path: Path, published: Published) -> bool:
