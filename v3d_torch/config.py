@@ -98,11 +98,28 @@ class VotingConfig(Section):
     baselines: tuple[float, ...] = (0.0, 0.3)
     """Distances now are compared with those so many seconds ago; 0 is the frame before, the paper's rule. A walker at
     1 m/s changes by 3 cm in 1/30 s, no more than a centroid's noise, and by 30 cm in 0.3 s."""
-    withdraw: bool = True
-    """An object voted dynamic loses its own votes: else two walkers would outvote every chair."""
-    background: bool = True
-    """The background votes as one more object that never moves, seen through the camera's motion: it decides where
-    fewer than three objects are in view."""
+
+
+class BackgroundConfig(Section):
+    """The background's word on who moves: whether an object's places are still filled, seen through the camera's motion.
+
+    It has the casting vote. Centroids and clouds also change when an object is cut by the image border, covered or
+    segmented differently; and two walkers would outvote every chair.
+    """
+
+    enabled: bool = True
+    """Off for the paper's literal rules."""
+    moved_share: float = Field(0.15, gt=0, le=1)
+    """An object has moved when so much of it has, of what is in sight. Silhouettes err by a pixel or two and make up
+    some hundredths of a person; a torso of 0.4 m that sways by 6 cm reaches this."""
+    tolerance: float = Field(0.01, gt=0)
+    """Depth that differs by this times z^2 is the same, 1/m: four times a structured-light camera's error."""
+    min_tolerance: float = Field(0.04, gt=0)
+    """And so is depth that differs by this, metres: the thickness of clothes and of a voxel."""
+    min_depth: float = Field(0.3, gt=0)
+    """Nearer points are out of such a camera's range, metres."""
+    min_points: int = Field(30, gt=0)
+    """Fewer points in sight tell nothing."""
 
 
 class ChamferConfig(Section):
@@ -137,6 +154,7 @@ class ObjectsConfig(Section):
     clouds: CloudConfig = CloudConfig()
     identity: IdentityConfig = IdentityConfig()
     voting: VotingConfig = VotingConfig()
+    background: BackgroundConfig = BackgroundConfig()
     chamfer: ChamferConfig = ChamferConfig()
     mask: MaskConfig = MaskConfig()
 

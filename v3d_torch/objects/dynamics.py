@@ -11,9 +11,10 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import ObjectsConfig
+from v3d_torch.objects.background import moved_share
 from v3d_torch.objects.chamfer import chamfer_distance
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.track import Track
+from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
 from v3d_torch.segmentation.coco import PERSON
@@ -91,8 +92,9 @@ class ObjectDynamics:
             T_wc: camera to world as the motion from the frame before gives it.
         """
         tracks = self.tracker(stamp, instances, clouds, depth, T_wc)
-        votes = self._vote(stamp, [track for track in tracks if not track.missed])
-        chamfer = self._deform(stamp, [track for track in tracks if not track.missed], T_wc)
+        seen = [track for track in tracks if not track.missed]
+        votes = self._vote(stamp, seen)
+        chamfer = self._deform(stamp, seen)
         objects = [
             Judged(
                 id=track.id,
@@ -112,42 +114,52 @@ class ObjectDynamics:
         """Votes of each object, the most over all baselines; marks those that are voted dynamic."""
         config = self._config.voting
         most: dict[int, int] = {}
-        if not config.enabled:
-            return most
-        for baseline in config.baselines:
-            pairs = [(track, pair) for track in tracks if (pair := track.pair(baseline)) is not None]
+        for baseline in config.baselines if config.enabled else ():
+            pairs = {track: pair for track in tracks if (pair := track.pair(baseline)) is not None}
             if not pairs:
                 continue
-            dynamic, votes = hold_election(
-                torch.stack([then.centroid for _, (then, _) in pairs]),
-                torch.stack([now.centroid for _, (_, now) in pairs]),
-                distance_threshold=config.distance_threshold,
-                vote_threshold=config.vote_threshold,
-                background=config.background,
-                withdraw=config.withdraw,
-            )
-            for i, (track, _) in enumerate(pairs):
-                most[track.id] = max(most.get(track.id, 0), int(votes[i]))
-                if dynamic[i]:
+            then = torch.stack([then.centroid for then, _ in pairs.values()])
+            now = torch.stack([now.centroid for _, now in pairs.values()])
+            moved = torch.tensor([self._background_agrees(*pair) for pair in pairs.values()])
+            ballots = hough_vote(
+                then, now, torch.ones_like(moved), config.distance_threshold, config.vote_threshold
+            ).pair.to(torch.int64)
+            needed = torch.full_like(ballots[0], config.vote_threshold)
+            if self._config.background.enabled:
+                # Who moves cannot tell who else does; nor can who stands still but whose centroid, cut or covered, jumps.
+                witness = ~moved & ((now - then).norm(dim=1) < 0.5 * config.distance_threshold)
+                ballots = torch.cat([ballots * witness, moved[:, None]], dim=1)
+                # Where fewer have a vote than are needed, all who have one must agree.
+                needed = needed.minimum(witness.sum() - witness.long() + 1)
+            votes = ballots.sum(dim=1)
+            for track, count, voted in zip(pairs, votes.tolist(), moved & (votes >= needed), strict=True):
+                most[track.id] = max(most.get(track.id, 0), count)
+                if voted:
                     track.last_dynamic = stamp
         return most
 
-    def _deform(self, stamp: float, tracks: list[Track], T_wc: Tensor) -> dict[int, float]:
+    def _deform(self, stamp: float, tracks: list[Track]) -> dict[int, float]:
         """Root mean Chamfer distance of each object to its own past; marks those that deform."""
         config = self._config.chamfer
         measured: dict[int, float] = {}
-        if not config.enabled:
-            return measured
-        for track in tracks:
+        for track in tracks if config.enabled else ():
             pair = track.pair(config.baseline)
             if pair is None:
                 continue
             then, now = pair
             squared = chamfer_distance(then.cloud[None], now.cloud[None])
             measured[track.id] = float((squared / 2).sqrt())
-            if measured[track.id] >= config.distance_threshold:
+            if measured[track.id] >= config.distance_threshold and self._background_agrees(then, now):
                 track.last_deforming = stamp
         return measured
+
+    def _background_agrees(self, then: Sighting, now: Sighting) -> bool:
+        """Whether the places of an object say that it moved; where they cannot tell, the other evidence stands."""
+        config = self._config.background
+        if not config.enabled:
+            return True
+        share = moved_share((then.cloud, then.view), (now.cloud, now.view), self._camera, config)
+        return not share < config.moved_share
 
     def _judge(self, track: Track, stamp: float) -> Verdict:
         config = self._config.mask
@@ -170,47 +182,3 @@ class ObjectDynamics:
         side = 2 * self._config.mask.margin + 1
         grown = cv2.dilate(left_out.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
         return torch.from_numpy(grown == 0)
-
-
-def hold_election(
-    previous: Tensor,
-    current: Tensor,
-    *,
-    distance_threshold: float,
-    vote_threshold: int,
-    background: bool,
-    withdraw: bool,
-) -> tuple[Tensor, Tensor]:
-    """Alg. 1 of the paper, with two amendments that can be switched off.
-
-    The background, which never moves, votes on each object by its displacement in the world; and an object once
-    voted dynamic, the one with most votes first, loses its own votes, for else two walkers outvote every chair.
-
-    Args:
-        previous: centroids then, world frame, metres, shape :math:`(K, 3)`.
-        current: centroids now, row by row the same objects.
-        distance_threshold: T_d, metres.
-        vote_threshold: T_v; where fewer have a vote (with ``background``), all of them must agree.
-        background: whether the background votes.
-        withdraw: whether dynamic objects lose their votes.
-
-    Returns:
-        Which objects are dynamic, bool, and the votes before any was withdrawn, int64, both of shape :math:`(K,)`.
-    """
-    present = torch.ones(previous.shape[0], dtype=torch.bool)
-    ballots = hough_vote(previous, current, present, distance_threshold, vote_threshold).pair > 0
-    if background:
-        moved = (current - previous).norm(dim=1) >= distance_threshold
-        ballots = torch.cat([ballots, moved[:, None]], dim=1)
-        vote_threshold = min(vote_threshold, ballots.shape[1] - 1)
-    votes = ballots.sum(dim=1)
-    if not withdraw:
-        return votes >= vote_threshold, votes
-    dynamic = torch.zeros_like(present)
-    standing = votes.clone()
-    while True:
-        leader = int(torch.where(dynamic, -1, standing).argmax())
-        if dynamic[leader] or standing[leader] < vote_threshold:
-            return dynamic, votes
-        dynamic[leader] = True
-        standing = standing - ballots[:, leader].long()

@@ -9,6 +9,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from v3d_torch.objects.background import DepthView
+
 
 @dataclass(frozen=True)
 class Sighting:
@@ -18,11 +20,13 @@ class Sighting:
         stamp: seconds.
         centroid: world frame, metres, float64, shape :math:`(3,)`; nan when its cloud was too small.
         cloud: world frame, metres, float32, shape :math:`(P, 3)`.
+        view: the depth image that it was seen in.
     """
 
     stamp: float
     centroid: Tensor
     cloud: Tensor
+    view: DepthView
 
     @property
     def located(self) -> bool:
@@ -30,7 +34,7 @@ class Sighting:
         return bool(torch.isfinite(self.centroid).all())
 
 
-@dataclass
+@dataclass(eq=False)  # a track is itself, not its values
 class Track:
     """An object with an id, and what was seen of it lately.
 

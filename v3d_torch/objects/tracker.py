@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import IdentityConfig
 from v3d_torch.lie import invert
+from v3d_torch.objects.background import DepthView
 from v3d_torch.objects.lift import ObjectClouds
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.types import Instances
@@ -54,7 +55,8 @@ class InstanceTracker:
         Returns:
             Tracks in view or missed for less than the longest gap, by id.
         """
-        sightings = [self._sight(stamp, clouds, i, T_wc) for i in range(len(instances))]
+        view = DepthView(depth, invert(T_wc))
+        sightings = [self._sight(stamp, clouds, i, T_wc, view) for i in range(len(instances))]
         owner = self._assign(stamp, instances, sightings)
         continued = set()
         for i, sighting in enumerate(sightings):
@@ -85,14 +87,19 @@ class InstanceTracker:
         for track in self.tracks:
             track.velocity = R @ track.velocity
             track.sightings = [
-                Sighting(s.stamp, R @ s.centroid + t, s.cloud @ R.T.to(s.cloud) + t.to(s.cloud))
+                Sighting(
+                    s.stamp,
+                    R @ s.centroid + t,
+                    s.cloud @ R.T.to(s.cloud) + t.to(s.cloud),
+                    DepthView(s.view.depth, s.view.T_cw @ invert(T_new_old)),
+                )
                 for s in track.sightings
             ]
 
-    def _sight(self, stamp: float, clouds: ObjectClouds, i: int, T_wc: Tensor) -> Sighting:
+    def _sight(self, stamp: float, clouds: ObjectClouds, i: int, T_wc: Tensor, view: DepthView) -> Sighting:
         cloud = clouds.points[i, clouds.valid[i]]
         R, t = T_wc[:3, :3], T_wc[:3, 3]
-        return Sighting(stamp, R @ clouds.centroid[i].to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud))
+        return Sighting(stamp, R @ clouds.centroid[i].to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud), view)
 
     def _assign(self, stamp: float, instances: Instances, sightings: list[Sighting]) -> dict[int, Track]:
         """Track of each instance that continues one."""
