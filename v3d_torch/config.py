@@ -101,7 +101,7 @@ class VotingConfig(Section):
 
 
 class BackgroundConfig(Section):
-    """The background's word on who moves: whether an object's places are still filled, seen through the camera's motion.
+    """The background's word on who moves: whether an object's places are still filled, by the camera's motion.
 
     It has the casting vote. Centroids and clouds also change when an object is cut by the image border, covered or
     segmented differently; and two walkers would outvote every chair.

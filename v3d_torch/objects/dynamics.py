@@ -126,7 +126,7 @@ class ObjectDynamics:
             ).pair.to(torch.int64)
             needed = torch.full_like(ballots[0], config.vote_threshold)
             if self._config.background.enabled:
-                # Who moves cannot tell who else does; nor can who stands still but whose centroid, cut or covered, jumps.
+                # Who moves cannot tell who else does, nor can who stands still but whose centroid, cut off, jumps.
                 witness = ~moved & ((now - then).norm(dim=1) < 0.5 * config.distance_threshold)
                 ballots = torch.cat([ballots * witness, moved[:, None]], dim=1)
                 # Where fewer have a vote than are needed, all who have one must agree.
