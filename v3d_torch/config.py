@@ -109,9 +109,11 @@ class BackgroundConfig(Section):
 
     enabled: bool = True
     """Off for the paper's literal rules."""
-    moved_share: float = Field(0.15, gt=0, le=1)
-    """An object has moved when so much of it has, of what is in sight. Silhouettes err by a pixel or two and make up
-    some hundredths of a person; a torso of 0.4 m that sways by 6 cm reaches this."""
+    moved_share: float = Field(0.5, gt=0, le=1)
+    """An object has moved when at least half of it, of what is in sight, has."""
+    deformed_share: float = Field(0.15, gt=0, le=1)
+    """It has deformed when so much has. Silhouettes err by a pixel or two and make up some hundredths of a person; a
+    torso of 0.4 m that sways by 6 cm reaches this."""
     tolerance: float = Field(0.01, gt=0)
     """Depth that differs by this times z^2 is the same, 1/m: four times a structured-light camera's error."""
     min_tolerance: float = Field(0.04, gt=0)
@@ -203,10 +205,10 @@ class TrackingConfig(Section):
     """Farther descriptors do not match, bits of 256."""
     max_ratio: float = Field(0.9, gt=0, le=1)
     """Lowe's ratio among the candidates within the radius."""
-    inverse_depth_sigma: float = Field(0.01, gt=0)
-    """Standard deviation of inverse depth, 1/m: a structured-light camera errs by this times z^2. On a still plane
-    that is 0.0014 (Khoshelham and Elberink, Sensors 2012); a hand-held camera's corners lie on depth edges, and its
-    colour and depth are taken at different times: what remains on TUM's fr1 has a median of 0.005."""
+    inverse_depth_sigma: float = Field(0.025, gt=0)
+    """Standard deviation of inverse depth, 1/m; depth itself errs by this times z^2. A still plane gives 0.0014
+    (Khoshelham and Elberink, Sensors 2012), but corners lie on depth edges, and colour and depth are taken at different
+    times and not perfectly aligned. ORB-SLAM2's setting: a pixel of disparity at a baseline of 40 pixel metres."""
     pixel_sigma: float = Field(1.0, gt=0)
     """Standard deviation of a feature's place at level 0, pixels."""
     min_inliers: int = Field(20, gt=0)

@@ -17,7 +17,7 @@ from v3d_torch.objects.lift import ObjectClouds
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
-from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.segmentation.coco import LIVING, PERSON
 from v3d_torch.types import Instances
 
 
@@ -120,7 +120,8 @@ class ObjectDynamics:
                 continue
             then = torch.stack([then.centroid for then, _ in pairs.values()])
             now = torch.stack([now.centroid for _, now in pairs.values()])
-            moved = torch.tensor([self._background_agrees(*pair) for pair in pairs.values()])
+            share = self._config.background.moved_share
+            moved = torch.tensor([self._background_agrees(*pair, share) for pair in pairs.values()])
             ballots = hough_vote(
                 then, now, torch.ones_like(moved), config.distance_threshold, config.vote_threshold
             ).pair.to(torch.int64)
@@ -139,27 +140,27 @@ class ObjectDynamics:
         return most
 
     def _deform(self, stamp: float, tracks: list[Track]) -> dict[int, float]:
-        """Root mean Chamfer distance of each object to its own past; marks those that deform."""
+        """Root mean Chamfer distance of each living object to its own past; marks those that deform."""
         config = self._config.chamfer
+        share = self._config.background.deformed_share
         measured: dict[int, float] = {}
         for track in tracks if config.enabled else ():
             pair = track.pair(config.baseline)
-            if pair is None:
+            if pair is None or track.label not in LIVING:
                 continue
             then, now = pair
             squared = chamfer_distance(then.cloud[None], now.cloud[None])
             measured[track.id] = float((squared / 2).sqrt())
-            if measured[track.id] >= config.distance_threshold and self._background_agrees(then, now):
+            if measured[track.id] >= config.distance_threshold and self._background_agrees(then, now, share):
                 track.last_deforming = stamp
         return measured
 
-    def _background_agrees(self, then: Sighting, now: Sighting) -> bool:
-        """Whether the places of an object say that it moved; where they cannot tell, the other evidence stands."""
+    def _background_agrees(self, then: Sighting, now: Sighting, share: float) -> bool:
+        """Whether so much of an object has left its places; not where too little of them is in sight to tell."""
         config = self._config.background
         if not config.enabled:
             return True
-        share = moved_share((then.cloud, then.view), (now.cloud, now.view), self._camera, config)
-        return not share < config.moved_share
+        return moved_share((then.cloud, then.view), (now.cloud, now.view), self._camera, config) >= share
 
     def _judge(self, track: Track, stamp: float) -> Verdict:
         config = self._config.mask

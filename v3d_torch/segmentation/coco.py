@@ -17,3 +17,6 @@ COCO_NAMES: tuple[str, ...] = (
 
 PERSON = COCO_NAMES.index("person")
 """The class that the paper sets aside as potentially moving (Sec. III-A)."""
+
+LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
+"""Classes that deform by themselves: people and animals. Things are rigid: they move as a whole or not at all."""

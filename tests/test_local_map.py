@@ -1,0 +1,371 @@
+"""The map against plain counting; local bundle adjustment on a scene with known truth; when keyframes are made."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import Config, MappingConfig, load_config
+from v3d_torch.lie import invert, se3_exp
+from v3d_torch.mapping.adjust import adjust_locally
+from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.mapper import Mapper
+from v3d_torch.mapping.recorder import Estimate, Status
+from v3d_torch.mapping.table import Table
+from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.tracker import Tracking
+from v3d_torch.types import RGBDFrame
+
+CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+def numbers(*shape: int, seed: int) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def features(count: int, seed: int = 0, depth: float | None = None) -> Features:
+    """Features all over the image, 1 to 3 m away or at the given depth."""
+    uv = numbers(count, 2, seed=seed) * torch.tensor([639.0, 479.0], dtype=torch.float64)
+    bits = torch.randint(0, 256, (count, 32), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
+    z = 1 + 2 * numbers(count, seed=seed + 1) if depth is None else torch.full((count,), depth, dtype=torch.float64)
+    return Features(uv, uv.round().long(), z, (4 * numbers(count, seed=seed + 2)).long(), bits)
+
+
+def sparse_map(**settings_: int) -> SparseMap:
+    config = Config()
+    return SparseMap(MappingConfig(**settings_), config.features, CAMERA)
+
+
+def insert(target: SparseMap, landmarks: list[int], T_cw: Tensor = EYE, seed: int = 0) -> Keyframe:
+    """A keyframe whose features are the given landmarks, and no new ones as they have no depth."""
+    seen = features(len(landmarks), seed=seed, depth=0.0)
+    index = len(target.keyframes)
+    return target.insert(index, index / 30, T_cw, seen, torch.tensor(landmarks, dtype=torch.int64))
+
+
+# --- the table
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(st.integers(0, 300), max_size=8))
+def test_table_keeps_what_is_appended(counts: list[int]) -> None:
+    table = Table(number=((), torch.int64), place=((2,), torch.float64))
+    expected = torch.zeros(0, 2, dtype=torch.float64)
+    for turn, count in enumerate(counts):
+        places = numbers(count, 2, seed=turn)
+        rows = table.append(number=torch.arange(count), place=places)
+        assert rows.tolist() == list(range(len(expected), len(expected) + count))
+        expected = torch.cat([expected, places])
+    assert len(table) == len(expected)
+    assert torch.equal(table["place"], expected)
+    assert table["number"].tolist() == [number for count in counts for number in range(count)]
+
+
+def test_a_column_is_a_view_and_rows_are_whole() -> None:
+    table = Table(number=((), torch.int64), flag=((), torch.bool))
+    table.append(number=torch.arange(3), flag=torch.zeros(3, dtype=torch.bool))
+    table["number"][1] = 7
+    assert table["number"].tolist() == [0, 7, 2]
+    with pytest.raises(KeyError, match="flag"):
+        table.append(number=torch.arange(3))
+    assert len(table) == 3
+
+
+# --- landmarks
+
+
+def test_convention_landmarks_lie_where_their_keyframe_saw_them() -> None:
+    T_cw = se3_exp(torch.tensor([0.3, -0.2, 0.1, 0.1, 0.4, -0.2], dtype=torch.float64))
+    seen = features(50)
+    target = sparse_map()
+    keyframe = target.insert(0, 0.0, T_cw, seen, torch.full((50,), -1))
+    points = target.landmarks["point"]
+    in_camera = points @ T_cw[:3, :3].T + T_cw[:3, 3]
+    assert torch.equal(keyframe.landmarks, torch.arange(50))
+    torch.testing.assert_close(CAMERA.project(in_camera), seen.uv, rtol=0, atol=1e-9)
+    torch.testing.assert_close(in_camera[:, 2], seen.depth, rtol=0, atol=1e-12)
+    sight = points - invert(T_cw)[:3, 3]
+    torch.testing.assert_close(target.landmarks["direction"] * sight.norm(dim=1, keepdim=True), sight)
+    # Seen on level n at distance d, a landmark is as large on level 0 at d * 1.2^n.
+    torch.testing.assert_close(target.landmarks["reach"], sight.norm(dim=1) * 1.2 ** seen.octave.double())
+
+
+def test_new_landmarks_are_near_new_and_as_many_as_wanted() -> None:
+    target = sparse_map(min_tracked=10, landmarks_per_keyframe=60, max_landmark_depth=2.0)
+    insert(target, [])
+    first = target.insert(1, 0.0, EYE, features(200), torch.full((200,), -1))
+    made = first.landmarks >= 0
+    assert made.sum() == 60
+    assert (features(200).depth[made] <= 2.0).all()
+    known = torch.full((200,), -1)
+    known[:25] = torch.arange(25)
+    second = target.insert(2, 0.1, EYE, features(200), known)
+    assert torch.equal(second.landmarks[:25], torch.arange(25))
+    assert (second.landmarks >= 0).sum() == 60
+    assert len(target.landmarks) == 60 + 35
+
+
+def test_a_far_scene_is_mapped_too() -> None:
+    target = sparse_map(max_landmark_depth=4.0, min_tracked=50)
+    assert (target.insert(0, 0.0, EYE, features(120, depth=6.0), torch.full((120,), -1)).landmarks >= 0).all()
+
+
+# --- who sees whom
+
+
+@pytest.fixture
+def seeing() -> tuple[SparseMap, list[set[int]]]:
+    """A map of 40 landmarks and 12 keyframes that see some of them, and the same as plain sets."""
+    target = sparse_map()
+    target.insert(0, 0.0, EYE, features(40), torch.full((40,), -1))
+    sets = [set(range(40))]
+    dice = random.Random(3)  # noqa: S311
+    for seed in range(11):
+        chosen = sorted(dice.sample(range(40), dice.randint(2, 20)))
+        insert(target, chosen, seed=seed)
+        sets.append(set(chosen))
+    return target, sets
+
+
+def test_covisibility_equals_plain_counting(seeing: tuple[SparseMap, list[set[int]]]) -> None:
+    target, sets = seeing
+    wanted = {1, 5, 8, 13, 21, 34}
+    counts = [len(wanted & seen) for seen in sets]
+    assert target.shared(torch.tensor(sorted(wanted))).tolist() == counts
+    expected = sorted((k for k in range(12) if counts[k]), key=lambda k: -counts[k])[:5]
+    assert target.covisible(torch.tensor(sorted(wanted)), 5).tolist() == expected
+    pairs = [[i, j] for i in range(12) for j in range(i + 1, 12) if len(sets[i] & sets[j]) >= 7 or j == i + 1]
+    assert target.covisibility(7).tolist() == pairs
+
+
+def test_the_local_map_is_what_the_best_keyframes_see(seeing: tuple[SparseMap, list[set[int]]]) -> None:
+    target, sets = seeing
+    target.landmarks["alive"][3] = False
+    best = target.covisible(torch.tensor([2, 9]), 3).tolist()
+    local = target.local(torch.tensor([2, 9]), 3)
+    assert local.ids.tolist() == sorted(set.union(*(sets[k] for k in best)) - {3})
+    assert torch.equal(local.points, target.landmarks["point"][local.ids])
+    assert torch.equal(local.descriptors, target.landmarks["descriptor"][local.ids])
+    assert len(target.local(torch.zeros(0, dtype=torch.int64), 3).ids) == 0
+
+
+def test_forgotten_observations_no_longer_count(seeing: tuple[SparseMap, list[set[int]]]) -> None:
+    target, _ = seeing
+    table = target.observations
+    rows = torch.nonzero((table["keyframe"] == 4) & (table["landmark"] % 2 == 0))[:, 0]
+    gone = table["landmark"][rows]
+    kept = target.keyframes[4].landmarks[target.keyframes[4].landmarks % 2 == 1]
+    assert target.shared(gone)[4] == len(gone) > 0
+    target.forget(rows)
+    assert target.shared(gone)[4] == 0
+    assert target.shared(kept)[4] == len(kept)
+    assert target.keyframes[4].landmarks[target.keyframes[4].landmarks >= 0].tolist() == kept.tolist()
+
+
+def test_fused_landmarks_are_one(seeing: tuple[SparseMap, list[set[int]]]) -> None:
+    target, sets = seeing
+    last = target.insert(12, 0.4, EYE, features(6, seed=50), torch.full((6,), -1))
+    known = torch.tensor([4, -1, 7, -1, -1, 30])  # what three of its six landmarks turned out to be
+    doubles = last.landmarks[[0, 2, 5]].tolist()
+    target.fuse(last, known)
+    assert last.landmarks.tolist() == [4, 41, 7, 43, 44, 30]
+    assert not target.landmarks["alive"][doubles].any()
+    assert not torch.isin(target.observations["landmark"], torch.tensor(doubles)).any()
+    assert target.shared(torch.tensor([4, 7, 30])).tolist() == [len({4, 7, 30} & seen) for seen in sets] + [3]
+
+
+def test_culling_keeps_what_is_found_again() -> None:
+    target = sparse_map()
+    target.insert(0, 0.0, EYE, features(4), torch.full((4,), -1))
+    everything = torch.arange(4)
+    for turn in range(8):  # landmark 0 is found always, 1 every second time, 2 once, 3 never
+        found = torch.tensor([0, 1 if turn % 2 else -1, 2 if turn == 0 else -1, -1])
+        target.record(Tracking(EYE, found, everything))
+    target.cull()
+    assert target.landmarks["alive"].all()  # no judgement before the next keyframe
+    insert(target, [0, 1, 2, 3])
+    target.cull()
+    assert target.landmarks["alive"].tolist() == [True, True, False, False]
+
+
+def test_culling_drops_landmarks_that_no_second_keyframe_saw() -> None:
+    target = sparse_map()
+    target.insert(0, 0.0, EYE, features(3), torch.full((3,), -1))
+    for _ in range(2):
+        insert(target, [1])
+        target.cull()
+    assert target.landmarks["alive"].all()
+    insert(target, [])
+    target.cull()
+    assert target.landmarks["alive"].tolist() == [False, True, False]
+
+
+def test_landmarks_go_along_with_the_keyframe_that_made_them() -> None:
+    target = sparse_map()
+    target.insert(0, 0.0, EYE, features(20), torch.full((20,), -1))
+    target.insert(1, 0.1, EYE, features(30, seed=9), torch.full((30,), -1))
+    before = target.landmarks["point"].clone()
+    T_cw = se3_exp(torch.tensor([0.5, 0.1, -0.3, 0.2, 0.0, 0.3], dtype=torch.float64))
+    target.move_keyframes(torch.stack([EYE, T_cw]))
+    assert torch.equal(target.landmarks["point"][:20], before[:20])
+    # What a camera sees does not change when camera and landmarks move together.
+    moved = target.landmarks["point"][20:] @ T_cw[:3, :3].T + T_cw[:3, 3]
+    torch.testing.assert_close(moved, before[20:], rtol=0, atol=1e-12)
+    directions = target.landmarks["direction"][20:] @ T_cw[:3, :3].T
+    torch.testing.assert_close(directions, before[20:] / before[20:].norm(dim=1, keepdim=True), rtol=0, atol=1e-12)
+    assert torch.equal(target.keyframes[1].T_cw, T_cw)
+
+
+# --- local bundle adjustment
+
+
+class Walk:
+    """Cameras that step sideways along 300 points; what they measure is true up to noise, their poses are wrong."""
+
+    def __init__(self, keyframes: int, error: float) -> None:
+        # Twice the width of the image: new ones come into view as others leave it.
+        self.points = CAMERA.lift(features(300, seed=1).uv * torch.tensor([2, 1]), 2 + numbers(300, seed=2))
+        self.map = sparse_map(max_landmark_depth=8)
+        o = torch.zeros(keyframes, dtype=torch.float64)
+        steps = torch.arange(keyframes, dtype=torch.float64)
+        self.T_cw = se3_exp(torch.stack([-0.1 * steps, o, o, o, -0.01 * steps, o], dim=1))
+        wrong = error * torch.randn(keyframes, 6, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+        wrong[0] = 0
+        start = se3_exp(wrong) @ self.T_cw
+        ids = torch.full((300,), -1)
+        for k in range(keyframes):
+            seen, which = self.look(k)
+            keyframe = self.map.insert(k, k / 30, start[k], seen, ids[which])
+            ids[which] = keyframe.landmarks
+
+    def look(self, k: int) -> tuple[Features, Tensor]:
+        in_camera = self.points @ self.T_cw[k, :3, :3].T + self.T_cw[k, :3, 3]
+        uv = CAMERA.project(in_camera)
+        which = torch.nonzero(((uv > 0) & (uv < torch.tensor([640, 480]))).all(dim=1))[:, 0]
+        noise = 0.2 * torch.randn(len(which), 2, generator=torch.Generator().manual_seed(k), dtype=torch.float64)
+        zeros = torch.zeros(len(which), dtype=torch.int64)
+        descriptors = torch.zeros(len(which), 32, dtype=torch.uint8)
+        uv = uv[which] + noise
+        return Features(uv, uv.long(), in_camera[which, 2], zeros, descriptors), which
+
+    def errors(self) -> Tensor:
+        """Distance of each camera to its true place, metres."""
+        T_wc = invert(torch.stack([keyframe.T_cw for keyframe in self.map.keyframes]))
+        return (T_wc - invert(self.T_cw))[:, :3, 3].norm(dim=1)
+
+
+def test_local_adjustment_finds_the_true_poses() -> None:
+    walk = Walk(keyframes=6, error=0.01)
+    before = walk.errors()
+    for _ in range(3):
+        adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)
+    assert before.max() > 0.02
+    assert walk.errors().max() < 0.003
+    assert torch.equal(walk.map.keyframes[0].T_cw, EYE)  # the first is the world
+
+
+def test_local_adjustment_moves_the_neighbourhood_only() -> None:
+    walk = Walk(keyframes=12, error=0.01)
+    before = [keyframe.T_cw.clone() for keyframe in walk.map.keyframes]
+    config = load_config(overrides=["mapping.bundle_keyframes=4"])
+    adjust_locally(walk.map, walk.map.keyframes[-1], config, CAMERA)
+    moved = [not torch.equal(keyframe.T_cw, old) for keyframe, old in zip(walk.map.keyframes, before, strict=True)]
+    assert moved == [False] * 8 + [True] * 4
+
+
+def test_without_bundle_keyframes_nothing_is_adjusted() -> None:
+    walk = Walk(keyframes=4, error=0.01)
+    before = walk.errors()
+    adjust_locally(walk.map, walk.map.keyframes[-1], load_config(overrides=["mapping.bundle_keyframes=0"]), CAMERA)
+    assert torch.equal(walk.errors(), before)
+
+
+def test_local_adjustment_forgets_what_does_not_fit() -> None:
+    walk = Walk(keyframes=6, error=0.0)
+    table = walk.map.observations
+    wrong = torch.nonzero((table["keyframe"] == 5) & (table["landmark"] % 20 == 0))[:, 0]
+    table["uv"][wrong] += 50.0
+    adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)
+    assert len(wrong) > 5
+    assert not table["valid"][wrong].any()
+    assert table["valid"].double().mean() > 0.98
+    assert (walk.map.keyframes[5].landmarks[table["feature"][wrong]] == -1).all()
+    assert walk.errors().max() < 0.006
+    adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)  # without them
+    assert walk.errors().max() < 0.003
+
+
+# --- when a frame becomes a keyframe
+
+
+class Frames:
+    """Frames as the mapper sees them: how many landmarks each of them found is all that matters."""
+
+    def __init__(self, **settings_: int | float) -> None:
+        overrides = [f"mapping.{key}={value}" for key, value in settings_.items()]
+        self.mapper = Mapper(load_config(overrides=[*overrides, "mapping.bundle_keyframes=0"]), CAMERA)
+        self.index = -1
+
+    def __call__(self, found: int, status: Status = Status.TRACKED, features_: int = 400) -> bool:
+        """Take in the next frame, 1/30 s after the one before; whether it became a keyframe."""
+        self.index += 1
+        image, depth = torch.zeros(3, 480, 640, dtype=torch.uint8), torch.zeros(1, 480, 640)
+        landmarks = torch.full((features_,), -1)
+        landmarks[:found] = torch.arange(found)
+        frame = RGBDFrame(self.index, self.index / 30, image, depth)
+        keyframes = self.mapper.map.keyframes
+        reference = keyframes[-1] if keyframes else None
+        estimate = Estimate(status, EYE, landmarks)
+        return self.mapper(frame, features(features_), estimate, reference) is not None
+
+
+def test_keyframes_come_when_tracking_gets_weak() -> None:
+    take = Frames(max_gap=100, min_tracked=100, min_tracked_ratio=0.7)
+    assert take(0, Status.LOST)
+    assert [take(found) for found in (300, 290, 211, 209)] == [False, False, False, True]
+    assert [take(found) for found in (150, 110, 104)] == [False, False, True]  # below 0.7 of 150
+    assert [take(found) for found in (120, 101, 99)] == [False, False, True]  # below the least count
+
+
+def test_keyframes_come_at_the_latest_after_the_gap() -> None:
+    take = Frames(max_gap=5)
+    made = [take(0, Status.LOST)] + [take(300) for _ in range(15)]
+    assert [index for index, keyframe in enumerate(made) if keyframe] == [0, 5, 10, 15]
+
+
+def test_odometry_is_mapped_at_once_so_that_the_map_goes_on() -> None:
+    take = Frames()
+    assert take(0, Status.LOST)
+    assert take(0, Status.ODOMETRY)
+
+
+def test_no_map_starts_where_too_little_is_seen() -> None:
+    take = Frames(min_tracked=100)
+    assert not take(0, Status.LOST, features_=99)
+    assert take(0, Status.LOST, features_=100)
+
+
+def test_a_lost_camera_maps_on_adrift_after_its_patience() -> None:
+    take = Frames(restart_after=0.5)
+    assert take(0, Status.LOST)
+    made = [take(0, Status.LOST) for _ in range(20)]
+    assert made.index(True) in (15, 16)  # half a second at 30 frames a second
+    first, second = take.mapper.map.keyframes[:2]
+    assert not first.adrift and second.adrift
+    take(5)
+    assert take.mapper.map.keyframes[-1].adrift  # what is tied to it is adrift as well
+
+
+def test_patience_starts_anew_when_the_camera_is_found() -> None:
+    take = Frames(restart_after=0.5, max_gap=1000)
+    assert take(0, Status.LOST)
+    for _ in range(3):
+        assert not any([take(0, Status.LOST) for _ in range(10)])
+        assert not take(300)

@@ -1,0 +1,220 @@
+"""Poses of frames: prediction, lost frames, and how they follow their keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
+
+from v3d_torch.lie import invert, se3_exp
+from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
+from v3d_torch.odometry.orb import Features
+
+EYE = torch.eye(4, dtype=torch.float64)
+TWIST = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.4, -0.3], dtype=torch.float64)  # m/s and rad/s
+
+twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(lambda v: torch.tensor(v, dtype=torch.float64))
+
+
+def keyframe(T_cw: Tensor = EYE, stamp: float = 0.0, landmarks: int = 0, adrift: bool = False) -> Keyframe:
+    none = torch.zeros(0, dtype=torch.int64)
+    empty = Features(torch.zeros(0, 2), torch.zeros(0, 2).long(), none.double(), none, torch.zeros(0, 32).byte())
+    return Keyframe(0, 0, stamp, T_cw, empty, torch.arange(landmarks), adrift)
+
+
+def estimate(T_cw: Tensor, status: Status = Status.TRACKED, landmarks: tuple[int, ...] = ()) -> Estimate:
+    return Estimate(status, T_cw, torch.tensor(landmarks, dtype=torch.int64))
+
+
+def walk(stamps: list[float], lost: tuple[int, ...] = (), tied_to: Keyframe | None = None) -> PoseRecorder:
+    """Frames of a camera that moves with the constant twist; lost ones are recorded where they are predicted."""
+    poses = PoseRecorder()
+    for index, stamp in enumerate(stamps):
+        if index in lost:
+            poses.record(stamp, estimate(poses.predict(stamp), Status.LOST), tied_to)
+        else:
+            poses.record(stamp, estimate(se3_exp(TWIST * stamp)), tied_to)
+    return poses
+
+
+# --- prediction
+
+
+def test_nothing_is_known_before_the_first_frame() -> None:
+    poses = PoseRecorder()
+    assert poses.status is None and poses.statuses == []
+    assert torch.equal(poses.T_cw, EYE)
+    assert torch.equal(poses.predict(3.0), EYE)
+
+
+@settings(deadline=None, max_examples=30)
+@given(twists, st.floats(0.01, 0.1), st.floats(0.01, 0.2))
+def test_constant_velocity_is_predicted_exactly(twist: Tensor, step: float, ahead: float) -> None:
+    poses = PoseRecorder()
+    for stamp in (0.0, step):
+        poses.record(stamp, estimate(se3_exp(twist * stamp)), None)
+    torch.testing.assert_close(poses.predict(step + ahead), se3_exp(twist * (step + ahead)), rtol=0, atol=1e-9)
+
+
+def test_convention_velocity_acts_in_the_camera_frame() -> None:
+    """A camera far from the origin that turns on the spot is predicted to stay there."""
+    T_wc = EYE.clone()
+    T_wc[:3, 3] = torch.tensor([10.0, -5.0, 3.0])
+    turn = torch.tensor([0, 0, 0, 0, 0.5, 0], dtype=torch.float64)
+    poses = PoseRecorder()
+    for stamp in (0.0, 0.1):
+        poses.record(stamp, estimate(invert(T_wc @ se3_exp(turn * stamp))), None)
+    predicted = invert(poses.predict(0.2))
+    torch.testing.assert_close(predicted[:3, 3], T_wc[:3, 3], rtol=0, atol=1e-9)
+    torch.testing.assert_close(predicted, T_wc @ se3_exp(turn * 0.2), rtol=0, atol=1e-9)
+
+
+def test_no_motion_is_believed_for_longer_than_a_fifth_of_a_second() -> None:
+    poses = walk([0.0, 0.1])
+    torch.testing.assert_close(poses.predict(5.0), se3_exp(TWIST * 0.3), rtol=0, atol=1e-9)
+
+
+def test_a_lost_camera_goes_on_for_a_moment_and_then_stands() -> None:
+    stamps = [k / 30 for k in range(40)]
+    poses = walk(stamps[:10])
+    where = []
+    for stamp in stamps[10:]:
+        where.append(invert(poses.predict(stamp))[:3, 3])
+        poses.record(stamp, estimate(poses.predict(stamp), Status.LOST), None)
+    steps = torch.stack(where).diff(dim=0).norm(dim=1)
+    speed = float(TWIST[:3].norm())
+    assert steps[:4].min() > 0.9 * speed / 30  # goes on
+    assert (steps[8:] < 1e-12).all()  # stands
+    assert steps.sum() < 0.3 * speed
+
+
+def test_the_jump_to_where_a_lost_camera_is_found_is_no_velocity() -> None:
+    poses = walk([0.0, 1 / 30], lost=())
+    for k in range(2, 20):
+        poses.record(k / 30, estimate(poses.T_cw, Status.LOST), None)
+    away = se3_exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64))
+    poses.record(20 / 30, estimate(away), None)
+    torch.testing.assert_close(poses.predict(21 / 30), away, rtol=0, atol=1e-12)
+
+
+# --- lost frames
+
+
+def test_lost_frames_lie_on_the_geodesic_between_their_neighbours() -> None:
+    stamps = [0.0, 0.1, 0.2, 0.35, 0.5, 0.6]  # unevenly spaced
+    poses = walk(stamps, lost=(2, 3, 4))
+    trajectory = poses.trajectory()
+    expected = invert(se3_exp(TWIST * torch.tensor(stamps, dtype=torch.float64)[:, None]))
+    torch.testing.assert_close(trajectory.T_wc, expected, rtol=0, atol=1e-9)
+    assert [status.value for status in poses.statuses] == ["tracked"] * 2 + ["lost"] * 3 + ["tracked"]
+
+
+def test_interpolated_rotations_equal_scipys() -> None:
+    stamps = [0.0, 0.2, 0.3, 1.0]
+    ends = Rotation.from_rotvec([[0.1, 0.2, 0.3], [-1.0, 0.8, 0.5]])
+    poses = PoseRecorder()
+    for index, stamp in enumerate(stamps):
+        T_cw = EYE.clone()
+        T_cw[:3, :3] = torch.from_numpy(ends[0 if index == 0 else 1].as_matrix())
+        poses.record(stamp, estimate(T_cw, Status.LOST if index in (1, 2) else Status.TRACKED), None)
+    R_cw = poses.trajectory().T_wc[:, :3, :3].mT.numpy()
+    np.testing.assert_allclose(R_cw, Slerp([0.0, 1.0], ends)(stamps).as_matrix(), atol=1e-9)
+
+
+def test_lost_frames_at_the_ends_stay_where_they_were_predicted() -> None:
+    stamps = [k / 10 for k in range(6)]
+    poses = walk(stamps, lost=(0, 4, 5))
+    T_wc = poses.trajectory().T_wc
+    torch.testing.assert_close(T_wc[0], EYE)
+    torch.testing.assert_close(T_wc[4], invert(se3_exp(TWIST * 0.4)), rtol=0, atol=1e-9)
+    torch.testing.assert_close(T_wc[5], poses.trajectory().T_wc[5])
+    assert len(T_wc) == 6
+
+
+def test_a_camera_that_is_never_found_still_has_a_pose_for_every_frame() -> None:
+    trajectory = walk([0.0, 0.1, 0.2], lost=(0, 1, 2)).trajectory()
+    assert trajectory.stamps.tolist() == [0.0, 0.1, 0.2]
+    torch.testing.assert_close(trajectory.T_wc, EYE.expand(3, 4, 4))
+
+
+# --- keyframes move
+
+
+@settings(deadline=None, max_examples=20)
+@given(twists, twists)
+def test_frames_follow_their_keyframe(at: Tensor, correction: Tensor) -> None:
+    """What a frame sees of its keyframe stays the same when the back end moves the keyframe."""
+    tied = keyframe(se3_exp(at))
+    poses = walk([0.0, 0.1, 0.2], tied_to=tied)
+    before = poses.trajectory().T_wc
+    tied.T_cw = se3_exp(correction) @ tied.T_cw
+    after = poses.trajectory().T_wc
+    T_new_old = invert(se3_exp(correction) @ se3_exp(at)) @ se3_exp(at)
+    torch.testing.assert_close(after, T_new_old @ before, rtol=0, atol=1e-9)
+    torch.testing.assert_close(poses.T_cw, invert(after[-1]), rtol=0, atol=1e-9)
+
+
+def test_each_frame_follows_its_own_keyframe() -> None:
+    first, second = keyframe(), keyframe(se3_exp(TWIST))
+    poses = PoseRecorder()
+    for stamp, tied in ((0.0, first), (0.1, second)):
+        poses.record(stamp, estimate(se3_exp(TWIST * stamp)), tied)
+    second.T_cw = second.T_cw @ se3_exp(torch.tensor([-1.0, 0, 0, 0, 0, 0], dtype=torch.float64))
+    T_wc = poses.trajectory().T_wc
+    assert torch.equal(T_wc[0], EYE)
+    shift = T_wc[1] @ se3_exp(TWIST * 0.1)  # new from old
+    torch.testing.assert_close(shift[:3, 3], torch.tensor([1.0, 0, 0], dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+def test_lost_frames_are_interpolated_after_all_corrections() -> None:
+    tied = keyframe()
+    poses = PoseRecorder()
+    for stamp in (0.0, 0.1, 0.2):
+        poses.record(stamp, estimate(EYE, Status.LOST if stamp == 0.1 else Status.TRACKED), None if stamp == 0 else tied)
+    tied.T_cw = se3_exp(torch.tensor([-0.4, 0, 0, 0, 0, 0], dtype=torch.float64))
+    x = poses.trajectory().T_wc[:, 0, 3]
+    assert x.tolist() == pytest.approx([0.0, 0.2, 0.4])
+
+
+def test_a_frame_that_becomes_a_keyframe_is_the_keyframe() -> None:
+    poses = walk([0.0, 0.1], tied_to=keyframe())
+    own = keyframe(se3_exp(TWIST), stamp=0.1, landmarks=7)
+    poses.anchor(own)
+    assert torch.equal(poses.T_cw, own.T_cw)
+    own.T_cw = se3_exp(2 * TWIST)
+    assert torch.equal(poses.T_cw, own.T_cw)
+    assert poses.landmarks.tolist() == list(range(7))
+    assert len(poses.statuses) == 2
+
+
+# --- status
+
+
+def test_the_first_keyframe_makes_its_frame_tracked() -> None:
+    poses = PoseRecorder()
+    poses.record(0.0, estimate(EYE, Status.LOST), None)
+    assert poses.status is Status.LOST
+    poses.anchor(keyframe())
+    assert poses.status is Status.TRACKED
+
+
+def test_what_is_tied_to_a_guess_is_adrift() -> None:
+    poses = PoseRecorder()
+    poses.record(0.0, estimate(EYE, Status.LOST), keyframe())
+    guess = keyframe(adrift=True)
+    poses.anchor(guess)
+    poses.record(0.1, estimate(EYE), guess)
+    poses.record(0.2, estimate(EYE, Status.ODOMETRY), guess)
+    assert poses.statuses == [Status.ADRIFT, Status.ADRIFT, Status.ODOMETRY]
+
+
+def test_landmarks_are_those_of_the_last_frame_that_found_any() -> None:
+    poses = PoseRecorder()
+    poses.record(0.0, estimate(EYE, landmarks=(5, -1, 2)), None)
+    poses.record(0.1, estimate(EYE, Status.LOST, landmarks=(-1, -1)), None)
+    assert poses.landmarks.tolist() == [5, 2]
