@@ -192,8 +192,12 @@ class MotionConfig(Section):
     """Reprojection error of inliers of PnP-RANSAC, pixels."""
     iterations: int = Field(300, gt=0)
     """Most hypotheses of either RANSAC: finds a sample of 5 at half outliers with probability 0.9999."""
-    min_inliers: int = Field(12, gt=0)
-    """Fewer do not make a motion."""
+    min_inliers: int = Field(20, gt=0)
+    """Fewer do not make a motion: a dozen of wrong matches agree by chance."""
+    max_speed: float = Field(5.0, gt=0)
+    """No hand moves a camera faster, m/s; between two frames a motion beyond is wrong."""
+    max_rotation_rate: float = Field(6.3, gt=0)
+    """Nor turns it faster, rad/s: a full turn in a second."""
 
 
 class TrackingConfig(Section):

@@ -32,6 +32,7 @@ Segmenter = Callable[[RGBDFrame], Instances]
 class View:
     """What the last frame saw standing still: features, and the id of the landmark behind each, -1 for none."""
 
+    stamp: float
     features: Features
     landmarks: Tensor
 
@@ -76,7 +77,7 @@ class V3DSLAM:
         with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what is no person
-            motion = self.motion(self._last.features, features, ~features.on(people)) if self._last else None
+            motion = self._move(frame.stamp, features, ~features.on(people))
             T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
             scene = self.judge(frame.stamp, instances, clouds, depth, invert(T_cw))
@@ -89,7 +90,7 @@ class V3DSLAM:
             reference = self._reference(estimate)
             self.poses.record(frame.stamp, estimate, reference)
             keyframe = self.mapper(frame, static, estimate, reference)
-            self._last = View(static, estimate.landmarks if keyframe is None else keyframe.landmarks)
+            self._last = View(frame.stamp, static, estimate.landmarks if keyframe is None else keyframe.landmarks)
         if keyframe is not None:
             self.poses.anchor(keyframe)
             with self.clock("loop"):  # III-E: loop detection, pose graph
@@ -97,6 +98,11 @@ class V3DSLAM:
                 if T_new_old is not None:
                     self.judge.tracker.move_world(T_new_old)
         return scene
+
+    def _move(self, stamp: float, features: Features, usable: Tensor) -> Motion | None:
+        if self._last is None:
+            return None
+        return self.motion(self._last.features, features, usable, elapsed=stamp - self._last.stamp)
 
     def _carry(self, motion: Motion | None, count: int) -> Tensor:
         """Ids of the landmarks that the motion's matches carry over from the last frame, -1 for none, (count,)."""

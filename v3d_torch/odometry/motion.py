@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import FeaturesConfig, MotionConfig
+from v3d_torch.lie import se3_log
 from v3d_torch.odometry.matching import match_descriptors
 from v3d_torch.odometry.orb import Features, spread
 from v3d_torch.odometry.ransac import epipolar_inliers, pnp_ransac
@@ -43,16 +45,17 @@ class MotionEstimator:
         self._camera = camera
         self._seed = seed
 
-    def __call__(self, a: Features, b: Features, usable: Tensor | None = None) -> Motion | None:
+    def __call__(self, a: Features, b: Features, usable: Tensor | None = None, elapsed: float = math.inf) -> Motion | None:
         """Motion from view ``a`` to view ``b``.
 
         Args:
             a: known view; its features with depth take part.
             b: new view.
             usable: which features of ``b`` take part, bool, shape :math:`(N,)`; all of them when None.
+            elapsed: time between the views, seconds, which bounds how far a camera can have come.
 
         Returns:
-            None when fewer than ``min_inliers`` matches agree on one motion.
+            None when fewer than ``min_inliers`` matches agree on one motion, or on one that no hand can make.
         """
         config = self._config
         candidates = torch.arange(len(b)) if usable is None else torch.nonzero(usable)[:, 0]
@@ -83,4 +86,12 @@ class MotionEstimator:
         if pose is None or int(pose[1].sum()) < config.min_inliers:
             return None
         T_ba, inliers = pose
+        if not self._possible(T_ba, elapsed):
+            return None
         return Motion(T_ba, pairs[inliers])
+
+    def _possible(self, T_ba: Tensor, elapsed: float) -> bool:
+        """Whether a camera in a hand or on a robot can move so in the time."""
+        twist = se3_log(T_ba)
+        distance, angle = float(twist[:3].norm()), float(twist[3:].norm())
+        return distance <= self._config.max_speed * elapsed and angle <= self._config.max_rotation_rate * elapsed

@@ -1,0 +1,266 @@
+"""Accuracy of the whole system on sequences in TUM layout, beside other systems' figures, as Markdown.
+
+``python benchmarks/accuracy.py`` runs ``python -m v3d_torch.run`` for each sequence, configuration and seed, one after
+the other, so that no run slows another. A run that fails is shown with its sentence. The other systems' figures are
+those of ``peers.yaml`` and, on the paper's sequences, those of its tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
+
+import yaml
+
+import v3d_torch
+from v3d_torch.errors import OutputError
+from v3d_torch.evaluation.tables import paper_scores, paper_sequence
+from v3d_torch.files import write_text
+from v3d_torch.mapping.recorder import Status
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+CONFIGURATIONS = {
+    "full": [],
+    "baseline": ["--segmenter", "none"],
+    "paper": ["--config", str(CHECKOUT / "configs" / "paper.yaml")],
+}
+LIBRARIES = ("torch", "kornia", "onnxruntime")
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one run gave: the figures of its ``metrics.json``, or the sentence it failed with."""
+
+    sequence: str
+    configuration: str
+    seed: int
+    metrics: dict[str, Any] | None
+    failure: str = ""
+
+    @property
+    def ate(self) -> float | None:
+        """RMSE in metres; None where the run failed or could not be scored."""
+        return self.metrics["ate"]["rmse"] if self.metrics and "ate" in self.metrics else None
+
+    def __str__(self) -> str:
+        """One line for whoever waits."""
+        result = f"failed: {self.failure}"
+        if self.metrics is not None:
+            score = "no score (no true poses, or too few that match)" if self.ate is None else f"ATE {self.ate:.4f} m"
+            result = f"{score}, {self.metrics['fps']:.1f} frames a second"
+        return f"{self.sequence}, {self.configuration}, seed {self.seed}: {result}"
+
+
+def run(sequence: str, configuration: str, seed: int, data_root: Path) -> Outcome:
+    """Run the system once, in a process and a temporary folder of its own."""
+    folder = data_root / sequence
+    source = ["--seq", str(folder) if folder.is_dir() else sequence, "--data-root", str(data_root)]
+    with TemporaryDirectory() as out:
+        # -P: the package imported here, whose commit heads the table, not one that the working folder may hold.
+        command = [sys.executable, "-P", "-m", "v3d_torch.run", *source, "--seed", str(seed), "--out", out]
+        done = subprocess.run(command + CONFIGURATIONS[configuration], capture_output=True, text=True)  # noqa: S603
+        if done.returncode:
+            sentence = failure(done).replace(out, "its temporary folder")
+            return Outcome(sequence, configuration, seed, None, sentence)
+        metrics = json.loads((Path(out) / "metrics.json").read_text(encoding="utf-8"))
+    return Outcome(sequence, configuration, seed, metrics)
+
+
+def failure(done: subprocess.CompletedProcess[str]) -> str:
+    """The sentence that a failed run ended with."""
+    if done.returncode < 0:
+        return f"killed by {signal.Signals(-done.returncode).name}"
+    lines = done.stderr.strip().splitlines()
+    return lines[-1].removeprefix("error: ") if lines else f"exit code {done.returncode} without a word"
+
+
+def heading() -> Iterator[str]:
+    """What was run, of which commit, when and on what."""
+    yield f"`{shlex.join(['python', 'benchmarks/accuracy.py', *sys.argv[1:]])}`"
+    yield ""
+    yield f"- commit {commit()}, {datetime.now().astimezone():%Y-%m-%d}"
+    yield f"- {processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the first run"
+    yield f"- Python {platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
+
+
+def commit() -> str:
+    """Of the package's checkout, with ``-dirty`` when tracked files differ from it."""
+    # --exclude: no tag instead of the hash. No optional locks: someone may be about to commit.
+    command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--exclude", "*"]
+    try:
+        folder = Path(v3d_torch.__file__).parent
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown (not a git checkout)"
+
+
+def processor() -> str:
+    """Model of the processor."""
+    cpuinfo = Path("/proc/cpuinfo")
+    found = re.search(r"^model name\s*: (.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.is_file() else None
+    return found[1] if found else platform.processor() or platform.machine()
+
+
+def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root: Path) -> Iterator[str]:
+    """A row per sequence: ATE of each configuration, then of the peers that have a figure for any sequence."""
+    sequences = unique(outcome.sequence for outcome in outcomes)
+    configurations = unique(outcome.configuration for outcome in outcomes)
+    peers = {sequence: peer_scores(sequence, known) for sequence in sequences}
+    columns = unique(name for scores in peers.values() for name in scores)
+    yield row(["sequence", "what", "frames", *configurations, *columns])
+    yield row(["---"] * 2 + ["---:"] * (1 + len(configurations) + len(columns)))
+    for sequence in sequences:
+        runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
+        frames = unique(str(outcome.metrics["frames"]) for outcome in runs if outcome.metrics)
+        scores = [ate_cell([o for o in runs if o.configuration == name]) for name in configurations]
+        beside = [peers[sequence].get(name, "-") for name in columns]
+        yield row([sequence, description(sequence, known, data_root), *(frames or ["-"]), *scores, *beside])
+
+
+def runs_table(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """A row per sequence and configuration: how many frames were found and how, and how fast."""
+    yield row(["sequence", "configuration", "runs failed", *Status, "coverage", "frames a second"])
+    yield row(["---"] * 2 + ["---:"] * (3 + len(Status)))
+    for sequence, configuration in unique((outcome.sequence, outcome.configuration) for outcome in outcomes):
+        runs = [o for o in outcomes if (o.sequence, o.configuration) == (sequence, configuration)]
+        metrics = [outcome.metrics for outcome in runs if outcome.metrics is not None]
+        failed = f"{len(runs) - len(metrics)} of {len(runs)}"
+        statuses = [spread([m[status] for m in metrics], ".0f") for status in Status]
+        coverage = spread([m["coverage"] for m in metrics if "coverage" in m], ".1%")
+        fps = spread([m["fps"] for m in metrics], ".1f")
+        yield row([sequence, configuration, failed, *statuses, coverage, fps])
+
+
+def notes(outcomes: Sequence[Outcome], known: dict[str, Any]) -> Iterator[str]:
+    """What the tables cannot say: each failure, and what is to be known of the sequences and the peers."""
+    yield from (f"- {outcome}" for outcome in outcomes if outcome.ate is None)
+    spoken: dict[str, list[str]] = {}
+    for outcome in outcomes:
+        of_sequence = known["sequences"].get(Path(outcome.sequence).name, {}).get("notes", [])
+        of_scores = outcome.metrics.get("notes", []) if outcome.metrics else []
+        for note in [*of_sequence, *of_scores]:
+            spoken.setdefault(note, []).append(outcome.sequence)
+    yield from (f"- {', '.join(unique(sequences))}: {note}" for note, sequences in spoken.items())
+    if any(Path(outcome.sequence).name in known["sequences"] for outcome in outcomes):
+        yield f"- {known['about']}"
+
+
+def peer_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
+    """ATE RMSE in metres by system."""
+    if (paper := paper_sequence(sequence)) is not None:
+        scores = paper_scores()["ate"][paper]
+        return {f"{name} (paper)": f"{score.rmse:.4f}" for name, score in scores.items() if score.rmse is not None}
+    return known["sequences"].get(Path(sequence).name, {}).get("ate", {})
+
+
+def description(sequence: str, known: dict[str, Any], data_root: Path) -> str:
+    """What the sequence is: as ``peers.yaml`` has it, else the first line of its README."""
+    name = Path(sequence).name
+    if name in known["sequences"]:
+        return known["sequences"][name]["what"]
+    readme = data_root / sequence / "README.md"
+    lines = readme.read_text(encoding="utf-8").splitlines() if readme.is_file() else []
+    return next((line.lstrip("# ").removeprefix(f"{name}: ") for line in lines if line.strip()), "-")
+
+
+def ate_cell(runs: Sequence[Outcome]) -> str:
+    """Median and range over the seeds, with the failures among them."""
+    failed = sum(outcome.metrics is None for outcome in runs)
+    if failed == len(runs):
+        return "failed"
+    return spread([run.ate for run in runs if run.ate is not None], ".4f") + (f", {failed} failed" if failed else "")
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Median and range of some values, which is left out when there is none to see."""
+    if not values:
+        return "-"
+    middle, low, high = (format(value, form) for value in (median(values), min(values), max(values)))
+    return middle if low == high else f"{middle} [{low}-{high}]"
+
+
+def row(cells: Sequence[str]) -> str:
+    """A row of a Markdown table."""
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def unique(items: Iterable[T]) -> list[T]:
+    """Each item once, in the order of the first."""
+    return list(dict.fromkeys(items))
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description="Accuracy on sequences in TUM layout, beside other systems, as Markdown."
+    )
+    data = Path(os.environ.get("V3D_DATA", "../shared/data"))
+    parser.add_argument(
+        "--data-root", type=Path, default=data, help="folder of sequences [$V3D_DATA, else ../shared/data]"
+    )
+    parser.add_argument("--seqs", nargs="+", help="names of sequences [every folder in --data-root that holds one]")
+    parser.add_argument("--seeds", type=int, default=3, help="runs of each, with seeds from 0 [3]")
+    parser.add_argument("--configs", nargs="+", choices=CONFIGURATIONS, default=["full", "baseline"])
+    parser.add_argument("--out", type=Path, help="Markdown file to write, too")
+    return parser
+
+
+def main() -> None:
+    """Run everything that the command line asks for, and print the tables."""
+    parser = arguments()
+    options = parser.parse_args()
+    listed = {
+        path.parent.name for name in ("rgb.txt", "associations.txt") for path in options.data_root.glob(f"*/{name}")
+    }
+    sequences = unique(options.seqs or sorted(listed))
+    if options.seeds < 1:
+        parser.error("--seeds: at least one run is needed")
+    if not sequences:
+        parser.error(
+            f"{options.data_root}: holds no sequence (a folder with rgb.txt or associations.txt); see --data-root"
+        )
+
+    lines = [*heading(), ""]
+    outcomes = []
+    for sequence in sequences:
+        for configuration in unique(options.configs):
+            for seed in range(options.seeds):
+                outcomes.append(run(sequence, configuration, seed, options.data_root))
+                print(outcomes[-1], file=sys.stderr)
+    known = yaml.safe_load(Path(__file__).with_name("peers.yaml").read_text(encoding="utf-8"))
+    lines += ["ATE RMSE in metres; of several seeds, the median [lowest-highest].", ""]
+    lines += [
+        *accuracy_table(outcomes, known, options.data_root),
+        "",
+        *runs_table(outcomes),
+        "",
+        *notes(outcomes, known),
+    ]
+    text = "\n".join(lines) + "\n"
+    print(text, end="")
+    if options.out is not None:
+        try:
+            write_text(options.out, text)
+        except OutputError as error:
+            parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

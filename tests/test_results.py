@@ -1,0 +1,388 @@
+"""What a run leaves behind: files written whole, the pipeline's notes, the dense map, every file of the results."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import plyfile
+import pyarrow.parquet as pq
+import pytest
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import Config, DenseMapConfig, load_config
+from v3d_torch.errors import InputError, OutputError
+from v3d_torch.files import one_process_makes, write_png, write_text, written_whole
+from v3d_torch.lie import invert, se3_exp
+from v3d_torch.mapping.dense import DenseMap
+from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.mapping.recorder import Status
+from v3d_torch.objects.dynamics import Scene
+from v3d_torch.odometry.orb import Features
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.results import write_results
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.trajectory import read_trajectory
+from v3d_torch.types import Instances, RGBDFrame, Trajectory
+
+CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240)
+WALL = 2.0
+"""Distance of the wall, metres."""
+STEP = 4
+"""Pixels by which the image moves from frame to frame: the camera goes 4 * 2 / 260 m."""
+FRAMES = 14
+
+
+class Wall:
+    """A camera that slides along a wall covered with noise; a square in the image's middle is called a person."""
+
+    name = "wall"
+    camera = CAMERA
+
+    def __init__(self, broken: int | None = None, interrupted: int | None = None) -> None:
+        noise = np.random.default_rng(0).integers(0, 256, (240 // 4, 480 // 4, 3), dtype=np.uint8)
+        self._wall = cv2.resize(noise, (480, 240), interpolation=cv2.INTER_CUBIC)
+        self._broken, self._interrupted = broken, interrupted
+        self.stamps = torch.arange(FRAMES, dtype=torch.float64) / 10
+        # Turned by next to nothing: orientations that never change are taken for placeholders.
+        T_wc = se3_exp(torch.zeros(FRAMES, 6, dtype=torch.float64).index_fill_(1, torch.tensor(3), 1e-6))
+        T_wc[0] = torch.eye(4)
+        T_wc[:, 0, 3] = torch.arange(FRAMES) * STEP * WALL / CAMERA.fx
+        self.groundtruth: Trajectory | None = Trajectory(self.stamps, T_wc)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        if index == self._broken:
+            raise InputError("rgb/x.png: is truncated or no image; copy or download it again")
+        if index == self._interrupted:
+            raise KeyboardInterrupt
+        image = torch.from_numpy(self._wall[:, STEP * index : STEP * index + 320].copy()).permute(2, 0, 1)
+        return RGBDFrame(index, float(self.stamps[index]), image, torch.full((1, 240, 320), WALL))
+
+
+def square(frame: RGBDFrame) -> Instances:
+    """A person in the middle of the image."""
+    mask = torch.zeros(1, 240, 320, dtype=torch.bool)
+    mask[:, 90:150, 130:190] = True
+    box = torch.tensor([[130.0, 90, 190, 150]])
+    return Instances(mask, torch.zeros(1, dtype=torch.int64), torch.ones(1), box)
+
+
+def pipeline(sequence: Wall | None = None, masks: Path | None = None, config: Config | None = None) -> Pipeline:
+    sequence = sequence or Wall()
+    return Pipeline(sequence, V3DSLAM(CAMERA, square, config), masks)
+
+
+@pytest.fixture(scope="module")
+def run() -> Pipeline:
+    """A whole run over the wall, with a keyframe every 5 frames."""
+    done = pipeline(config=load_config(overrides=["mapping.max_gap=5"]))
+    done()
+    return done
+
+
+@pytest.fixture(scope="module")
+def results(run: Pipeline, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("results") / "new" / "folder"
+    write_results(folder, run)
+    return folder
+
+
+# --- files
+
+
+def test_a_file_is_whole_or_the_old_one_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "table.txt"
+    write_text(path, "höhe\n")
+    assert path.read_bytes() == "höhe\n".encode()
+    with pytest.raises(ZeroDivisionError), written_whole(path) as temporary:
+        temporary.write_text("half")
+        assert temporary.suffix == ".txt" and temporary.parent == path.parent
+        raise ZeroDivisionError
+    assert path.read_text(encoding="utf-8") == "höhe\n"
+    assert [entry.name for entry in path.parent.iterdir()] == ["table.txt"]
+
+
+def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"file/x\.txt: cannot be written"):
+        write_text(tmp_path / "file" / "x.txt", "")
+    with pytest.raises(OutputError, match="No space left"), written_whole(tmp_path / "y.txt"):
+        raise OSError(28, "No space left on device")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_convention_colours_of_a_png_are_red_green_blue(tmp_path: Path) -> None:
+    colour = np.random.default_rng(1).integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    write_png(tmp_path / "colour.png", colour)
+    write_png(tmp_path / "grey.png", colour[..., 0])
+    assert np.array_equal(cv2.imread(str(tmp_path / "colour.png"))[..., ::-1], colour)
+    assert np.array_equal(cv2.imread(str(tmp_path / "grey.png"), cv2.IMREAD_UNCHANGED), colour[..., 0])
+
+
+def make_once(target: Path) -> None:
+    with one_process_makes(target):
+        if not target.exists():
+            count = target.with_name("count")
+            count.write_text(count.read_text() + "x" if count.exists() else "x")
+            target.mkdir()
+
+
+def test_of_many_processes_one_makes_the_folder(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    workers = [context.Process(target=make_once, args=(tmp_path / "made",)) for _ in range(6)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(timeout=30)
+    assert [worker.exitcode for worker in workers] == [0] * 6
+    assert (tmp_path / "count").read_text() == "x"
+
+
+# --- the dense map
+
+
+def keyframe(T_cw: Tensor) -> Keyframe:
+    none = torch.zeros(0, dtype=torch.int64)
+    empty = Features(torch.zeros(0, 2), torch.zeros(0, 2).long(), none.double(), none, torch.zeros(0, 32).byte())
+    return Keyframe(0, 0, 0.0, T_cw, empty, none)
+
+
+def dense(**settings: float) -> DenseMap:
+    return DenseMap(DenseMapConfig(**settings), CAMERA)  # type: ignore[arg-type]
+
+
+def test_dense_map_equals_plain_voxel_means() -> None:
+    generator = torch.Generator().manual_seed(3)
+    fused = dense(stride=4, voxel_size=0.05, max_depth=3.0)
+    voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for view in range(2):
+        T_cw = se3_exp(0.02 * torch.randn(6, generator=generator, dtype=torch.float64))
+        depth = 1.5 + 2 * torch.rand(1, 240, 320, generator=generator)
+        depth[0, :20] = 0.0
+        image = torch.randint(0, 256, (3, 240, 320), generator=generator, dtype=torch.uint8)
+        static = torch.rand(240, 320, generator=generator) > 0.3
+        fused.add(keyframe(T_cw), image, depth, static)
+        v, u = np.mgrid[0:240:4, 0:320:4]
+        z = depth[0].numpy()[v, u].astype(np.float64)
+        keep = static.numpy()[v, u] & (z > 0) & (z <= 3.0)
+        u, v, z = u[keep], v[keep], z[keep]
+        rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(z)], axis=1)
+        points = (rays * z[:, None]).astype(np.float32).astype(np.float64)
+        T_wc = np.linalg.inv(T_cw.numpy())
+        points = points @ T_wc[:3, :3].T + T_wc[:3, 3]
+        colours = image.numpy()[:, v, u].T
+        for point, colour in zip(points, colours, strict=True):
+            voxels.setdefault(tuple(np.floor(point / 0.05).astype(int)), []).append(np.r_[point, colour])
+    points, colours = fused.fuse()
+    # Rounding puts a few points on the other side of a voxel's face.
+    assert abs(len(points) - len(voxels)) <= 3
+    expected = np.array([np.mean(rows, axis=0) for rows in voxels.values()])
+    distance = torch.cdist(points.double(), torch.from_numpy(expected[:, :3]))
+    nearest, row = distance.min(dim=1)
+    assert (nearest < 1e-4).double().mean() > 0.999
+    close = (colours.double() - torch.from_numpy(expected[:, 3:])[row]).abs().max(dim=1).values < 0.51
+    assert close.double().mean() > 0.999
+
+
+def test_the_dense_map_follows_its_keyframes() -> None:
+    own = keyframe(torch.eye(4, dtype=torch.float64))
+    fused = dense(voxel_size=1e-3)
+    ones = torch.ones(240, 320, dtype=torch.bool)
+    fused.add(own, torch.zeros(3, 240, 320, dtype=torch.uint8), torch.full((1, 240, 320), WALL), ones)
+    before, _ = fused.fuse()
+    torch.testing.assert_close(before[:, 2], torch.full_like(before[:, 2], WALL))
+    own.T_cw = invert(se3_exp(torch.tensor([0.0, 0, 0.5, 0, 0, 0], dtype=torch.float64)))
+    after, _ = fused.fuse()
+    torch.testing.assert_close(after[:, 2], torch.full_like(after[:, 2], WALL + 0.5))
+    assert len(after) == len(before) == 60 * 80
+
+
+def test_an_empty_dense_map_has_no_points() -> None:
+    points, colours = dense().fuse()
+    assert points.shape == colours.shape == (0, 3)
+    fused = dense()
+    nothing = torch.zeros(240, 320, dtype=torch.bool)
+    image = torch.zeros(3, 240, 320, dtype=torch.uint8)
+    fused.add(keyframe(torch.eye(4, dtype=torch.float64)), image, torch.ones(1, 240, 320), nothing)
+    assert len(fused.fuse()[0]) == 0
+
+
+# --- the pipeline
+
+
+def test_the_run_knows_the_truth_of_the_wall(run: Pipeline) -> None:
+    assert run.slam.poses.statuses == [Status.TRACKED] * FRAMES
+    truth = run.sequence.groundtruth
+    assert truth is not None
+    error = (run.slam.poses.trajectory().T_wc - truth.T_wc)[:, :3, 3].norm(dim=1)
+    assert error.max() < 0.01
+    assert run.run.failure is None and run.run.seconds > 0
+
+
+def test_every_frame_is_reported_and_every_object_noted() -> None:
+    told: list[tuple[int, int, Status]] = []
+
+    def on_frame(frame: RGBDFrame, scene: Scene, status: Status) -> None:
+        told.append((frame.index, len(scene.objects), status))
+
+    flow = pipeline()
+    done = flow(on_frame)
+    assert told == [(index, 1, Status.TRACKED) for index in range(FRAMES)]
+    assert [row["frame"] for row in done.dynamics] == list(range(FRAMES))
+    assert {row["class"] for row in done.dynamics} == {"person"}
+    assert done.dynamics[-1]["z"] == pytest.approx(WALL, abs=0.02)
+    assert [shot.stamp for shot in done.snapshots] == sorted(shot.stamp for shot in done.snapshots)
+    assert len(done.snapshots) == 6
+    assert set(flow.slam.clock.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
+    assert sum(flow.slam.clock.seconds.values()) <= done.seconds
+
+
+@pytest.mark.parametrize("where", [0, 1, 5])
+def test_what_was_computed_is_kept_when_a_frame_is_broken(where: int, tmp_path: Path) -> None:
+    flow = pipeline(Wall(broken=where))
+    done = flow()
+    assert done.failure is not None and "truncated" in done.failure
+    evaluation = write_results(tmp_path, flow)
+    lines = (tmp_path / "trajectory.txt").read_text().splitlines()
+    assert len(lines) == where
+    assert (evaluation is not None) == (where >= 3)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["processed"], metrics["frames"]) == (where, FRAMES)
+    assert metrics["failure"] == done.failure
+    assert (tmp_path / "map.ply").is_file() and (tmp_path / "dynamics.parquet").is_file()
+
+
+def test_an_interrupt_ends_the_run_and_keeps_it(tmp_path: Path) -> None:
+    flow = pipeline(Wall(interrupted=4))
+    assert flow().failure == f"interrupted after 4 of {FRAMES} frames"
+    write_results(tmp_path, flow)
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
+
+
+def test_masks_show_what_is_left_out(tmp_path: Path) -> None:
+    config = load_config(overrides=["objects.mask.margin=0", "objects.mask.confirm_still=100"])
+    pipeline(masks=tmp_path / "masks", config=config)()
+    paths = sorted((tmp_path / "masks").iterdir())
+    assert [path.name for path in paths] == [f"{index / 10:.6f}.png" for index in range(FRAMES)]
+    for path in paths:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.uint8
+        assert np.array_equal(image, np.where(square(Wall()[0]).masks[0].numpy(), 255, 0))
+
+
+def test_masks_that_cannot_be_written_end_the_run_with_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "masks").write_text("")
+    with pytest.raises(OutputError, match=r"masks.*cannot be written"):
+        pipeline(masks=tmp_path / "masks")()
+
+
+# --- the files of a run
+
+
+def test_all_files_of_the_contract_are_there(results: Path) -> None:
+    names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
+    assert names == {
+        *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "map.ply"),
+        *("figures/trajectory.png", "figures/masks.png"),
+    }
+
+
+def test_the_trajectory_is_that_of_all_frames(results: Path, run: Pipeline) -> None:
+    written = read_trajectory(results / "trajectory.txt")
+    torch.testing.assert_close(written.T_wc, run.slam.poses.trajectory().T_wc, rtol=0, atol=1e-8)
+    assert torch.equal(written.stamps, run.sequence.stamps)
+    keyframes = read_trajectory(results / "keyframes.txt")
+    at = torch.searchsorted(written.stamps, keyframes.stamps)
+    assert at.tolist() == [keyframe.frame for keyframe in run.slam.mapper.map.keyframes]
+    assert at.tolist()[:2] == [0, 5]
+    torch.testing.assert_close(keyframes.T_wc, written.T_wc[at], rtol=0, atol=1e-8)
+
+
+def test_the_written_configuration_is_the_one_that_ran(results: Path, run: Pipeline) -> None:
+    assert load_config(results / "config.yaml") == run.slam.config
+    assert load_config(results / "config.yaml").mapping.max_gap == 5
+
+
+def test_metrics_have_their_stable_keys(results: Path, run: Pipeline) -> None:
+    metrics = json.loads((results / "metrics.json").read_text())
+    for score in (metrics["ate"], metrics["rpe"]["trans"], metrics["rpe"]["rot"]):
+        assert {"rmse", "mean", "median", "std", "max"} <= score.keys()
+        assert 0 <= score["mean"] <= score["rmse"] <= score["max"] + 1e-12
+    assert metrics["ate"]["rmse"] < 0.01
+    assert metrics["tracked"] == metrics["frames"] == metrics["processed"] == FRAMES
+    assert metrics["lost"] == metrics["odometry"] == metrics["adrift"] == metrics["loops"] == 0
+    assert metrics["coverage"] == 1.0
+    assert metrics["keyframes"] == len(run.slam.mapper.map.keyframes) >= 3
+    assert metrics["fps"] == pytest.approx(FRAMES / metrics["seconds"])
+    assert 50 < metrics["peak_memory_mb"] < 20_000
+    assert metrics["seed"] == 0 and metrics["versions"]["torch"] == torch.__version__
+    assert sum(metrics["seconds_per_stage"].values()) <= metrics["seconds"]
+
+
+def test_dynamics_are_a_table_that_pandas_reads(results: Path, run: Pipeline) -> None:
+    table = pq.read_table(results / "dynamics.parquet").to_pandas()
+    assert list(table.columns) == [
+        *("frame", "stamp", "id", "class", "x", "y", "z", "votes", "chamfer", "verdict", "missed")
+    ]
+    assert len(table) == len(run.run.dynamics) == FRAMES
+    assert table["frame"].tolist() == list(range(FRAMES))
+    assert np.allclose(table["stamp"], run.sequence.stamps.numpy())
+    assert set(table["verdict"]) <= {"static", "dynamic", "deforming", "unknown"}
+
+
+def test_the_map_is_the_wall_in_its_colours(results: Path) -> None:
+    vertices = plyfile.PlyData.read(results / "map.ply")["vertex"]
+    z = np.asarray(vertices["z"])
+    assert len(z) > 1000
+    assert np.abs(z - WALL).max() < 0.02
+    truth = Wall()
+    offset = np.asarray(vertices["x"]) * CAMERA.fx / WALL + CAMERA.cx
+    row = np.asarray(vertices["y"]) * CAMERA.fy / WALL + CAMERA.cy
+    inside = (offset > 2) & (offset < 470) & (row > 2) & (row < 236)
+    expected = truth._wall[row[inside].round().astype(int), offset[inside].round().astype(int)].astype(float)
+    got = np.stack([np.asarray(vertices[name])[inside] for name in ("red", "green", "blue")], axis=1)
+    for channel in range(3):  # red is red: the channels are not exchanged
+        same = np.corrcoef(got[:, channel], expected[:, channel])[0, 1]
+        other = np.corrcoef(got[:, channel], expected[:, (channel + 1) % 3])[0, 1]
+        assert same > 0.5 > 0.3 > abs(other)
+
+
+def test_figures_are_pictures(results: Path) -> None:
+    for name in ("trajectory.png", "masks.png"):
+        image = cv2.imread(str(results / "figures" / name))
+        assert image is not None and min(image.shape[:2]) >= 200 and max(image.shape[:2]) <= 4000
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+
+
+def test_without_ground_truth_there_are_no_scores(run: Pipeline, tmp_path: Path) -> None:
+    bare = Pipeline(Wall(), run.slam)
+    bare.sequence.groundtruth = None  # type: ignore[misc]
+    bare.run = replace(run.run)
+    assert write_results(tmp_path, bare) is None
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert "rmse" not in (metrics.get("ate") or {})
+    assert metrics["frames"] == FRAMES
+    assert (tmp_path / "figures" / "trajectory.png").is_file()
+
+
+def test_results_that_cannot_be_written_are_named(run: Pipeline, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"file/config\.yaml: cannot be written"):
+        write_results(tmp_path / "file", run)
+
+
+def test_the_same_run_writes_the_same_bytes(results: Path, tmp_path: Path) -> None:
+    again = pipeline(config=load_config(overrides=["mapping.max_gap=5"]))
+    again()
+    write_results(tmp_path, again)
+    for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "dynamics.parquet"):
+        assert (tmp_path / name).read_bytes() == (results / name).read_bytes(), name
