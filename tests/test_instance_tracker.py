@@ -152,7 +152,7 @@ def test_ids_are_kept_when_the_camera_moves_over_still_objects() -> None:
     boards = [Board(-0.6), Board(-0.1), Board(0.4)]
     for frame in range(4):
         T_wc = HERE.clone()
-        T_wc[0, 3] = -0.4 + 0.24 * frame
+        T_wc[0, 3] = -0.36 + 0.24 * frame
         T_wc[2, 3] = -0.1 * frame
         tracks = watch(*boards, T_wc=T_wc)
         for i, board in enumerate(boards, start=1):

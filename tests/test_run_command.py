@@ -1,0 +1,319 @@
+"""``python -m v3d_torch.run`` as a user calls it: results, errors in a sentence, Ctrl-C, the built-in demo."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from scipy.ndimage import label
+
+from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
+from v3d_torch.datasets.demo.sequence import FRAMES, RATE, START, write_sequence
+from v3d_torch.trajectory import read_trajectory
+
+FILES = {
+    *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "map.ply", "run.log"),
+    *("figures/trajectory.png", "figures/masks.png"),
+}
+"""What every run leaves behind."""
+
+
+def command(*arguments: str | Path) -> list[str]:
+    # One thread: two of them spin for each other where cores are shared, and the results are the same (tested below).
+    return [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"]
+
+
+def environment(**changes: str) -> dict[str, str]:
+    own = {key: value for key, value in os.environ.items() if key != "V3D_DATA"}
+    return own | {"COLUMNS": "120", "NO_COLOR": "1"} | changes
+
+
+def call(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(  # noqa: S603
+        command(*arguments), cwd=cwd, env=environment(**variables), capture_output=True, text=True, timeout=500
+    )
+
+
+def assert_one_sentence(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    for word in words:
+        assert word in done.stderr
+
+
+def files_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="session")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A second of the demo in which the walker crosses the room, in TUM layout."""
+    folder = tmp_path_factory.mktemp("sequences") / "second"
+    write_sequence(folder, range(45, 75))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def first(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of that second with the masks that come with it."""
+    out = tmp_path_factory.mktemp("first")
+    done = with_masks(sequence, "--out", out, "--save-masks", cwd=out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def with_masks(sequence: Path, *more: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return call("--seq", sequence, "--segmenter", "masks", "--masks", sequence / "masks", *more, cwd=cwd)
+
+
+@pytest.fixture
+def copy(sequence: Path, tmp_path: Path) -> Path:
+    """The sequence, to be broken; the images are links, so replace them and do not write into them."""
+    folder = tmp_path / "copy"
+    shutil.copytree(sequence, folder, copy_function=os.link)
+    return folder
+
+
+def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
+    content = change(path.read_bytes())
+    path.unlink()
+    path.write_bytes(content)
+
+
+# --- a run
+
+
+def test_a_run_leaves_all_its_files(first: Path, sequence: Path) -> None:
+    assert {name for name in files_in(first) if not name.startswith("masks/")} == FILES
+    trajectory = read_trajectory(first / "trajectory.txt")
+    listed = [float(line.split()[0]) for line in (sequence / "associations.txt").read_text().splitlines()]
+    assert trajectory.stamps.tolist() == listed
+    metrics = json.loads((first / "metrics.json").read_text())
+    assert metrics["ate"]["rmse"] < 0.005
+    assert metrics["tracked"] == metrics["frames"] == 30
+    log = (first / "run.log").read_text().splitlines()
+    assert sum("frame" in line and "tracked" in line for line in log) == 30
+
+
+def test_the_screen_shows_scores_and_where_the_results_are(sequence: Path, tmp_path: Path) -> None:
+    done = with_masks(sequence, "--out", tmp_path / "out [b]", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    for words in ("ATE rmse", "30 of 30", "30 tracked", f"results: {tmp_path / 'out [b]'}"):
+        assert words in done.stdout
+
+
+def test_saved_masks_are_black_and_white_and_named_by_stamp(first: Path, sequence: Path) -> None:
+    stamps = [line.split()[0] for line in (sequence / "associations.txt").read_text().splitlines()]
+    assert sorted(path.name for path in (first / "masks").iterdir()) == [f"{float(stamp):.6f}.png" for stamp in stamps]
+    for stamp in stamps:
+        saved = cv2.imread(str(first / "masks" / f"{float(stamp):.6f}.png"), cv2.IMREAD_UNCHANGED)
+        truth = cv2.imread(str(sequence / "masks" / f"{stamp}.png"), cv2.IMREAD_UNCHANGED)
+        assert saved.dtype == np.uint8 and saved.shape == (480, 640)
+        assert set(np.unique(saved)) <= {0, 255}
+        moving = (truth > 0) & (label(truth > 0)[0] > 0)
+        assert (saved[moving] == 255).mean() > 0.95  # who moves, or might, is left out
+        assert (saved == 255).mean() < 0.6
+
+
+def test_the_same_bytes_again_with_any_number_of_threads(first: Path, sequence: Path, tmp_path: Path) -> None:
+    for threads in (1, 2):
+        short = tmp_path / f"{threads}"
+        done = with_masks(sequence, "--out", short, "--set", f"threads={threads}", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
+            assert (short / name).read_bytes() == (first / name).read_bytes(), (threads, name)
+
+
+def test_without_a_segmenter_and_without_out(sequence: Path, tmp_path: Path) -> None:
+    """The newest results are behind ``latest``; without masks nobody is judged."""
+    runs = tmp_path / "results" / "second"
+    newest = []
+    for seed in (3, 4):
+        done = call("--seq", sequence, "--segmenter", "none", "--seed", str(seed), cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        latest = runs / "latest"
+        assert latest.is_symlink()
+        assert files_in(latest.resolve()) == FILES - {"figures/masks.png"} | {"figures/masks.png"}
+        assert json.loads((latest / "metrics.json").read_text())["seed"] == seed
+        assert len(pd.read_parquet(latest / "dynamics.parquet")) == 0
+        newest.append(latest.resolve())
+    assert newest[0] != newest[1]
+    assert {path.name for path in runs.iterdir()} == {"latest", *(path.name for path in newest)}
+
+
+def test_a_configuration_file_and_the_command_line_over_it(sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text("mapping: {max_gap: 4, min_tracked: 90}\n")
+    arguments = ("--config", tmp_path / "own.yaml", "--set", "mapping.max_gap=7", "--set", "features.count=900")
+    done = call("--seq", sequence, "--segmenter", "none", *arguments, "--out", tmp_path / "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    written = (tmp_path / "out" / "config.yaml").read_text()
+    for line in ("max_gap: 7", "min_tracked: 90", "count: 900", "source: none"):
+        assert line in written
+
+
+# --- what users get wrong
+
+
+def test_an_unknown_key_is_answered_with_the_nearest(sequence: Path, tmp_path: Path) -> None:
+    done = call("--seq", sequence, "--set", "objects.voting.vote_treshold=3", cwd=tmp_path)
+    assert_one_sentence(done, "objects.voting.vote_treshold", "objects.voting.vote_threshold")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_sequence_is_answered_with_the_nearest(tmp_path: Path) -> None:
+    assert_one_sentence(call("--seq", "fr3/w/xzy", cwd=tmp_path), "fr3/w/xzy", "fr3/w/xyz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_path_that_is_not_there(tmp_path: Path) -> None:
+    assert_one_sentence(call("--seq", tmp_path / "nowhere", cwd=tmp_path), str(tmp_path / "nowhere"))
+
+
+def test_a_folder_without_depth(copy: Path, tmp_path: Path) -> None:
+    (copy / "associations.txt").unlink()
+    (copy / "depth.txt").unlink()
+    assert_one_sentence(call("--seq", copy, "--segmenter", "none", cwd=tmp_path), str(copy), "depth.txt")
+
+
+def test_masks_of_another_folder(sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    arguments = ("--seq", sequence, "--segmenter", "masks")
+    assert_one_sentence(call(*arguments, "--masks", tmp_path / "empty", cwd=tmp_path), str(tmp_path / "empty"))
+    assert_one_sentence(call(*arguments, cwd=tmp_path), "--masks")
+
+
+@pytest.mark.parametrize("kind", ["rgb", "depth"])
+@pytest.mark.parametrize("index", [0, 6])
+def test_a_truncated_image(kind: str, index: int, copy: Path, tmp_path: Path) -> None:
+    """The results up to there are kept; a network of stars that fall is told in a sentence."""
+    broken = sorted((copy / kind).iterdir())[index]
+    rewrite(broken, lambda content: content[: len(content) // 2])
+    done = call("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
+    assert_one_sentence(done, str(broken))
+    trajectory = tmp_path / "out" / "trajectory.txt"
+    assert len(trajectory.read_text().splitlines() if trajectory.exists() else []) == index
+    if index:
+        assert files_in(tmp_path / "out") == FILES
+        assert str(tmp_path / "out") in done.stderr
+        assert json.loads((tmp_path / "out" / "metrics.json").read_text())["processed"] == index
+
+
+def test_colour_and_depth_swapped(copy: Path, tmp_path: Path) -> None:
+    (copy / "associations.txt").unlink()
+    colour, depth = (copy / "rgb.txt").read_bytes(), (copy / "depth.txt").read_bytes()
+    rewrite(copy / "rgb.txt", lambda _: depth)
+    rewrite(copy / "depth.txt", lambda _: colour)
+    done = call("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
+    assert_one_sentence(done, str(sorted((copy / "depth").iterdir())[0]), "swapped")
+
+
+def test_depth_with_8_bits(copy: Path, tmp_path: Path) -> None:
+    path = sorted((copy / "depth").iterdir())[0]
+    grey = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
+    rewrite(path, lambda _: cv2.imencode(".png", grey)[1].tobytes())
+    done = call("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
+    assert_one_sentence(done, str(path), "8-bit", "16 bits")
+
+
+@pytest.mark.parametrize("below", [False, True])
+def test_a_file_where_the_results_belong(below: bool, sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    out = tmp_path / "taken" / "out" if below else tmp_path / "taken"
+    done = call("--seq", sequence, "--segmenter", "none", "--out", out, cwd=tmp_path)
+    assert_one_sentence(done, str(tmp_path / "taken"))
+
+
+def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
+    """Where there is a network this would fetch 500 MB: a proxy that nobody listens at keeps it off."""
+    (tmp_path / "data").mkdir()
+    start = time.monotonic()
+    nobody = {name: "http://127.0.0.1:9" for name in ("https_proxy", "http_proxy", "HTTPS_PROXY", "HTTP_PROXY")}
+    variables = {"V3D_DATA": str(tmp_path / "data"), "V3D_CACHE": str(tmp_path / "cache"), "no_proxy": "", **nobody}
+    done = call("--seq", "fr3/w/xyz", cwd=tmp_path, **variables)
+    assert time.monotonic() - start < 20
+    name = "rgbd_dataset_freiburg3_walking_xyz"
+    assert_one_sentence(done, "fr3/w/xyz", f"{name}.tgz", "https://", str(tmp_path / "data"))
+    assert not list((tmp_path / "data").iterdir())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
+def test_ctrl_c_keeps_what_was_computed(sequence: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = command("--seq", sequence, "--segmenter", "none", "--save-masks", "--out", out)
+    with subprocess.Popen(  # noqa: S603
+        arguments, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 100
+        while len(list((out / "masks").glob("1*.png" if START < 2 else "*.png"))) < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=100)
+    assert_one_sentence(subprocess.CompletedProcess(arguments, process.returncode, stdout, stderr), "interrupted after")
+    assert "results" in stderr
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert 3 <= metrics["processed"] < 30
+    assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
+    assert {name for name in files_in(out) if not name.startswith("masks/")} == FILES
+
+
+def test_help_is_instant_and_names_every_option() -> None:
+    start = time.monotonic()
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, env=environment(), check=True
+    )
+    assert time.monotonic() - start < 3
+    for option in ("seq", "data-root", "camera", "config", "set", "segmenter", "masks", "weights", "seed", "out"):
+        assert f"--{option}" in done.stdout
+    probe = "import sys, v3d_torch.run; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
+    assert done.stdout.strip() == "False"
+
+
+# --- the acceptance test: the built-in demo with the real network
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """Results of the whole demo as ``--seq demo`` gives them out of the box, and what the screen showed."""
+    out = tmp_path_factory.mktemp("demo")
+    done = call("--seq", "demo", "--out", out, cwd=out)
+    assert done.returncode == 0, done.stderr
+    return out, done.stdout
+
+
+def objects_near(table: pd.DataFrame, alignment: torch.Tensor, frame: int, x: float, y: float) -> pd.DataFrame:
+    """People of a frame whose centroid lies within 0.5 m of a place on the room's floor."""
+    people = table[(table["frame"] == frame) & (table["class"] == "person") & ~table["missed"]]
+    points = torch.from_numpy(people[["x", "y", "z"]].to_numpy()) @ alignment[:3, :3].T + alignment[:3, 3]
+    return people[((points[:, :2] - torch.tensor([x, y])).norm(dim=1) < 0.5).numpy()]
+
+
+def test_demo_every_file_every_frame(demo: tuple[Path, str]) -> None:
+    out, stdout = demo
+    assert files_in(out) == FILES
+    assert len((out / "trajectory.txt").read_text().splitlines()) == FRAMES == 120
+    assert "ATE rmse" in stdout
+    for name in ("figures/trajectory.png", "figures/masks.png"):
+        image = cv2.imread(str(out / name))
+        assert image is not None and min(image.shape[:2]) >= 300 and max(image.shape[:2]) <= 4000
+
+
+def test_demo_trajectory(demo: tuple[Path, str]) -> None:
+    metrics = json.loads((demo[0] / "metrics.json").read_text())
+    assert metrics["ate"]["rmse"] < 0.02
+    assert metrics["rpe"]["trans"]["rmse"] < 0.02 and metrics["rpe"]["rot"]["rmse"] < 0.5
+    assert metrics["coverage"] == 1.0 and metrics["lost"] == 0 and metrics["failure"] is None
