@@ -76,8 +76,13 @@ class CloudConfig(Section):
 class IdentityConfig(Section):
     """Ids of objects over frames, and objects that the network misses for a while (paper, Sec. III)."""
 
-    max_distance: float = Field(0.8, gt=0)
-    """Centroids farther apart than this are two objects, metres: 4 m/s at 5 frames a second."""
+    max_speed: float = Field(3.0, gt=0)
+    """No object in a room moves faster, m/s: a person who runs. A centroid farther off is another object's."""
+    max_jump: float = Field(0.2, gt=0)
+    """By so much a centroid may be off in any time, metres: it moves when an object is cut or covered."""
+    least_overlap: float = Field(0.5, ge=0, le=1)
+    """An instance of another class continues an object only where their masks overlap by this: a class may flicker
+    between frames, but a cup does not turn into the table under it."""
     max_gap: float = Field(0.5, gt=0)
     """An object that is not seen is predicted for so long, seconds: about a step of a person who walks."""
     velocity_gain: float = Field(0.5, gt=0, le=1)

@@ -20,8 +20,8 @@ from v3d_torch.types import Instances
 class InstanceTracker:
     """Gives each instance the id of the object that it shows.
 
-    An instance continues the track whose predicted centroid is nearest and whose mask it overlaps, in the assignment
-    that is best for all together; no appearance takes part.
+    An instance continues the track of its class whose predicted centroid is nearest and whose mask it overlaps, in the
+    assignment that is best for all together; no appearance takes part.
 
     Args:
         config: gates and times.
@@ -30,7 +30,7 @@ class InstanceTracker:
     """
 
     _STRIDE = 4  # masks are compared on every 4th pixel: an overlap needs no more
-    _CLASS_PENALTY = 0.3  # metres: another class counts as much as so much more distance
+    _FORBIDDEN = 1e3  # cost of a pair that cannot be: above any sum of possible ones
     _DEPTH_GATE = 0.3  # metres: half the depth of a person; a predicted mask keeps only pixels that near
 
     def __init__(self, config: IdentityConfig, camera: PinholeCamera, voxel_size: float) -> None:
@@ -112,16 +112,17 @@ class InstanceTracker:
             torch.stack([track.mask[:: self._STRIDE, :: self._STRIDE] for track in self.tracks]),
             instances.masks[:, :: self._STRIDE, :: self._STRIDE],
         )
-        # Without a centroid on either side the masks alone decide, and they must overlap.
-        gate = self._config.max_distance
-        distance = torch.where(torch.isfinite(distance), distance, 2 * gate * (1 - overlap))
+        elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
+        gate = (self._config.max_jump + self._config.max_speed * elapsed)[:, None]
+        overlaps = overlap >= self._config.least_overlap
+        # Without a centroid on either side the masks alone decide.
+        near = torch.where(torch.isfinite(distance), distance <= gate, overlaps)
         labels = torch.tensor([track.label for track in self.tracks])
-        cost = distance + gate * (1 - overlap) + self._CLASS_PENALTY * (labels[:, None] != instances.labels[None, :])
-        rows, columns = linear_sum_assignment(cost.numpy())
+        possible = near & ((labels[:, None] == instances.labels[None, :]) | overlaps)
+        cost = torch.where(torch.isfinite(distance), distance / gate, 1.0) + (1 - overlap)
+        rows, columns = linear_sum_assignment(torch.where(possible, cost, self._FORBIDDEN).numpy())
         return {
-            int(column): self.tracks[row]
-            for row, column in zip(rows, columns, strict=True)
-            if distance[row, column] <= gate
+            int(column): self.tracks[row] for row, column in zip(rows, columns, strict=True) if possible[row, column]
         }
 
     def _predict_mask(self, track: Track, stamp: float, depth: Tensor, T_wc: Tensor) -> Tensor:

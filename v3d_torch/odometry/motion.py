@@ -45,7 +45,9 @@ class MotionEstimator:
         self._camera = camera
         self._seed = seed
 
-    def __call__(self, a: Features, b: Features, usable: Tensor | None = None, elapsed: float = math.inf) -> Motion | None:
+    def __call__(
+        self, a: Features, b: Features, usable: Tensor | None = None, elapsed: float = math.inf
+    ) -> Motion | None:
         """Motion from view ``a`` to view ``b``.
 
         Args:
