@@ -62,7 +62,7 @@ def test_an_occluder_that_hides_all_leaves_nothing_to_tell() -> None:
 
 
 def test_points_beside_the_image_have_no_say() -> None:
-    """The camera has moved right by 60 pixels' worth: the left half of the board is out of its sight, a quarter gone."""
+    """The camera has moved right by 60 pixels: the left half of the board is out of its sight, a quarter is gone."""
     T_wc = HERE.clone()
     T_wc[0, 3] = 60 * OBJECT / CAMERA.fx
     seen = view(((0, 5), OBJECT), T_wc=T_wc)

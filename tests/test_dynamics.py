@@ -102,7 +102,9 @@ def standing(_: float) -> Tensor:
 
 def handheld(t: float) -> Tensor:
     """0.4 m/s sideways, 0.15 m/s forward, and 0.2 rad/s of turning."""
-    return se3_exp(torch.tensor([0.4 * t - 0.2, 0.05 * math.sin(6 * t), 0.15 * t, 0.03, 0.15 - 0.2 * t, 0.02 * t]).double())
+    return se3_exp(
+        torch.tensor([0.4 * t - 0.2, 0.05 * math.sin(6 * t), 0.15 * t, 0.03, 0.15 - 0.2 * t, 0.02 * t]).double()
+    )
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class Frame:
 def play(
     *things: Thing,
     seconds: float,
-    rate: float = 30.0,
+    rate: float = 15.0,
     camera: Callable[[float], Tensor] = standing,
     overrides: tuple[str, ...] = (),
     path: Path | None = None,
@@ -150,6 +152,12 @@ def verdicts(frames: list[Frame], number: int) -> set[Verdict]:
     return {judged.verdict for frame in frames for judged in frame.scene.objects if judged.id == number}
 
 
+def of_class(frames: list[Frame], label: int, *but: int) -> set[Verdict]:
+    """Verdicts on a class but for some ids: what comes out of cover may have a new one."""
+    objects = [judged for frame in frames for judged in frame.scene.objects]
+    return {judged.verdict for judged in objects if judged.label == label and judged.id not in but}
+
+
 def first(frames: list[Frame], number: int, verdict: Verdict) -> float:
     """When an object is first judged so, seconds."""
     return next((frame.stamp for frame in frames if frame[number].verdict is verdict), math.inf)
@@ -170,12 +178,11 @@ def test_a_walker_among_what_stands_is_dynamic_and_nothing_else_is(
 ) -> None:
     """0.9 m/s, at 30 frames a second 3 cm a frame: no more than noise from frame to frame, found within 0.4 s."""
     frames = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1)), seconds=1.0, rate=rate, camera=camera)
-    assert ids(frames) == {1, 2, 3, 4}
     assert first(frames, 4, Verdict.DYNAMIC) <= 0.4 + 1e-6
     assert frames[-1][4].verdict is Verdict.DYNAMIC
     assert frames[-1][4].votes >= 2
-    for number in (1, 2, 3):
-        assert verdicts(frames, number) == {Verdict.STATIC}
+    assert {4} == {judged.id for frame in frames for judged in frame.scene.objects if judged.label == PERSON}
+    assert of_class(frames, CHAIR) == of_class(frames, TV) == {Verdict.STATIC}
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.9), (0.0, 0.0, -0.6), (0.5, 0.0, 0.7)])
@@ -205,30 +212,53 @@ def test_one_object_alone(camera: Callable[[float], Tensor]) -> None:
     assert verdicts(play(CHAIRS[0], seconds=1.2, camera=camera), 1) == {Verdict.STATIC}
 
 
-def test_what_a_walker_passes_in_front_of_stands() -> None:
-    """The chair is cut in two, then covered, then comes out: its centroid jumps all the time."""
-    chair = still((0.0, 0.3, 3.2), (0.7, 0.7, 0.4))
-    frames = play(chair, CHAIRS[0], CHAIRS[1], walker((-0.8, 0.1, 2.0), (1.0, 0.0, 0.0)), seconds=1.8)
-    whole = int((frames[0].owner == 0).sum())
-    assert min(int((frame.owner == 0).sum()) for frame in frames) < 0.5 * whole
-    centroids = torch.stack([frame[1].centroid for frame in frames if not frame[1].missed])
-    assert float((centroids - centroids[0]).norm(dim=1).max()) > 0.1
-    assert all(verdicts(frames, number) == {Verdict.STATIC} for number in (1, 2, 3))
-    assert frames[-1][4].verdict is Verdict.DYNAMIC
+@pytest.mark.parametrize("label", [CHAIR, PERSON])
+def test_what_a_walker_passes_in_front_of_stands(label: int) -> None:
+    """It is cut, then covered, then comes out: its centroid jumps all the time."""
+    standing_still = still((0.2, 0.3, 3.2), (0.9, 0.7, 0.4), label)
+    frames = play(standing_still, CHAIRS[0], walker((-0.45, 0.1, 2.0), (1.0, 0.0, 0.0)), seconds=1.3)
+    pixels = [int((frame.owner == 0).sum()) for frame in frames]
+    assert 50 < min(pixels) < 0.5 * pixels[0]
+    shown = [judged for frame in frames for judged in frame.scene.objects if judged.label == label and judged.id != 3]
+    x = torch.tensor([float(judged.centroid[0]) for judged in shown if label == PERSON or judged.id != 2])
+    assert float((x - x[0]).abs().max()) > 0.15
+    assert of_class(frames, CHAIR) == {Verdict.STATIC}
+    assert of_class(frames, PERSON, 3) <= {Verdict.UNKNOWN, Verdict.STATIC}
+    assert frames[-1][3].verdict is Verdict.DYNAMIC
 
 
-def test_what_the_image_border_cuts_as_the_camera_turns_stands() -> None:
-    """0.6 rad/s; the wide box slides out of the image, and its centroid within it."""
+@pytest.mark.parametrize("label", [CHAIR, PERSON])
+def test_what_the_image_border_cuts_as_the_camera_turns_stands(label: int) -> None:
+    """0.6 rad/s; the wide box slides out of the image, and its centroid along it."""
 
     def turning(t: float) -> Tensor:
         return se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.6 * t, 0.0], dtype=torch.float64))
 
-    table = still((-0.8, 0.3, 2.6), (1.0, 0.4, 0.6))
-    frames = play(table, CHAIRS[1], still((0.4, -0.5, 3.5)), seconds=0.9, camera=turning)
+    wide = still((-0.8, 0.3, 2.6), (1.0, 0.4, 0.6), label)
+    frames = play(wide, CHAIRS[1], still((0.4, -0.5, 3.5)), seconds=0.9, camera=turning)
     assert int((frames[-1].owner == 0).sum()) < 0.4 * int((frames[0].owner == 0).sum())
     assert float((frames[-1][1].centroid - frames[0][1].centroid).norm()) > 0.15
-    for number in (1, 2, 3):
-        assert verdicts(frames, number) == {Verdict.STATIC}
+    assert verdicts(frames, 1) == {Verdict.STATIC if label == CHAIR else Verdict.UNKNOWN}  # not yet for a second
+    assert verdicts(frames, 2) == verdicts(frames, 3) == {Verdict.STATIC}
+
+
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.3), (0.9, 0.0, 0.0)])
+def test_a_chair_that_is_pushed_is_dynamic(velocity: Vector) -> None:
+    """Things have no gait to tell them by: they must leave their places."""
+    x, y, z = velocity
+    pushed = Thing(CHAIR, lambda t: [((-0.4 + x * t, 0.3 + y * t, 2.5 + z * t), (0.5, 0.6, 0.5))])
+    frames = play(*CHAIRS, pushed, seconds=0.8)
+    assert first(frames, 4, Verdict.DYNAMIC) <= 0.4 + 1e-6
+    assert all(verdicts(frames, number) == {Verdict.STATIC} for number in (1, 2, 3))
+
+
+@pytest.mark.xfail(strict=True, reason="in 0.3 s it leaves less than half of its places, at any later time as well")
+def test_a_chair_that_is_pushed_slowly_aside_is_dynamic_within_a_second() -> None:
+    """0.4 m/s: in 0.3 s it has left a quarter of its half metre, in a second four fifths."""
+    pushed = Thing(CHAIR, lambda t: [((-0.6 + 0.4 * t, 0.3, 2.2), (0.5, 0.6, 0.5))])
+    frames = play(*CHAIRS, pushed, seconds=1.4)
+    assert all(verdicts(frames, number) == {Verdict.STATIC} for number in (1, 2, 3))
+    assert first(frames, 4, Verdict.DYNAMIC) <= 1.1
 
 
 @CAMERAS
@@ -240,13 +270,20 @@ def test_a_swayer_deforms_and_is_not_dynamic(camera: Callable[[float], Tensor]) 
     assert max(frame[4].chamfer for frame in frames if frame.stamp >= 0.3) > 0.025
     for number in (1, 2, 3):
         assert verdicts(frames, number) == {Verdict.STATIC}
-        assert max(frame[number].chamfer for frame in frames if frame.stamp >= 0.3 - 1e-6) < 0.025
+
+
+def test_chamfer_of_somebody_who_stands_is_noise_and_things_have_none() -> None:
+    things = (*CHAIRS, walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)))
+    frames = play(*things, seconds=0.8, camera=handheld)
+    assert all(math.isnan(frame[4].chamfer) for frame in frames if frame.stamp < 0.29)
+    assert all(0 < frame[4].chamfer < 0.02 for frame in frames if frame.stamp > 0.31)
+    assert all(math.isnan(frame[number].chamfer) for frame in frames for number in (1, 2, 3))
 
 
 @RATES
 def test_a_verdict_holds_and_ends(rate: float) -> None:
     """The walk ends after 0.8 s; the last pair of views that shows it, 0.3 or 0.4 s apart, after 1.1 or 1.2 s."""
-    frames = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.8), seconds=2.6, rate=rate)
+    frames = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.8), seconds=2.4, rate=rate)
     dynamic = [frame.stamp for frame in frames if frame[4].verdict is Verdict.DYNAMIC]
     assert dynamic == [frame.stamp for frame in frames if dynamic[0] <= frame.stamp <= dynamic[-1]]
     assert 0.8 + 1.0 <= dynamic[-1] < 0.8 + 0.4 + 1.0 + 1e-6
@@ -256,11 +293,16 @@ def test_a_verdict_holds_and_ends(rate: float) -> None:
 def test_a_verdict_holds_for_the_configured_time() -> None:
     thing = walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.6)
     short, long = (
-        play(*CHAIRS, thing, seconds=1.7, overrides=(f"objects.mask.hold_dynamic={hold}", "objects.chamfer.enabled=false"))
+        play(
+            *CHAIRS,
+            thing,
+            seconds=1.7,
+            overrides=(f"objects.mask.hold_dynamic={hold}", "objects.chamfer.enabled=false"),
+        )
         for hold in (0.2, 0.6)
     )
     ends = [max(frame.stamp for frame in run if frame[4].verdict is Verdict.DYNAMIC) for run in (short, long)]
-    assert ends[1] - ends[0] == pytest.approx(0.4, abs=1e-6)
+    assert ends[1] - ends[0] == pytest.approx(0.4, abs=1.01 / 15)  # a frame more or less by rounding
 
 
 @RATES
@@ -287,7 +329,9 @@ def test_the_static_mask_leaves_out_who_moves_or_might_with_a_margin_and_nothing
 
 
 def test_a_margin_of_nothing_leaves_out_the_masks_themselves() -> None:
-    frame = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), seconds=0.2, overrides=("objects.mask.margin=0",))[-1]
+    frame = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), seconds=0.2, overrides=("objects.mask.margin=0",))[
+        -1
+    ]
     assert torch.equal(frame.scene.static, frame.owner != 3)
 
 
@@ -311,7 +355,7 @@ def test_a_missed_walker_stays_left_out_where_it_must_be_and_is_then_forgotten()
             assert frame[4].verdict is Verdict.DYNAMIC
             assert math.isnan(frame[4].chamfer)
             true_x = -0.6 + 0.9 * frame.stamp
-            assert float(frame[4].centroid[0]) == pytest.approx(true_x, abs=0.05)
+            assert float(frame[4].centroid[0]) == pytest.approx(true_x, abs=0.1)
             left_out = (~frame.scene.static)[frame.owner == 3]
             assert float(left_out.double().mean()) > 0.98
     assert 4 not in {judged.id for judged in frames[-1].scene.objects}
@@ -328,11 +372,11 @@ def test_without_voting_nothing_is_dynamic_and_without_chamfer_nothing_deforms()
     assert all(math.isnan(frame[4].chamfer) for frame in no_chamfer)
 
 
-@pytest.mark.parametrize("thing", [walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1), stop=0.6), swayer((0.0, 0.1, 2.4))])
+@pytest.mark.parametrize("thing", [walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1), stop=0.5), swayer((0.0, 0.1, 2.4))])
 def test_verdicts_do_not_change_when_the_world_is_corrected_under_them(thing: Thing) -> None:
     T_new_old = se3_exp(torch.tensor([0.7, -0.2, 1.5, 0.2, -0.8, 0.4], dtype=torch.float64))
-    overrides = ("objects.mask.hold_dynamic=0.3",)
-    arguments = {"seconds": 1.3, "camera": handheld, "overrides": overrides}
+    overrides = ("objects.mask.hold_dynamic=0.2",)
+    arguments = {"seconds": 1.2, "camera": handheld, "overrides": overrides}
     never = play(*CHAIRS, thing, **arguments)  # type: ignore[arg-type]
     then = play(*CHAIRS, thing, correction=(0.5, T_new_old), **arguments)  # type: ignore[arg-type]
     assert ids(never) == ids(then) == {1, 2, 3, 4}
@@ -436,24 +480,17 @@ def test_literal_rules_give_no_vote_to_what_the_frame_before_has_not() -> None:
     assert [judged[number].votes for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
-@pytest.mark.xfail(strict=True, reason="a background that cannot tell votes for motion all the same")
-def test_an_object_of_which_nothing_can_be_told_is_not_dynamic() -> None:
-    """A still box alone, of few points, behind whose place every other pixel has no depth from time to time."""
-    config = load_config(None, (STRIDE, "objects.clouds.eps=0.2")).objects
+def test_where_the_background_cannot_tell_nothing_is_dynamic() -> None:
+    """A box steps on by 6 cm a frame while the depth of all images is lost, so that no place can be looked at."""
+    config = load_config(None, (STRIDE,)).objects
     lift, judge = CloudLifter(config.clouds, CAMERA), ObjectDynamics(config, CAMERA)
-    box = still((0.3, 0.2, 3.0), (0.26, 0.26, 0.2))
-    votes = []
+    nothing = torch.zeros(1, CAMERA.height, CAMERA.width)
     for frame in range(12):
-        depth, owner = photograph([box], frame / 30, HERE, 0.0)
-        holes = torch.rand(owner.shape, generator=torch.Generator().manual_seed(frame)) < 0.65
-        depth[0, holes & (owner == 0)] = 0.0
-        instances = found(owner, [box], set())
-        clouds = lift(depth, instances)
-        scene = judge(frame / 30, instances, clouds, depth, HERE)
-        votes.append(scene.objects[0].votes)
-        assert torch.isfinite(scene.objects[0].centroid).all()
-        assert scene.objects[0].verdict is Verdict.STATIC
-    assert votes == [0] * 12
+        things = [still((0.06 * frame - 0.3, 0.2, 3.0)), still((0.8, 0.2, 3.0))]
+        depth, owner = photograph(things, frame / 30, HERE, 0.0)
+        instances = found(owner, things, set())
+        scene = judge(frame / 30, instances, lift(depth, instances), nothing, HERE)
+        assert [judged.verdict for judged in scene.objects] == [Verdict.STATIC, Verdict.STATIC]
 
 
 def test_nothing_to_see() -> None:

@@ -21,7 +21,9 @@ COLUMNS, ROWS = (280, 400), (150, 330)  # of the object in the image: first and 
 
 def instances(*masks: Tensor) -> Instances:
     count = len(masks)
-    return Instances(torch.stack(masks), torch.zeros(count, dtype=torch.int64), torch.ones(count), torch.zeros(count, 4))
+    return Instances(
+        torch.stack(masks), torch.zeros(count, dtype=torch.int64), torch.ones(count), torch.zeros(count, 4)
+    )
 
 
 def rectangle(columns: tuple[int, int] = COLUMNS, rows: tuple[int, int] = ROWS, grown: int = 0) -> Tensor:

@@ -175,7 +175,9 @@ def test_lost_frames_are_interpolated_after_all_corrections() -> None:
     tied = keyframe()
     poses = PoseRecorder()
     for stamp in (0.0, 0.1, 0.2):
-        poses.record(stamp, estimate(EYE, Status.LOST if stamp == 0.1 else Status.TRACKED), None if stamp == 0 else tied)
+        poses.record(
+            stamp, estimate(EYE, Status.LOST if stamp == 0.1 else Status.TRACKED), None if stamp == 0 else tied
+        )
     tied.T_cw = se3_exp(torch.tensor([-0.4, 0, 0, 0, 0, 0], dtype=torch.float64))
     x = poses.trajectory().T_wc[:, 0, 3]
     assert x.tolist() == pytest.approx([0.0, 0.2, 0.4])

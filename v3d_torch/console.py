@@ -18,7 +18,7 @@ from rich.table import Table
 
 from v3d_torch.config import load_config
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
 from v3d_torch.mapping.recorder import Status
@@ -132,15 +132,16 @@ class _Verdicts:
 
 def _result_folder(out: Path | None, sequence: str) -> Path:
     """The folder given, else a new one by the time, which ``latest`` beside it points to."""
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        return out
     runs = Path("results") / sequence.replace("/", "_")
-    folder = runs / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    folder.mkdir(parents=True, exist_ok=True)
-    latest = runs / "latest"
-    latest.unlink(missing_ok=True)
-    latest.symlink_to(folder.name)
+    folder = out or runs / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if out is None:
+            latest = runs / "latest"
+            latest.unlink(missing_ok=True)
+            latest.symlink_to(folder.name)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from error
     return folder
 
 

@@ -26,6 +26,7 @@ def main(
         list[str] | None, typer.Option("--set", help="A value, such as objects.voting.distance_threshold=0.05.")
     ] = None,
     segmenter: Annotated[str | None, typer.Option(help="yolo, masks or none.")] = None,
+    model: Annotated[str | None, typer.Option(help="yolov8n-seg, yolo11n-seg or yolo26n-seg.")] = None,
     masks: Annotated[Path | None, typer.Option(help="Folder of id images for --segmenter masks.")] = None,
     weights: Annotated[Path | None, typer.Option(help="Checkpoint or ONNX file of the network.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
@@ -37,6 +38,7 @@ def main(
 
     overrides = list(set_ or [])
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
+    overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
     with exit_on_error():
         run_sequence(

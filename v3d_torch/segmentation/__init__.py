@@ -35,6 +35,6 @@ def make_segmenter(
         return NoSegmentation()
     if config.source == "masks":
         if masks_dir is None:
-            raise ConfigError("segmentation.source=masks: name the folder of the id images")
+            raise ConfigError("segmentation.source=masks: name the folder of the id images with --masks")
         return StoredMasks(masks_dir)
     return YOLOSegmenter(config, weights)

@@ -37,7 +37,7 @@ class StoredMasks:
         self.folder = folder
         self._paths = sorted(folder.glob("*.png"))
         if not self._paths:
-            raise InputError(f"{folder}: holds no PNG files; name the folder of the id images")
+            raise InputError(f"{folder}: holds no PNG files; name the folder of the id images with --masks")
         self._stamps: Tensor | None = None
         if all(_STAMP.fullmatch(path.stem) for path in self._paths):
             self._stamps = torch.tensor([float(path.stem) for path in self._paths], dtype=torch.float64)
