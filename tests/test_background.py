@@ -69,6 +69,11 @@ def test_points_beside_the_image_have_no_say() -> None:
     assert share(surface((50, 70)), seen) == pytest.approx(0.5)
 
 
+def test_points_up_to_the_border_have_a_say() -> None:
+    for columns, rows in (((150, 160), (40, 80)), ((0, 10), (40, 80)), ((60, 80), (110, 120)), ((60, 80), (0, 10))):
+        assert share(surface(columns, rows), view()) == 1.0
+
+
 def test_points_behind_the_camera_have_no_say() -> None:
     T_wc = HERE.clone()
     T_wc[2, 3] = OBJECT + 1.0
@@ -127,6 +132,14 @@ def test_moved_share_is_the_greater_of_leaving_and_coming() -> None:
     assert moved_share((then, hidden_then), (now, visible_now), CAMERA, CONFIG) == 1.0
     # The same the other way round in time: it goes behind the screen.
     assert moved_share((now, visible_now), (then, hidden_then), CAMERA, CONFIG) == 1.0
+
+
+def test_what_grows_has_moved_by_the_share_that_is_new() -> None:
+    small = surface((60, 80)), view(((60, 80), OBJECT))
+    large = surface((60, 100)), view(((60, 100), OBJECT))
+    assert vacated_share(small[0], large[1], CAMERA, CONFIG) == 0.0
+    assert moved_share(small, large, CAMERA, CONFIG) == pytest.approx(0.5)
+    assert moved_share(large, small, CAMERA, CONFIG) == pytest.approx(0.5)
 
 
 def test_nobody_can_tell() -> None:

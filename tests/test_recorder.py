@@ -105,6 +105,11 @@ def test_the_jump_to_where_a_lost_camera_is_found_is_no_velocity() -> None:
 # --- lost frames
 
 
+def test_without_frames_the_trajectory_is_empty() -> None:
+    trajectory = PoseRecorder().trajectory()
+    assert len(trajectory) == 0 and trajectory.T_wc.shape == (0, 4, 4)
+
+
 def test_lost_frames_lie_on_the_geodesic_between_their_neighbours() -> None:
     stamps = [0.0, 0.1, 0.2, 0.35, 0.5, 0.6]  # unevenly spaced
     poses = walk(stamps, lost=(2, 3, 4))
@@ -174,10 +179,9 @@ def test_each_frame_follows_its_own_keyframe() -> None:
 def test_lost_frames_are_interpolated_after_all_corrections() -> None:
     tied = keyframe()
     poses = PoseRecorder()
-    for stamp in (0.0, 0.1, 0.2):
-        poses.record(
-            stamp, estimate(EYE, Status.LOST if stamp == 0.1 else Status.TRACKED), None if stamp == 0 else tied
-        )
+    poses.record(0.0, estimate(EYE), None)
+    poses.record(0.1, estimate(EYE, Status.LOST), tied)
+    poses.record(0.2, estimate(EYE), tied)
     tied.T_cw = se3_exp(torch.tensor([-0.4, 0, 0, 0, 0, 0], dtype=torch.float64))
     x = poses.trajectory().T_wc[:, 0, 3]
     assert x.tolist() == pytest.approx([0.0, 0.2, 0.4])

@@ -164,7 +164,7 @@ def test_dense_map_equals_plain_voxel_means() -> None:
     generator = torch.Generator().manual_seed(3)
     fused = dense(stride=4, voxel_size=0.05, max_depth=3.0)
     voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for view in range(2):
+    for _ in range(2):
         T_cw = se3_exp(0.02 * torch.randn(6, generator=generator, dtype=torch.float64))
         depth = 1.5 + 2 * torch.rand(1, 240, 320, generator=generator)
         depth[0, :20] = 0.0
@@ -281,8 +281,8 @@ def test_masks_show_what_is_left_out(tmp_path: Path) -> None:
 
 def test_masks_that_cannot_be_written_end_the_run_with_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "masks").write_text("")
-    with pytest.raises(OutputError, match=r"masks.*cannot be written"):
-        pipeline(masks=tmp_path / "masks")()
+    failure = pipeline(masks=tmp_path / "masks")().failure
+    assert failure is not None and "masks" in failure and "cannot be written" in failure
 
 
 # --- the files of a run

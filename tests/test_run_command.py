@@ -244,7 +244,7 @@ def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
     """Where there is a network this would fetch 500 MB: a proxy that nobody listens at keeps it off."""
     (tmp_path / "data").mkdir()
     start = time.monotonic()
-    nobody = {name: "http://127.0.0.1:9" for name in ("https_proxy", "http_proxy", "HTTPS_PROXY", "HTTP_PROXY")}
+    nobody = dict.fromkeys(("https_proxy", "http_proxy", "HTTPS_PROXY", "HTTP_PROXY"), "http://127.0.0.1:9")
     variables = {"V3D_DATA": str(tmp_path / "data"), "V3D_CACHE": str(tmp_path / "cache"), "no_proxy": "", **nobody}
     done = call("--seq", "fr3/w/xyz", cwd=tmp_path, **variables)
     assert time.monotonic() - start < 20
@@ -275,7 +275,7 @@ def test_ctrl_c_keeps_what_was_computed(sequence: Path, tmp_path: Path) -> None:
 
 def test_help_is_instant_and_names_every_option() -> None:
     start = time.monotonic()
-    done = subprocess.run(  # noqa: S603
+    done = subprocess.run(
         [sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, env=environment(), check=True
     )
     assert time.monotonic() - start < 3

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets.base import RGBDSequence
-from v3d_torch.errors import InputError
+from v3d_torch.errors import V3DError
 from v3d_torch.files import write_png
 from v3d_torch.mapping.dense import DenseMap
 from v3d_torch.mapping.recorder import Status
@@ -82,7 +82,7 @@ class Pipeline:
                 self._note(frame, scene)
                 if on_frame is not None:
                     on_frame(frame, scene, self.slam.poses.statuses[-1])
-        except InputError as error:
+        except V3DError as error:
             self.run.failure = str(error)
         except KeyboardInterrupt:
             done, total = len(self.slam.poses.statuses), len(self.sequence)
@@ -97,7 +97,7 @@ class Pipeline:
             write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
         keyframes = self.slam.mapper.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.dense.add(keyframes[-1], frame.image, frame.depth, scene.static)
+            self.dense.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
         step = max(len(self.sequence) // self._SNAPSHOTS, 1)
         if frame.index % step == step // 2 and len(self.run.snapshots) < self._SNAPSHOTS:
             self.run.snapshots.append(Snapshot(frame.stamp, frame.image, scene.objects))

@@ -62,10 +62,12 @@ class Scene:
     Attributes:
         objects: by id.
         static: pixels that tracking may use, bool, shape :math:`(H, W)`.
+        unpeopled: pixels of ``static`` that show no person, not even one who stands still, for the coloured map.
     """
 
     objects: list[Judged]
     static: Tensor
+    unpeopled: Tensor
 
 
 class ObjectDynamics:
@@ -108,7 +110,10 @@ class ObjectDynamics:
             )
             for track in tracks
         ]
-        return Scene(objects, self._static_mask(objects, depth.shape[-2:]))
+        moving = [judged for judged in objects if not self._may_be_tracked(judged)]
+        people = [judged for judged in objects if judged.label == PERSON]
+        static = self._clear_of(moving, depth.shape[-2:])
+        return Scene(objects, static, static & self._clear_of(people, depth.shape[-2:]))
 
     def _vote(self, stamp: float, tracks: list[Track]) -> dict[int, int]:
         """Votes of each object, the most over all baselines; marks those that are voted dynamic."""
@@ -172,14 +177,15 @@ class ObjectDynamics:
             return Verdict.UNKNOWN
         return Verdict.STATIC
 
-    def _static_mask(self, objects: list[Judged], size: torch.Size) -> Tensor:
-        """Pixels outside of every object that moves or might, these grown by the margin."""
-        left_out = torch.zeros(size, dtype=torch.bool)
+    def _may_be_tracked(self, judged: Judged) -> bool:
+        deforming = judged.verdict is Verdict.DEFORMING and self._config.chamfer.include_deforming
+        return deforming or judged.verdict is Verdict.STATIC
+
+    def _clear_of(self, objects: list[Judged], size: torch.Size) -> Tensor:
+        """Pixels outside of the given objects, these grown by the margin, bool, shape (H, W)."""
+        covered = torch.zeros(size, dtype=torch.bool)
         for judged in objects:
-            if judged.verdict is Verdict.DEFORMING and self._config.chamfer.include_deforming:
-                continue
-            if judged.verdict is not Verdict.STATIC:
-                left_out |= judged.mask
+            covered |= judged.mask
         side = 2 * self._config.mask.margin + 1
-        grown = cv2.dilate(left_out.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+        grown = cv2.dilate(covered.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
         return torch.from_numpy(grown == 0)
