@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.levenberg import huber
 from v3d_torch.lie import invert, se3_exp, se3_log
 from v3d_torch.mapping.bundle import (
     Observations,
@@ -19,7 +20,7 @@ from v3d_torch.mapping.bundle import (
     normal_equations,
     solve_normal_equations,
 )
-from v3d_torch.odometry.refine import huber, reprojection
+from v3d_torch.odometry.refine import reprojection
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
 DEPTH_SIGMA = 0.0025

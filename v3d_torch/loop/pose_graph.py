@@ -20,7 +20,7 @@ import torch
 from pypose.lietensor.operation import SE3_Adj, se3_Jl_inv
 from torch import Tensor
 
-from v3d_torch.odometry.refine import huber, levenberg_marquardt
+from v3d_torch.levenberg import huber, levenberg_marquardt
 
 
 @dataclass(frozen=True)

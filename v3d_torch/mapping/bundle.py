@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.levenberg import huber, levenberg_marquardt
 from v3d_torch.lie import se3_exp
-from v3d_torch.odometry.refine import Measurements, chi_square, huber, levenberg_marquardt, reprojection
+from v3d_torch.odometry.refine import Measurements, chi_square, reprojection
 
 
 @dataclass(frozen=True, kw_only=True)
