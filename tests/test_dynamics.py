@@ -353,6 +353,16 @@ def test_features_on_the_deforming_are_kept_when_asked_for() -> None:
     assert not left_out.scene.static[left_out.owner == 3].any()
 
 
+def test_somebody_who_stands_is_tracked_on_but_not_mapped() -> None:
+    things = (CHAIRS[0], walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)))
+    scene = (frame := play(*things, seconds=1.2, overrides=("objects.mask.margin=5",))[-1]).scene
+    assert frame[2].verdict is Verdict.STATIC
+    assert scene.static.all()
+    away = torch.from_numpy(distance_transform_edt(frame.owner != 1))
+    assert not scene.unpeopled[away <= 4].any()
+    assert scene.unpeopled[away >= 6].all()
+
+
 def test_a_missed_walker_stays_left_out_where_it_must_be_and_is_then_forgotten() -> None:
     things = (*CHAIRS, walker((-0.6, 0.1, 2.3), (0.9, 0.0, 0.0)))
     frames = play(*things, seconds=1.4, hidden=lambda t: {3} if t > 0.65 else set())

@@ -78,7 +78,7 @@ class IdentityConfig(Section):
 
     max_speed: float = Field(3.0, gt=0)
     """No object in a room moves faster, m/s: a person who runs. A centroid farther off is another object's."""
-    max_jump: float = Field(0.2, gt=0)
+    max_jump: float = Field(0.5, gt=0)
     """By so much a centroid may be off in any time, metres: it moves when an object is cut or covered."""
     least_overlap: float = Field(0.5, ge=0, le=1)
     """An instance of another class continues an object only where their masks overlap by this: a class may flicker
@@ -100,7 +100,7 @@ class VotingConfig(Section):
     """T_d, metres: a change of the distance between two centroids that counts as a vote."""
     vote_threshold: int = Field(2, gt=0)
     """T_v, votes that make an object dynamic (authors' code: more than one)."""
-    baselines: tuple[float, ...] = (0.0, 0.3)
+    baselines: tuple[float, ...] = (0.0, 0.3, 0.9)
     """Distances now are compared with those so many seconds ago; 0 is the frame before, the paper's rule. A walker at
     1 m/s changes by 3 cm in 1/30 s, no more than a centroid's noise, and by 30 cm in 0.3 s."""
 

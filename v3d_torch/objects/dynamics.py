@@ -81,6 +81,7 @@ class ObjectDynamics:
     def __init__(self, config: ObjectsConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._camera = camera
+        self._last_stamp = -torch.inf
         self.tracker = InstanceTracker(config.identity, camera, config.clouds.voxel_size)
 
     def __call__(self, stamp: float, instances: Instances, clouds: ObjectClouds, depth: Tensor, T_wc: Tensor) -> Scene:
@@ -97,6 +98,7 @@ class ObjectDynamics:
         seen = [track for track in tracks if not track.missed]
         votes = self._vote(stamp, seen)
         chamfer = self._deform(stamp, seen)
+        self._last_stamp = stamp
         objects = [
             Judged(
                 id=track.id,
@@ -121,6 +123,8 @@ class ObjectDynamics:
         most: dict[int, int] = {}
         for baseline in config.baselines if config.enabled else ():
             pairs = {track: pair for track in tracks if (pair := track.pair(baseline)) is not None}
+            if baseline == 0:  # the frame before: what it has not is not compared (Alg. 1)
+                pairs = {track: pair for track, pair in pairs.items() if pair[0].stamp >= self._last_stamp}
             if not pairs:
                 continue
             then = torch.stack([then.centroid for then, _ in pairs.values()])

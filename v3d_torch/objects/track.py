@@ -72,6 +72,11 @@ class Track:
         """The last time that the network saw the object."""
         return self.sightings[-1]
 
+    @property
+    def located(self) -> Sighting:
+        """The last sighting with a centroid; the newest one when none has."""
+        return next((sighting for sighting in reversed(self.sightings) if sighting.located), self.newest)
+
     def pair(self, baseline: float) -> tuple[Sighting, Sighting] | None:
         """The newest sighting and the newest one at least ``baseline`` seconds before it; 0 means the one before.
 
@@ -86,14 +91,14 @@ class Track:
 
     def predict(self, stamp: float) -> Tensor:
         """Centroid at ``stamp`` with constant velocity (paper, Sec. II), world frame, shape :math:`(3,)`."""
-        return self.newest.centroid + self.velocity * (stamp - self.newest.stamp)
+        return self.located.centroid + self.velocity * (stamp - self.located.stamp)
 
     def extend(self, sighting: Sighting, gain: float, history: float) -> None:
         """Take in a new sighting: update the velocity, forget what is older than ``history`` seconds."""
-        elapsed = sighting.stamp - self.newest.stamp
-        displacement = sighting.centroid - self.newest.centroid
+        elapsed = sighting.stamp - self.located.stamp
+        displacement = sighting.centroid - self.located.centroid
         if elapsed > 0 and torch.isfinite(displacement).all():
             self.velocity = (1 - gain) * self.velocity + gain * displacement / elapsed
         self.sightings.append(sighting)
-        while sighting.stamp - self.sightings[0].stamp > history and len(self.sightings) > 2:
+        while sighting.stamp - self.sightings[0].stamp > history + self._TOLERANCE and len(self.sightings) > 2:
             self.sightings.pop(0)

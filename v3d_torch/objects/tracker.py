@@ -30,7 +30,7 @@ class InstanceTracker:
     """
 
     _STRIDE = 4  # masks are compared on every 4th pixel: an overlap needs no more
-    _FORBIDDEN = 1e3  # cost of a pair that cannot be: above any sum of possible ones
+    _FORBIDDEN = 2.0  # cost of a pair that cannot be: the most of one that can, or ids would move along to fill gaps
     _DEPTH_GATE = 0.3  # metres: half the depth of a person; a predicted mask keeps only pixels that near
 
     def __init__(self, config: IdentityConfig, camera: PinholeCamera, voxel_size: float) -> None:
@@ -75,7 +75,7 @@ class InstanceTracker:
             if track.id not in continued:
                 track.missed = True
                 track.mask = self._predict_mask(track, stamp, depth, T_wc)
-        return self.tracks
+        return list(self.tracks)
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the tracks along when the map is corrected under them.
