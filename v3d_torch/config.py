@@ -266,7 +266,7 @@ class LoopConfig(Section):
     candidates: int = Field(3, gt=0)
     """Places looked at for each keyframe."""
     min_gap: int = Field(10, gt=0)
-    """Keyframes nearer in time than this are no loop."""
+    """Keyframes nearer in time than this are no loop; nor is one looked for so soon after another."""
     min_inliers: int = Field(40, gt=0)
     """Inliers of the geometric verification."""
 
@@ -276,8 +276,8 @@ class Config(Section):
 
     seed: int = Field(0, ge=0)
     """Seed of every random choice."""
-    threads: int = Field(2, gt=0)
-    """Threads of torch."""
+    threads: int = Field(1, gt=0)
+    """Threads of torch: the tensors of a frame are so small that more threads wait for each other."""
     segmentation: SegmentationConfig = SegmentationConfig()
     depth: DepthConfig = DepthConfig()
     objects: ObjectsConfig = ObjectsConfig()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
 import time
 from collections import Counter
@@ -10,9 +12,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from threading import Event
+from types import FrameType
 
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -42,7 +47,7 @@ def exit_on_error() -> Iterator[None]:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("error: interrupted before the first frame; nothing was computed", file=sys.stderr)
+        print("error: interrupted before the results were written", file=sys.stderr)
         sys.exit(2)
 
 
@@ -74,17 +79,18 @@ def run_sequence(
     pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), folder / "masks" if save_masks else None)
     with _log_to(folder / "run.log"):
         _LOG.info("%s: %d frames", sequence.name, len(sequence))
-        with _progress(console) as progress:
-            run = pipeline(_Verdicts(progress, len(sequence)))
+        with _progress(console) as progress, _interrupts_between_frames() as interrupted:
+            run = pipeline(_Verdicts(progress, len(sequence), interrupted))
         evaluation = write_results(folder, pipeline)
         if run.failure:
             _LOG.error(run.failure)
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
         console.print(table)
-    console.print(f"results: {folder}")
+    console.print(f"results: {folder}", markup=False)  # brackets in the name are no markup
     if run.failure:
-        raise InputError(f"{run.failure}; the results of the frames before are in {folder}")
+        done = len(pipeline.slam.poses.statuses)
+        raise InputError(f"{run.failure}; the results of the {done} frames before are in {folder}")
 
 
 def _progress(console: Console) -> Progress:
@@ -115,8 +121,9 @@ class _Bar:
 class _Verdicts:
     """The bar of a run: frames a second, and what the objects in view are judged to be."""
 
-    def __init__(self, progress: Progress, frames: int) -> None:
+    def __init__(self, progress: Progress, frames: int, interrupted: Event) -> None:
         self._progress = progress
+        self._interrupted = interrupted
         self._task = progress.add_task("tracking", total=frames, note="")
         self._start = time.perf_counter()
         self._frames = 0
@@ -128,6 +135,25 @@ class _Verdicts:
         objects = ", ".join(f"{count} {what}" for what, count in sorted(verdicts.items()) if "static" not in what)
         self._progress.update(self._task, advance=1, note=f"{rate:.1f} frames/s  {status.value}  {objects}")
         _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, status.value, objects or "nothing moves")
+        if self._interrupted.is_set():
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def _interrupts_between_frames() -> Iterator[Event]:
+    """Hold Ctrl-C back until a frame is done, so that the map is whole; a second one strikes at once."""
+    interrupted = Event()
+
+    def hold(signum: int, frame: FrameType | None) -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        interrupted.set()
+
+    before = signal.signal(signal.SIGINT, hold)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _result_folder(out: Path | None, sequence: str) -> Path:
@@ -137,9 +163,9 @@ def _result_folder(out: Path | None, sequence: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if out is None:
-            latest = runs / "latest"
-            latest.unlink(missing_ok=True)
-            latest.symlink_to(folder.name)
+            pointer = runs / f".latest.{os.getpid()}"  # renamed, so that there is always a latest
+            pointer.symlink_to(folder.name)
+            pointer.replace(runs / "latest")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from error
     return folder
@@ -163,7 +189,7 @@ def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     slam, run = pipeline.slam, pipeline.run
     statuses = Counter(slam.poses.statuses)
     verdicts = Counter(str(row["verdict"]) for row in run.dynamics)
-    table = Table(title=f"V3D-SLAM on {pipeline.sequence.name}", show_header=False)
+    table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
     table.add_row("frames", f"{len(slam.poses.statuses)} of {len(pipeline.sequence)}")
     table.add_row("found", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes)}, {slam.loops.count}")

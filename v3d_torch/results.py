@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import resource
 import sys
 from contextlib import suppress
 from importlib.metadata import version
@@ -28,6 +27,9 @@ from v3d_torch.segmentation.coco import COCO_NAMES
 from v3d_torch.trajectory import write_trajectory
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figures import mask_strip, trajectory_figure
+
+if sys.platform != "win32":
+    import resource
 
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
@@ -66,10 +68,9 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)
     keyframes = slam.mapper.map.keyframes
-    if keyframes:
-        T_wc = invert(torch.stack([keyframe.T_cw for keyframe in keyframes]))
-        stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-        write_trajectory(folder / "keyframes.txt", Trajectory(stamps, T_wc))
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(keyframe.T_cw[None] for keyframe in keyframes)])
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(T_cw)))
     evaluation = None
     if sequence.groundtruth is not None:
         with suppress(InputError):  # too few poses to score are still worth writing
@@ -88,7 +89,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
     frames = len(statuses)
     counts = {status.value: statuses.count(status) for status in Status}
     return {
-        **(evaluation.to_dict() if evaluation is not None else {}),
+        **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
         "sequence": pipeline.sequence.name,
         "frames": len(pipeline.sequence),
         "processed": frames,
@@ -112,7 +113,9 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
     }
 
 
-def _peak_memory_mb() -> float:
+def _peak_memory_mb() -> float | None:
+    if sys.platform == "win32":
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 

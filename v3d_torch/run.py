@@ -27,7 +27,7 @@ def main(
     ] = None,
     segmenter: Annotated[str | None, typer.Option(help="yolo, masks or none.")] = None,
     model: Annotated[str | None, typer.Option(help="yolov8n-seg, yolo11n-seg or yolo26n-seg.")] = None,
-    masks: Annotated[Path | None, typer.Option(help="Folder of id images for --segmenter masks.")] = None,
+    masks: Annotated[Path | None, typer.Option(help="Folder of id images, for --segmenter masks.")] = None,
     weights: Annotated[Path | None, typer.Option(help="Checkpoint or ONNX file of the network.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
@@ -37,6 +37,7 @@ def main(
     from v3d_torch.console import exit_on_error, run_sequence
 
     overrides = list(set_ or [])
+    segmenter = segmenter or ("masks" if masks is not None else None)
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []

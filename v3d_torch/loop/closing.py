@@ -99,7 +99,9 @@ class LoopCloser:
         return invert(keyframe.T_cw) @ T_cw_before
 
     def _find(self, keyframe: Keyframe, sparse_map: SparseMap) -> Place | None:
-        """A place seen before that neither time nor the map connects with the keyframe."""
+        """A place seen before that neither time nor the map connects with the keyframe; none soon after another."""
+        if self._loops and keyframe.index - self._loops[-1][1] < self._config.min_gap:
+            return None
         near = sparse_map.shared(keyframe.landmarks[keyframe.landmarks >= 0]).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_gap, keyframe.index + 1)
         return self.recognise(keyframe.features, sparse_map, {*near, *recent})

@@ -119,7 +119,8 @@ class SparseMap:
             Indices of keyframes that see at least one, int64, shape :math:`(<= count,)`.
         """
         shared = self.shared(landmarks)
-        order = torch.argsort(shared, descending=True, stable=True)[:count]
+        newest_first = shared * len(shared) + torch.arange(len(shared))  # of those that share as many
+        order = torch.argsort(newest_first, descending=True)[:count]
         return order[shared[order] > 0]
 
     def shared(self, landmarks: Tensor) -> Tensor:
@@ -181,7 +182,8 @@ class SparseMap:
             keyframe: whose features were found again.
             landmarks: id of the known landmark behind each of its features, -1 for none, int64, shape :math:`(N,)`.
         """
-        same = (keyframe.landmarks >= 0) & (landmarks >= 0) & (keyframe.landmarks != landmarks)
+        same = (keyframe.landmarks >= 0) & (landmarks >= 0)
+        same &= ~torch.isin(keyframe.landmarks, landmarks)  # what others become stays itself
         becomes = torch.arange(len(self.landmarks))
         becomes[keyframe.landmarks[same]] = landmarks[same]
         self.landmarks["alive"][keyframe.landmarks[same]] = False

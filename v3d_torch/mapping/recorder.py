@@ -115,7 +115,7 @@ class PoseRecorder:
     def trajectory(self) -> Trajectory:
         """All frames after all corrections; lost ones interpolated between their neighbours that were found."""
         stamps = torch.tensor([entry.stamp for entry in self._entries], dtype=torch.float64)
-        T_cw = torch.stack([entry.T_cw for entry in self._entries])
+        T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(entry.T_cw[None] for entry in self._entries)])
         found = torch.tensor([entry.status is not Status.LOST for entry in self._entries])
         return Trajectory(stamps, invert(_interpolate(stamps, T_cw, found)))
 
