@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from v3d_torch.config import Config, dump_config, load_config
+from v3d_torch.config import Config
+from v3d_torch.config_file import dump_config, load_config
 from v3d_torch.errors import ConfigError
 
 

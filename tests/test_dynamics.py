@@ -13,7 +13,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import ObjectsConfig, load_config
+from v3d_torch.config import ObjectsConfig
+from v3d_torch.config_file import load_config
 from v3d_torch.lie import se3_exp
 from v3d_torch.objects.dynamics import Judged, ObjectDynamics, Scene, Verdict
 from v3d_torch.objects.lift import CloudLifter, ObjectClouds

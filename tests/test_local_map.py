@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import Config, MappingConfig, load_config
+from v3d_torch.config import Config, MappingConfig
+from v3d_torch.config_file import load_config
 from v3d_torch.lie import invert, se3_exp
 from v3d_torch.mapping.adjust import adjust_locally
 from v3d_torch.mapping.local_map import Keyframe, SparseMap

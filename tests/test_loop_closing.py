@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import Config, load_config
+from v3d_torch.config import Config
+from v3d_torch.config_file import load_config
 from v3d_torch.lie import invert, se3_exp, se3_log
 from v3d_torch.loop.closing import LoopCloser
 from v3d_torch.loop.places import PlaceIndex

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import Config, DenseMapConfig, load_config
+from v3d_torch.config import Config, DenseMapConfig
+from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.files import one_process_makes, write_png, write_text, written_whole
 from v3d_torch.lie import invert, se3_exp

@@ -1,20 +1,13 @@
 """Typed configuration: a section per stage, each constant with its unit and its reason.
 
-Values come from the defaults here, then a YAML file, then ``section.key=value`` from the command line; the resolved
-whole is written beside each result.
+`v3d_torch.config_file` reads it from YAML and the command line; the resolved whole is written beside each result.
 """
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from v3d_torch.errors import ConfigError
+from pydantic import BaseModel, ConfigDict, Field
 
 
 class Section(BaseModel):
@@ -287,72 +280,3 @@ class Config(Section):
     mapping: MappingConfig = MappingConfig()
     loop: LoopConfig = LoopConfig()
     dense_map: DenseMapConfig = DenseMapConfig()
-
-
-def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Defaults, then a YAML file, then ``section.key=value`` overrides.
-
-    Args:
-        path: YAML file with any part of the tree; None for the defaults.
-        overrides: texts such as ``objects.voting.distance_threshold=0.05``; values are read as YAML.
-
-    Raises:
-        ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
-    """
-    tree: dict[str, Any] = {}
-    if path is not None:
-        tree = _read_yaml(path)
-    for override in overrides:
-        _apply_override(tree, override)
-    source = f"{path}" if path is not None else "--set"
-    _refuse_unknown_keys(tree, Config, source)
-    try:
-        return Config.model_validate(tree)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{source}: {key}: {first['msg'].lower()}, got {first['input']!r}") from error
-
-
-def dump_config(config: Config) -> str:
-    """The resolved configuration as YAML that `load_config` reads back."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path given as --config") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not valid YAML ({str(error).splitlines()[0]})") from error
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: holds a {type(tree).__name__}; a configuration is a mapping of sections")
-    return tree
-
-
-def _apply_override(tree: dict[str, Any], override: str) -> None:
-    key, separator, text = override.partition("=")
-    if not separator or not key.strip():
-        raise ConfigError(f"--set {override!r}: write section.key=value, such as objects.voting.vote_threshold=2")
-    *sections, leaf = key.strip().split(".")
-    for section in sections:
-        tree = tree.setdefault(section, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"--set {override!r}: {section!r} is a value, it has no keys below it")
-    try:
-        tree[leaf] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {override!r}: the value is not valid YAML") from error
-
-
-def _refuse_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
-    for key, value in tree.items():
-        field = section.model_fields.get(str(key))
-        if field is None:
-            near = difflib.get_close_matches(str(key), section.model_fields, n=1, cutoff=0.0)[0]
-            raise ConfigError(f"{source}: there is no {prefix}{key}; did you mean {prefix}{near}?")
-        if isinstance(value, Mapping) and isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            _refuse_unknown_keys(value, field.annotation, source, f"{prefix}{key}.")

@@ -21,7 +21,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from v3d_torch.config import load_config
+from v3d_torch.config_file import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation

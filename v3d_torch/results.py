@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from v3d_torch.config import dump_config
+from v3d_torch.config_file import dump_config
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.files import write_text, written_whole
