@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from kornia.geometry.calibration import distort_points, undistort_points
@@ -51,12 +52,8 @@ class PinholeCamera:
         Returns:
             Shape :math:`(N, 2)`, float64.
         """
-        uv = uv.to(torch.float64)
-        if not self.is_distorted or uv.shape[0] == 0:
-            return uv
-        coefficients = torch.tensor(self.distortion, dtype=torch.float64)
         # 20 fixed-point steps: with the strong lens of TUM's fr1 the corners need more than kornia's default of 5.
-        return undistort_points(uv[None], self.K[None], coefficients[None], num_iters=20)[0]
+        return self._bend(uv, partial(undistort_points, num_iters=20))
 
     def distort(self, uv: Tensor) -> Tensor:
         """Pixels of an ideal pinhole camera to pixels of the image as delivered: the inverse of `undistort`.
@@ -67,11 +64,14 @@ class PinholeCamera:
         Returns:
             Shape :math:`(N, 2)`, float64.
         """
+        return self._bend(uv, distort_points)
+
+    def _bend(self, uv: Tensor, lens: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
         uv = uv.to(torch.float64)
         if not self.is_distorted or uv.shape[0] == 0:
             return uv
         coefficients = torch.tensor(self.distortion, dtype=torch.float64)
-        return distort_points(uv[None], self.K[None], coefficients[None])[0]
+        return lens(uv[None], self.K[None], coefficients[None])[0]
 
     def project(self, points: Tensor) -> Tensor:
         """Points in the camera frame to undistorted pixels.

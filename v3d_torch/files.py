@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and by one process at a time."""
+"""Text that is read, and files that are written whole or not at all and by one process at a time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from filelock import FileLock
 from numpy.typing import NDArray
 
-from v3d_torch.errors import OutputError
+from v3d_torch.errors import InputError, OutputError
 
 
 @contextmanager
@@ -36,6 +36,31 @@ def written_whole(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def read_text(path: Path, expected: str) -> str:
+    """Read UTF-8 text, with or without a byte order mark.
+
+    Args:
+        path: of the file.
+        expected: what the file should hold, for the message: "a trajectory has lines of ...".
+
+    Raises:
+        InputError: when the file cannot be read or is not text.
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file in UTF-8; {expected}") from error
+
+
+def numbered_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
+    """Lines of a text file that hold something, without comments (#), with their numbers from 1; see `read_text`."""
+    for number, line in enumerate(read_text(path, expected).split("\n"), start=1):
+        if (line := line.strip()) and not line.startswith("#"):
+            yield number, line
 
 
 def write_text(path: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import InputError
-from v3d_torch.files import write_text
+from v3d_torch.files import numbered_lines, write_text
 from v3d_torch.types import Trajectory
 
 _COLUMNS = "stamp tx ty tz qx qy qz qw"
@@ -69,23 +69,15 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
 
 def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
     """Line numbers from 1, and the eight numbers of each line, shape (N, 8)."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file in UTF-8; a trajectory has lines of {_COLUMNS}") from error
     numbers, poses = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in numbered_lines(path, f"a trajectory has lines of {_COLUMNS}"):
         words = line.replace(",", " ").split()
-        if not words or words[0].startswith("#"):
-            continue
         try:
             pose = [float(word) for word in words]
         except ValueError:
             pose = []
         if len(pose) != len(_COLUMNS.split()):
-            raise InputError(f"{path}: line {number} is {line.strip()[:80]!r} where {_COLUMNS} is expected")
+            raise InputError(f"{path}: line {number} is {line[:80]!r} where {_COLUMNS} is expected")
         numbers.append(number)
         poses.append(pose)
     if not poses:

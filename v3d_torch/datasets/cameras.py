@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
+from v3d_torch.files import read_text
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
 PRESETS: tuple[str, ...] = tuple(
@@ -57,12 +58,7 @@ def load_camera(path_or_name: str | Path) -> PinholeCamera:
         near = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
         hint = f"did you mean {near[0]}?" if near else f"the presets are {', '.join(PRESETS)}"
         raise InputError(f"{path_or_name}: is neither a camera file nor a preset; {hint}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file; a camera is a YAML file or a K.txt") from error
+    text = read_text(path, "a camera is a YAML file or a K.txt")
     return _from_yaml(text, str(path)) if path.suffix in (".yaml", ".yml") else _from_numbers(text, str(path))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -12,8 +12,11 @@ from typing import TypeVar
 from v3d_torch.association import associate
 from v3d_torch.datasets.images import is_depth
 from v3d_torch.errors import InputError
+from v3d_torch.files import numbered_lines
 
 _T = TypeVar("_T")
+
+_EXPECTED = "a list has lines of a stamp and a file"
 
 MAX_DIFFERENCE = 0.02
 """Colour and depth farther apart than this are no pair, seconds (the benchmark's own choice)."""
@@ -41,7 +44,7 @@ def read_image_list(path: Path) -> list[tuple[float, str]]:
         InputError: the list cannot be read, is empty, or a line is not a stamp and a file.
     """
     entries = []
-    for number, line in _lines(path):
+    for number, line in numbered_lines(path, _EXPECTED):
         match = re.fullmatch(r"([^\s,]+)[\s,]+(.+)", line)
         if match is None:
             raise InputError(f"{path}: line {number} is {line[:80]!r} where a stamp and a file are expected")
@@ -58,7 +61,7 @@ def read_associations(path: Path) -> list[Pair]:
         InputError: as `read_image_list`.
     """
     rows = []
-    for number, line in _lines(path):
+    for number, line in numbered_lines(path, _EXPECTED):
         # The first name ends with a suffix and a number follows: names may hold spaces.
         match = re.fullmatch(r"([^\s,]+)[\s,]+(.+?\.\w+)[\s,]+([-+\d.e]+)[\s,]+(.+)", line)
         if match is None:
@@ -74,19 +77,6 @@ def pair_images(colour: list[tuple[float, str]], depth: list[tuple[float, str]])
     """Join two lists one to one by nearest stamps, at most `MAX_DIFFERENCE` apart; the colour stamp is the pair's."""
     indices = associate([stamp for stamp, _ in colour], [stamp for stamp, _ in depth], MAX_DIFFERENCE)
     return [Pair(*colour[i], depth[j][1]) for i, j in indices]
-
-
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Lines that hold something, with their numbers from 1."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file in UTF-8") from error
-    for number, line in enumerate(text.split("\n"), start=1):
-        if (line := line.strip()) and not line.startswith("#"):
-            yield number, line
 
 
 def _stamp(word: str, path: Path, number: int) -> float:
