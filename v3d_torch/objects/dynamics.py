@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import ObjectsConfig
+from v3d_torch.config import ObjectsConfig, VotingConfig
 from v3d_torch.objects.background import moved_share
 from v3d_torch.objects.chamfer import chamfer_distance
 from v3d_torch.objects.lift import ObjectClouds
@@ -127,22 +127,12 @@ class ObjectDynamics:
                 pairs = {track: pair for track, pair in pairs.items() if pair[0].stamp >= self._last_stamp}
             if not pairs:
                 continue
-            then = torch.stack([then.centroid for then, _ in pairs.values()])
-            now = torch.stack([now.centroid for _, now in pairs.values()])
             share = self._config.background.moved_share
             moved = torch.tensor([self._background_agrees(*pair, share) for pair in pairs.values()])
-            ballots = hough_vote(
-                then, now, torch.ones_like(moved), config.distance_threshold, config.vote_threshold
-            ).pair.to(torch.int64)
-            needed = torch.full_like(ballots[0], config.vote_threshold)
-            if self._config.background.enabled:
-                # Who moves cannot tell who else does, nor can who stands still but whose centroid, cut off, jumps.
-                witness = ~moved & ((now - then).norm(dim=1) < 0.5 * config.distance_threshold)
-                ballots = torch.cat([ballots * witness, moved[:, None]], dim=1)
-                # Where fewer have a vote than are needed, all who have one must agree.
-                needed = needed.minimum(witness.sum() - witness.long() + 1)
-            votes = ballots.sum(dim=1)
-            for track, count, voted in zip(pairs, votes.tolist(), moved & (votes >= needed), strict=True):
+            then = torch.stack([then.centroid for then, _ in pairs.values()])
+            now = torch.stack([now.centroid for _, now in pairs.values()])
+            votes, dynamic = elect(then, now, moved if self._config.background.enabled else None, config)
+            for track, count, voted in zip(pairs, votes.tolist(), dynamic.tolist(), strict=True):
                 most[track.id] = max(most.get(track.id, 0), count)
                 if voted:
                     track.last_dynamic = stamp
@@ -193,3 +183,28 @@ class ObjectDynamics:
         side = 2 * self._config.mask.margin + 1
         grown = cv2.dilate(covered.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
         return torch.from_numpy(grown == 0)
+
+
+def elect(then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig) -> tuple[Tensor, Tensor]:
+    """The paper's vote (Alg. 1), with the background as one more voter that has the casting vote.
+
+    Args:
+        then: centroids of K objects, world frame, metres, shape :math:`(K, 3)`.
+        now: the same objects later.
+        moved: whether the background says that each moved, bool, shape :math:`(K,)`; None for the paper's rule.
+        config: thresholds.
+
+    Returns:
+        Votes for each, int64, and which are dynamic, bool, both of shape :math:`(K,)`.
+    """
+    present = torch.ones(then.shape[0], dtype=torch.bool)
+    ballots = hough_vote(then, now, present, config.distance_threshold, config.vote_threshold).pair.to(torch.int64)
+    if moved is None:
+        votes = ballots.sum(dim=1)
+        return votes, votes >= config.vote_threshold
+    # Who moves cannot tell who else does, nor can who stands still but whose centroid, cut off, jumps.
+    witness = ~moved & ((now - then).norm(dim=1) < 0.5 * config.distance_threshold)
+    votes = (ballots * witness).sum(dim=1) + moved
+    # Where fewer have a vote than are needed, all who have one must agree.
+    voters = witness.sum() - witness.long() + 1
+    return votes, moved & (votes >= voters.clamp(max=config.vote_threshold))
