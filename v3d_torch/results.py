@@ -69,8 +69,7 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     write_trajectory(folder / "trajectory.txt", trajectory)
     keyframes = slam.mapper.map.keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-    T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(keyframe.T_cw[None] for keyframe in keyframes)])
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(T_cw)))
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(slam.mapper.map.T_cw)))
     evaluation = None
     if sequence.groundtruth is not None:
         with suppress(InputError):  # too few poses to score are still worth writing

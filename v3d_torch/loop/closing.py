@@ -107,7 +107,7 @@ class LoopCloser:
         return self.recognise(keyframe.features, sparse_map, {*near, *recent})
 
     def _correct(self, sparse_map: SparseMap) -> None:
-        T_cw = torch.stack([keyframe.T_cw for keyframe in sparse_map.keyframes])
+        T_cw = sparse_map.T_cw
         edges = sparse_map.covisibility(self._COVISIBLE)
         measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
         loops = torch.tensor([[i, j] for i, j, _ in self._loops])

@@ -30,7 +30,7 @@ def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, ca
         return
     poses, pose = table["keyframe"][rows].unique(return_inverse=True)
     landmarks, point = table["landmark"][rows].unique(return_inverse=True)
-    T_cw = torch.stack([sparse_map.keyframes[index].T_cw for index in poses.tolist()])
+    T_cw = sparse_map.T_cw
     fixed = ~torch.isin(poses, window) | (poses == 0)
     if not fixed.any():
         fixed[0] = True  # the oldest, else the neighbourhood as a whole could drift
@@ -43,12 +43,16 @@ def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, ca
         point=point,
     )
     found = bundle_adjust(
-        T_cw, sparse_map.landmarks["point"][landmarks], observations, camera, fixed, config.mapping.bundle_iterations
+        T_cw[poses],
+        sparse_map.landmarks["point"][landmarks],
+        observations,
+        camera,
+        fixed,
+        config.mapping.bundle_iterations,
     )
     # Landmarks with one observation do not take part: they go along with the keyframe that made them.
-    T_cw_all = torch.stack([keyframe.T_cw for keyframe in sparse_map.keyframes])
-    T_cw_all[poses[~fixed]] = rigid(found.T_cw[~fixed])
-    sparse_map.move_keyframes(T_cw_all)
+    T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
+    sparse_map.move_keyframes(T_cw)
     sparse_map.landmarks["point"][landmarks] = found.points
     sparse_map.forget(rows[found.chi2 > observations.limit])
 

@@ -74,6 +74,12 @@ class SparseMap:
             valid=((), torch.bool),  # until a bundle adjustment finds that it does not fit
         )
 
+    @property
+    def T_cw(self) -> Tensor:
+        """World to camera of all keyframes, float64, shape :math:`(K, 4, 4)`; K may be 0."""
+        poses = [keyframe.T_cw[None] for keyframe in self.keyframes]
+        return torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
+
     def insert(self, frame: int, stamp: float, T_cw: Tensor, features: Features, landmarks: Tensor) -> Keyframe:
         """Make a keyframe; features with depth that match no landmark become landmarks.
 
@@ -167,8 +173,7 @@ class SparseMap:
         Args:
             T_cw: world to camera, shape :math:`(K, 4, 4)`.
         """
-        old = torch.stack([keyframe.T_cw for keyframe in self.keyframes])
-        T_new_old = (invert(T_cw) @ old)[self.landmarks["keyframe"]]
+        T_new_old = (invert(T_cw) @ self.T_cw)[self.landmarks["keyframe"]]
         R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
         self.landmarks["point"][:] = (R @ self.landmarks["point"][..., None])[..., 0] + t
         self.landmarks["direction"][:] = (R @ self.landmarks["direction"][..., None])[..., 0]
