@@ -1,8 +1,8 @@
 """Times of the object stage's primitives beside scikit-learn, Open3D, SciPy, Kornia and torch.cdist.
 
 ``python benchmarks/objects.py`` prints one table for one thread and one for two. All competitors get the same clouds
-and take turns, so that a busy machine slows them alike; a time is the median over the turns, and ``ratio`` is the
-peer's median over ours: above 1 we are faster. Needs open3d and scikit-learn.
+and take turns in random order, so that a busy machine slows them alike. A time is the median over the turns; ``ratio``
+is the median of the peer's time over ours in the same turn: above 1 we are faster. Needs open3d and scikit-learn.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from v3d_torch.objects.voting import hough_vote
 from v3d_torch.objects.voxel import voxel_pool
 
 OURS = "v3d_torch"
-SIZES = [(5, 500), (5, 5000), (50, 5000)]
+SIZES = [(5, 500), (5, 5000), (50, 500), (50, 5000)]
+"""Instances of one frame and of ten, and points of each after pooling."""
 VOXEL, EPS, MIN_SAMPLES = 0.02, 0.08, 5
 
 Competitors = dict[str, Callable[[], Any]]
@@ -71,8 +72,8 @@ def smoothing() -> Competitors:
 
 
 def pooling(batch: int, count: int) -> Competitors:
-    """Nine points to a voxel."""
-    clouds = surfaces(batch, count, VOXEL / 3)
+    """Nine points to a cell of the sheet, which the noise shares out to two voxels: ``count`` are left."""
+    clouds = surfaces(batch, count * 9 // 2, VOXEL / 3)
     points, valid = tensors(clouds)
     return {
         OURS: lambda: voxel_pool(points, valid, VOXEL),
@@ -108,7 +109,8 @@ def comparing(batch: int, count: int) -> Competitors:
     p, q = tensors(then)[0], tensors(now)[0]
 
     def scipy_chamfer(a: np.ndarray, b: np.ndarray) -> float:
-        return float(sum(np.square(cKDTree(y).query(x)[0]).mean() for x, y in [(a, b), (b, a)]))
+        workers = torch.get_num_threads()
+        return float(sum(np.square(cKDTree(y).query(x, workers=workers)[0]).mean() for x, y in [(a, b), (b, a)]))
 
     def open3d_chamfer(a: np.ndarray, b: np.ndarray) -> float:
         a, b = open3d_cloud(a), open3d_cloud(b)
@@ -150,21 +152,22 @@ def contests() -> Iterator[tuple[str, str, Competitors]]:
     yield "hough_vote", "10 objects", voting()
 
 
-def take_turns(competitors: Competitors, turns: int) -> dict[str, float]:
-    """Median milliseconds of each."""
+def take_turns(competitors: Competitors, turns: int) -> dict[str, list[float]]:
+    """Milliseconds of each in each turn; more turns than asked for where they are short."""
     times: dict[str, list[float]] = {name: [] for name in competitors}
-    for turn in range(turns + 1):  # the first warms up
-        for name, run in competitors.items():
+    shuffler = np.random.default_rng(0)  # or the one who comes after the slowest would always find a cold cache
+    end = time.perf_counter() + 1
+    while len(times[OURS]) <= turns or time.perf_counter() < end:
+        for name in shuffler.permutation(list(competitors)):
             start = time.perf_counter()
-            run()
-            if turn:
-                times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: median(values) for name, values in times.items()}
+            competitors[name]()
+            times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: values[1:] for name, values in times.items()}  # the first warms up
 
 
 def main(
     threads: int = typer.Option(0, min=0, help="Threads to give to everyone; 0 runs with one, then with two."),
-    turns: int = typer.Option(7, min=1, help="Measurements per competitor."),
+    turns: int = typer.Option(11, min=1, help="Measurements per competitor, at least."),
 ) -> None:
     """Print a table of times for each number of threads."""
     if threads == 0:
@@ -179,10 +182,11 @@ def main(
     torch.set_num_threads(threads)
     table = Table("primitive", "size", "competitor", "ms", "ratio", title=f"threads: {threads}")
     for name, size, competitors in contests():
-        milliseconds = take_turns(competitors, turns)
-        for competitor, value in milliseconds.items():
+        times = take_turns(competitors, turns)
+        for competitor, values in times.items():
             head = (name, size) if competitor == OURS else ("", "")
-            table.add_row(*head, competitor, f"{value:.2f}", f"{value / milliseconds[OURS]:.2f}")
+            ratio = median(theirs / ours for theirs, ours in zip(values, times[OURS], strict=True))
+            table.add_row(*head, competitor, f"{median(values):.2f}", f"{ratio:.2f}")
         table.add_section()
     Console().print(table)
 

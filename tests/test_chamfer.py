@@ -1,4 +1,4 @@
-"""Chamfer distance against the full distance matrix and scikit-learn's nearest neighbours."""
+"""Chamfer distance against the full distance matrix and scikit-learn's KD-tree."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from sklearn.neighbors import NearestNeighbors
+from sklearn.neighbors import KDTree
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -42,15 +42,34 @@ def test_equals_the_equation(n: int, m: int, dtype: torch.dtype) -> None:
     torch.testing.assert_close(distance.double(), expected, rtol=1e-12 if dtype == torch.float64 else 1e-5, atol=1e-9)
 
 
-def test_large_clouds() -> None:
-    p, q = random_pair(1, 20_000, 15_000, torch.float32)
-    distance = chamfer_distance(p, q)
+SHAPES = {"box": (1.0, 1.0, 1.0), "sheet": (1.0, 2.0, 0.01), "line": (1.0, 0.0, 0.0)}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(1, 20_000),
+    m=st.integers(1, 20_000),
+    shape=st.sampled_from(sorted(SHAPES)),
+    cells=st.sampled_from([0, 30]),
+    away=st.sampled_from([0.0, 3.0, 1000.0]),
+    dtype=st.sampled_from(DTYPES),
+)
+@example(seed=0, n=20_000, m=15_000, shape="sheet", cells=0, away=3.0, dtype=torch.float32)
+def test_equals_a_kd_tree(seed: int, n: int, m: int, shape: str, cells: int, away: float, dtype: torch.dtype) -> None:
+    generator = np.random.default_rng(seed)
+    p, q = (generator.random((count, 3)) * SHAPES[shape] for count in (n, m))
+    if cells:  # on a lattice many points coincide, and many are equally near
+        p, q = np.round(p * cells) / cells, np.round(q * cells) / cells
+    p, q = (torch.from_numpy(cloud + away)[None].to(dtype) for cloud in (p, q))
     a, b = p[0].double().numpy(), q[0].double().numpy()
-    expected = sum(
-        np.square(NearestNeighbors(n_neighbors=1, algorithm="ball_tree").fit(y).kneighbors(x)[0]).mean()
-        for x, y in [(a, b), (b, a)]
-    )
-    assert abs(float(distance) - expected) < 1e-6 * expected
+    expected = sum(np.square(KDTree(y).query(x)[0]).mean() for x, y in [(a, b), (b, a)])
+    assert chamfer_distance(p, q).item() == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+def test_far_from_the_origin_float64_keeps_its_digits() -> None:
+    p, q = random_pair(2, 300, 200)
+    torch.testing.assert_close(chamfer_distance(p + 1e6, q + 1e6), chamfer_distance(p, q), rtol=1e-6, atol=0.0)
 
 
 def test_memory_is_linear() -> None:
@@ -108,6 +127,9 @@ def test_empty_is_undefined_and_leaves_gradients_alone() -> None:
     assert distance.isnan().tolist() == [False, True, False]
     distance[[0, 2]].sum().backward()
     assert p.grad is not None and p.grad.isfinite().all() and p.grad[0].any() and not p.grad[1].any()
+    p_valid = torch.ones(3, 6, dtype=torch.bool)
+    p_valid[2] = False
+    assert chamfer_distance(p, q, p_valid, torch.zeros_like(q_valid)).isnan().all()
     assert chamfer_distance(torch.zeros(2, 0, 3), torch.zeros(2, 4, 3)).isnan().all()
     assert chamfer_distance(torch.zeros(0, 3, 3), torch.zeros(0, 4, 3)).shape == (0,)
 
@@ -127,8 +149,22 @@ def test_order_of_points_does_not_matter_and_runs_repeat() -> None:
     torch.testing.assert_close(distance, chamfer_distance(p[:, shuffled], q))
 
 
-def test_refuses_points_that_are_not_finite() -> None:
+def test_threads_change_no_byte() -> None:
+    p, q = random_pair(3, 4000, 3000)
+    threads = torch.get_num_threads()
+    distances = []
+    try:
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            distances.append(chamfer_distance(p, q))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(distances[0], distances[1]) and torch.equal(distances[0], distances[2])
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e30])
+def test_refuses_points_that_are_not_finite(bad: float) -> None:
     p, q = random_pair(1, 4, 4)
-    q[0, 1, 0] = torch.inf
+    q[0, 1, 0] = bad
     with pytest.raises(InputError, match="not finite"):
         chamfer_distance(p, q)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import sklearn.cluster
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from sklearn.neighbors import NearestNeighbors
 
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.objects import dbscan as module
@@ -62,6 +63,30 @@ def test_any_cloud(cells: list[tuple[int, int, int]], copies: int, eps: float, m
     points = np.array(cells * copies, dtype=np.float64).reshape(-1, 3) / 4
     if line:
         points[:, 1:] = 0
+    np.testing.assert_array_equal(ours(points, eps, min_samples), oracle(points, eps, min_samples))
+
+
+SHAPES = {"box": (1.0, 1.0, 1.0), "sheet": (1.0, 2.0, 0.01), "line": (1.0, 0.0, 0.0)}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(1, 20_000),
+    shape=st.sampled_from(sorted(SHAPES)),
+    lattice=st.booleans(),
+    min_samples=st.integers(1, 12),
+)
+@example(seed=0, count=20_000, shape="sheet", lattice=True, min_samples=5)
+def test_any_large_cloud(seed: int, count: int, shape: str, lattice: bool, min_samples: int) -> None:
+    generator = np.random.default_rng(seed)
+    points = generator.random((count, 3)) * SHAPES[shape]
+    # So far that about every second point is a core point: clusters, border points and noise.
+    nearest = NearestNeighbors(n_neighbors=min(count, min_samples + 1)).fit(points).kneighbors(points)[0]
+    eps = float(nearest[:, -1].mean()) or 1.0
+    if lattice:  # of spacing eps / 2 in exact numbers: many coincide, and many are exactly eps apart
+        eps = 2.0 ** np.round(np.log2(eps))
+        points = np.round(points * 2 / eps) * eps / 2
     np.testing.assert_array_equal(ours(points, eps, min_samples), oracle(points, eps, min_samples))
 
 

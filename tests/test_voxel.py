@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -34,7 +36,7 @@ def grouped(points: Tensor, valid: Tensor, size: float) -> tuple[np.ndarray, np.
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("count", [1, 7, 3000])
+@pytest.mark.parametrize("count", [1, 7, 3000, 20_000])
 def test_equals_group_by(dtype: torch.dtype, count: int) -> None:
     points, valid = random_clouds(3, count, dtype=dtype)
     voxels = voxel_pool(points, valid, 0.05)
@@ -53,10 +55,12 @@ def test_equals_group_by(dtype: torch.dtype, count: int) -> None:
     cloud=st.lists(st.tuples(*[st.integers(-40, 40)] * 3), max_size=300),
     copies=st.integers(1, 3),
     size=st.sampled_from([0.125, 0.5, 2.0]),
+    spread=st.sampled_from([1, 2**7, 2**14]),
 )
-def test_any_cloud(cloud: list[tuple[int, int, int]], copies: int, size: float) -> None:
-    # Multiples of 1/16: duplicates, lines and points on the faces of voxels are common, and all sums are exact.
-    points = torch.tensor(cloud * copies, dtype=torch.float64).reshape(1, -1, 3) / 16
+def test_any_cloud(cloud: list[tuple[int, int, int]], copies: int, size: float, spread: int) -> None:
+    # Multiples of 1/16: duplicates, lines and points on the faces of voxels are common, and all sums are exact. The
+    # voxels of the box around them need 16, 32 or 64 bits to be numbered.
+    points = torch.tensor(cloud * copies, dtype=torch.float64).reshape(1, -1, 3) / 16 * spread
     voxels = voxel_pool(points, torch.ones(points.shape[:2], dtype=torch.bool), size)
     means, counts = grouped(points[0], torch.ones(points.shape[1], dtype=torch.bool), size)
     np.testing.assert_allclose(voxels.means[0].numpy(), means, atol=1e-12)
@@ -89,6 +93,33 @@ def test_padding_and_batch_do_not_matter() -> None:
         assert torch.equal(alone.means[0], voxels.means[b][voxels.valid[b]])
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_owner_is_the_voxel_of_each_point(dtype: torch.dtype) -> None:
+    points, valid = random_clouds(3, 4000, dtype=dtype)
+    valid[1, 20:] = False  # most of its row of voxels is padding
+    voxels = voxel_pool(points, valid, 0.05)
+    assert voxels.owner.shape == valid.shape and voxels.owner.dtype == torch.int64
+    assert torch.equal(voxels.owner >= 0, valid) and voxels.owner[~valid].eq(-1).all()
+    for b in range(3):
+        cells = pd.DataFrame(np.floor(points[b, valid[b]].numpy() / np.asarray(0.05, points.numpy().dtype)))
+        np.testing.assert_array_equal(voxels.owner[b, valid[b]].numpy(), cells.groupby([0, 1, 2]).ngroup())
+
+
+def test_no_point_has_an_owner_where_there_are_none() -> None:
+    for batch, count in [(0, 5), (2, 0), (2, 5)]:
+        owner = voxel_pool(torch.zeros(batch, count, 3), torch.zeros(batch, count, dtype=torch.bool), 0.1).owner
+        assert torch.equal(owner, torch.full((batch, count), -1))
+
+
+def test_clouds_that_share_a_voxel_stay_apart() -> None:
+    points = torch.rand(3, 5, 3, generator=torch.Generator().manual_seed(1))
+    valid = torch.ones(3, 5, dtype=torch.bool)
+    valid[1] = False
+    voxels = voxel_pool(points, valid, 1.0)
+    assert voxels.counts.tolist() == [[5], [0], [5]]
+    torch.testing.assert_close(voxels.means[[0, 2], 0], points[[0, 2]].mean(dim=1))
+
+
 def test_order_of_points_does_not_matter() -> None:
     points, valid = random_clouds(2, 500)
     shuffled = torch.randperm(500, generator=torch.Generator().manual_seed(3))
@@ -104,16 +135,27 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(lambda p: voxel_pool(p, valid, 0.15).means, (points,))
 
 
+def test_memory_grows_with_the_points_and_not_with_the_box() -> None:
+    points = 1000 * torch.rand(1, 20_000, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    tracemalloc.start()
+    voxels = voxel_pool(points, torch.ones(1, 20_000, dtype=torch.bool), 0.02)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert voxels.valid.all() and voxels.means.shape == points.shape
+    assert peak < 5e6  # a bit for each of 50,000 cubed cells: 16 TB
+
+
 def test_module_and_determinism() -> None:
-    points, valid = random_clouds(2, 4000, dtype=torch.float32)
-    first = VoxelPool(0.03)(points, valid)
+    points, valid = random_clouds(2, 40_000, dtype=torch.float32)
     threads = torch.get_num_threads()
-    torch.set_num_threads(2)
+    results = []
     try:
-        again = voxel_pool(points, valid, 0.03)
+        for number in (1, 2, 3):
+            torch.set_num_threads(number)
+            results.append(VoxelPool(0.05)(points, valid))
     finally:
         torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(*results, strict=True))
 
 
 def test_refuses_what_it_cannot_number() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -51,13 +51,15 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
     if eps <= 0 or min_samples < 1:
         raise ConfigError(f"DBSCAN needs eps > 0 and min_samples >= 1, not {eps} and {min_samples}.")
-    labels = torch.full(valid.shape, -1, dtype=torch.int64)
-    for cloud, present, out in zip(points.detach(), valid, labels, strict=True):
-        coordinates = cloud[present].to(torch.float64)
-        if not coordinates.isfinite().all():
-            raise InputError("A point to be clustered is not finite; mark points without depth as not valid.")
-        out[present] = torch.from_numpy(_cluster(coordinates.numpy(), eps, min_samples))
-    return labels
+    mask = valid.numpy()
+    index = np.flatnonzero(mask)
+    coordinates = points.detach().numpy().reshape(-1, 3).take(index, axis=0).astype(np.float64)
+    if not np.isfinite(coordinates).all():
+        raise InputError("A point to be clustered is not finite; mark points without depth as not valid.")
+    clouds = np.split(coordinates, mask.sum(axis=1).cumsum()[:-1])
+    labels = np.full(mask.size, -1)
+    labels[index] = np.concatenate([_cluster(cloud, eps, min_samples) for cloud in clouds])
+    return torch.from_numpy(labels.reshape(mask.shape))
 
 
 def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
@@ -66,7 +68,7 @@ def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
     counts, blocks = _neighbours(points, eps)
     core = counts >= min_samples
 
-    component = np.arange(size)
+    component = np.arange(size, dtype=np.int32)  # it is read for every pair: half the size, as they are
     borders: list[Pairs] = []  # (border point, core point that reaches it)
     for a, b in blocks:
         inner = core[a] & core[b]
@@ -104,6 +106,9 @@ def _most_pairs(points: NDArray[np.float64], eps: float) -> float:
     Neighbours are in the same or in touching cells of side ``eps``, hence at most 27/2 times the sum of squared cell
     counts. Cells that share a place of the hash table only raise the bound.
     """
+    in_one_cell = 13.5 * len(points) ** 2
+    if in_one_cell <= _MAX_PAIRS:  # wherever so few points are
+        return in_one_cell
     cells = np.floor(points / eps).astype(np.int64) * (73856093, 19349663, 83492791)
     occupancy = np.bincount(np.bitwise_xor.reduce(cells, axis=1) & 0xFFFF)
     return 13.5 * float(np.dot(occupancy, occupancy))
@@ -123,15 +128,15 @@ def _pairs_in_blocks(tree: cKDTree, counts: Ints, eps: float) -> Iterator[Pairs]
 def _join(component: Ints, a: Ints, b: Ints) -> Ints:
     """Components, numbered below N, after connecting points ``a[k]`` and ``b[k]`` for every k.
 
-    Most pairs tell nothing new. One partner per component joins nearly all that belongs together in a graph of N edges;
-    the pairs that still connect two components after that are few.
+    Most pairs tell nothing new. If every component follows one partner of lower number, and that one its own to the
+    end, nearly all that belongs together has met; the pairs that still connect two components after that are few.
     """
     size = len(component)
     a, b = component[a], component[b]
-    partner = np.arange(size)
-    partner[b] = a
-    forest = csr_array((np.ones(size, dtype=np.int8), partner, np.arange(size + 1)), shape=(size, size))
-    joined = connected_components(forest, directed=False)[1]
+    joined = np.arange(size, dtype=np.int32)
+    joined[np.maximum(a, b)] = np.minimum(a, b)
+    while not np.array_equal(joined, further := joined[joined]):
+        joined = further
 
     a, b = joined[a], joined[b]
     apart = a != b
