@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.base import RGBDSequence
+from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
 from v3d_torch.errors import V3DError
+from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
 from v3d_torch.mapping.dense import DenseMap
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Judged, Scene
-from v3d_torch.segmentation.coco import COCO_NAMES
+from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
@@ -39,45 +40,60 @@ class Run:
     Attributes:
         dynamics: a row per frame and object, as it goes into the table of the results.
         snapshots: frames for the figure of masks.
+        mask_evaluation: of the frames whose true masks are known.
         seconds: wall time of the frames.
         failure: why the run ended before the sequence did; None when it did not.
+        interrupted: whether the user ended it.
     """
 
     dynamics: list[dict[str, object]] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
+    mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)
     seconds: float = 0.0
     failure: str | None = None
+    interrupted: bool = False
 
 
 class Pipeline:
     """Runs a sequence through the system.
 
     Args:
-        sequence: frames to take in.
+        sequence: frames to take in, stored or as they come.
         slam: the system, new.
         masks: folder for an image per frame of what was left out of tracking; None for none.
     """
 
     _SNAPSHOTS = 6
 
-    def __init__(self, sequence: RGBDSequence, slam: V3DSLAM, masks: Path | None = None) -> None:
+    def __init__(self, sequence: RGBDStream, slam: V3DSLAM, masks: Path | None = None) -> None:
         self.sequence = sequence
         self.slam = slam
         self.dense = DenseMap(slam.config.dense_map, sequence.camera)
         self.run = Run()
         self._masks = masks
+        self._step = 1
+
+    @property
+    def frames(self) -> int:
+        """Frames that there are to take in; of a stream, which does not know, those taken in."""
+        return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses.statuses)
 
     def __call__(self, on_frame: FrameCallback | None = None) -> Run:
         """Process all frames. What was computed is kept when a frame cannot be read or the user interrupts.
+
+        An interrupt is how a stream without an end is meant to end, and no failure.
 
         Args:
             on_frame: called after each frame.
         """
         start = time.perf_counter()
+        frames = iter(self.sequence)
         try:
-            for index in range(len(self.sequence)):
+            while True:
                 with self.slam.clock("read"):
-                    frame = self.sequence[index]
+                    frame = next(frames, None)
+                if frame is None:
+                    break
                 scene = self.slam(frame)
                 self._note(frame, scene)
                 if on_frame is not None:
@@ -85,22 +101,43 @@ class Pipeline:
         except V3DError as error:
             self.run.failure = str(error)
         except KeyboardInterrupt:
-            done, total = len(self.slam.poses.statuses), len(self.sequence)
-            self.run.failure = f"interrupted after {done} of {total} frames"
+            self.run.interrupted = True
+            if isinstance(self.sequence, Sized):
+                done, total = len(self.slam.poses.statuses), len(self.sequence)
+                self.run.failure = f"interrupted after {done} of {total} frames"
         self.run.seconds = time.perf_counter() - start
         return self.run
 
     def _note(self, frame: RGBDFrame, scene: Scene) -> None:
         self.run.dynamics.extend(_row(frame, judged) for judged in scene.objects)
+        self._evaluate_masks(frame, scene)
         if self._masks is not None:
             left_out = (~scene.static).to(torch.uint8) * 255
             write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
         keyframes = self.slam.mapper.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             self.dense.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
-        step = max(len(self.sequence) // self._SNAPSHOTS, 1)
-        if frame.index % step == step // 2 and len(self.run.snapshots) < self._SNAPSHOTS:
-            self.run.snapshots.append(Snapshot(frame.stamp, frame.image, scene.objects))
+        self._keep_for_figure(frame, scene)
+
+    def _keep_for_figure(self, frame: RGBDFrame, scene: Scene) -> None:
+        """Keep every so manieth frame; of a stream, whose length is not known, ever fewer."""
+        snapshots = self.run.snapshots
+        if isinstance(self.sequence, Sized):
+            step = max(len(self.sequence) // self._SNAPSHOTS, 1)
+            wanted = frame.index % step == step // 2 and len(snapshots) < self._SNAPSHOTS
+        else:
+            if len(snapshots) == 2 * self._SNAPSHOTS:
+                del snapshots[1::2]
+                self._step *= 2
+            wanted = frame.index % self._step == 0
+        if wanted:
+            snapshots.append(Snapshot(frame.stamp, frame.image, scene.objects))
+
+    def _evaluate_masks(self, frame: RGBDFrame, scene: Scene) -> None:
+        truth = self.sequence.who_moves(frame.index) if isinstance(self.sequence, KnowsWhoMoves) else None
+        if truth is not None:
+            objects = {judged.id: judged.mask for judged in scene.objects}
+            self.run.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static, objects)
 
 
 def _row(frame: RGBDFrame, judged: Judged) -> dict[str, object]:
@@ -109,7 +146,7 @@ def _row(frame: RGBDFrame, judged: Judged) -> dict[str, object]:
         "frame": frame.index,
         "stamp": frame.stamp,
         "id": judged.id,
-        "class": COCO_NAMES[judged.label],
+        "class": class_name(judged.label),
         "x": x,
         "y": y,
         "z": z,

@@ -23,7 +23,7 @@ from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.segmentation.coco import COCO_NAMES
+from v3d_torch.segmentation.coco import class_name
 from v3d_torch.trajectory import write_trajectory
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figures import mask_strip, trajectory_figure
@@ -73,7 +73,7 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     evaluation = None
     if sequence.groundtruth is not None:
         with suppress(InputError):  # too few poses to score are still worth writing
-            evaluation = evaluate(sequence.groundtruth, trajectory, frames=len(sequence))
+            evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     with written_whole(folder / "dynamics.parquet") as path:
         pq.write_table(pa.Table.from_pylist(pipeline.run.dynamics, schema=_DYNAMICS), path)
@@ -87,10 +87,12 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
     statuses = slam.poses.statuses
     frames = len(statuses)
     counts = {status.value: statuses.count(status) for status in Status}
+    masks = run.mask_evaluation.scores()
     return {
         **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
+        "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
-        "frames": len(pipeline.sequence),
+        "frames": pipeline.frames,
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],
@@ -137,7 +139,7 @@ def _draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
     snapshots = pipeline.run.snapshots
     if snapshots:
         overlays = [
-            [(judged.mask, f"{COCO_NAMES[judged.label]} {judged.id}", judged.verdict.value) for judged in shot.objects]
+            [(judged.mask, f"{class_name(judged.label)} {judged.id}", judged.verdict.value) for judged in shot.objects]
             for shot in snapshots
         ]
         mask_strip([shot.image for shot in snapshots], overlays, folder / "masks.png")

@@ -12,12 +12,24 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 
 @app.command()
 def main(
-    seq: Annotated[str, typer.Option(help="demo, a TUM RGB-D sequence (fr3/w/xyz), or a folder in TUM layout.")],
+    seq: Annotated[
+        str,
+        typer.Option(
+            help="demo, a TUM RGB-D sequence (fr3/w/xyz), a folder, bag or video of RGB-D images, or a live camera"
+            " (realsense:)."
+        ),
+    ],
     data_root: Annotated[
         Path | None, typer.Option(envvar="V3D_DATA", help="Where named sequences are, or are downloaded to.")
     ] = None,
     camera: Annotated[
         str | None, typer.Option(help="camera.yaml, K.txt or a preset (tum_fr3), where the folder does not say.")
+    ] = None,
+    rgb_topic: Annotated[str | None, typer.Option(help="Topic of a bag's colour images [guessed].")] = None,
+    depth_topic: Annotated[str | None, typer.Option(help="Topic of a bag's depth images [guessed].")] = None,
+    info_topic: Annotated[str | None, typer.Option(help="Topic of the colour images' camera [guessed].")] = None,
+    fps: Annotated[
+        float | None, typer.Option(min=0.01, help="Frames a second, where images or videos do not say their times.")
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="YAML file over the defaults, such as configs/paper.yaml.")
@@ -35,6 +47,7 @@ def main(
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
+    from v3d_torch.datasets import SourceOptions
 
     overrides = list(set_ or [])
     segmenter = segmenter or ("masks" if masks is not None else None)
@@ -46,6 +59,7 @@ def main(
             seq,
             data_root=data_root,
             camera=camera,
+            options=SourceOptions(rgb_topic, depth_topic, info_topic, fps),
             config_path=config,
             overrides=overrides,
             masks=masks,

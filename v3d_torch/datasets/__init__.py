@@ -1,54 +1,96 @@
-"""Sources of RGB-D frames; `load_sequence` opens any of them by name."""
+"""Sources of RGB-D frames; `open_source` opens any of them by name, `load_sequence` those that have an end."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from v3d_torch.camera import PinholeCamera
-from v3d_torch.datasets.base import RGBDSequence
-from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.locate import sequence_folder
+from v3d_torch.datasets.base import RGBDSequence, RGBDStream
+from v3d_torch.datasets.cameras import CameraChoice, load_camera
+from v3d_torch.datasets.locate import sequence_path
 from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
+from v3d_torch.datasets.realsense import open_camera
+from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.download import Progress, cache_dir
+from v3d_torch.errors import InputError
 
 __all__ = [
     "PAPER_SEQUENCES",
     "RGBDSequence",
+    "RGBDStream",
+    "SourceOptions",
     "TUMSequence",
     "canonical_name",
     "load_camera",
     "load_sequence",
+    "open_source",
     "short_name",
 ]
+
+
+def open_source(
+    name: str,
+    *,
+    data_root: Path | None = None,
+    camera: CameraChoice = None,
+    options: SourceOptions | None = None,
+    download: bool = True,
+    progress: Progress | None = None,
+) -> RGBDStream:
+    """Open whatever gives RGB-D frames.
+
+    Args:
+        name: ``demo``; ``realsense:`` for a camera that is plugged in, ``realsense:SERIAL`` for one of several; a
+            folder or file of any kind in `v3d_torch.datasets.sources.SOURCES`; a name such as ``fr3/w/xyz``
+            (`canonical_name` lists the ways to write it); or the name of something in ``data_root``.
+        data_root: where sequences are kept; None takes ``$V3D_DATA``, then the cache (``$V3D_CACHE``).
+        camera: a camera, a preset's name or a camera file; None takes the source's own.
+        options: what the source does not say itself.
+        download: whether a TUM sequence that is not here is downloaded.
+        progress: told of the bytes of a download, or of the frames of the demo as they are made.
+
+    Returns:
+        An `RGBDSequence` where the frames are stored, else a stream.
+
+    Raises:
+        InputError: there is no such source, or something in it is wrong.
+        DownloadError: it is not here and cannot be downloaded.
+    """
+    options = options or SourceOptions()
+    if name == "demo":
+        # The demo is rendered on first use, with libraries that nothing else here needs.
+        from v3d_torch.datasets.demo import ensure_demo
+
+        reject_options(name, "the demo", options, frozenset())
+        return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
+    if name.partition(":")[0] == "realsense":
+        reject_options(name, "a live camera", options, frozenset({"fps"}))
+        return open_camera(name, camera, fps=options.fps)
+    path = sequence_path(name, data_root=data_root, download=download, progress=progress)
+    return open_path(path, camera, options, progress)
 
 
 def load_sequence(
     name: str,
     *,
     data_root: Path | None = None,
-    camera: str | Path | PinholeCamera | None = None,
+    camera: CameraChoice = None,
+    options: SourceOptions | None = None,
     download: bool = True,
     progress: Progress | None = None,
 ) -> RGBDSequence:
-    """Open a sequence.
-
-    Args:
-        name: ``demo``; a folder in TUM layout; a name such as ``fr3/w/xyz`` (`canonical_name` lists the ways to write
-            it); or the name of a folder in ``data_root``.
-        data_root: where sequences are kept; None takes ``$V3D_DATA``, then the cache (``$V3D_CACHE``).
-        camera: a camera, a preset's name or a camera file; None takes the sequence's own.
-        download: whether a TUM sequence that is not here is downloaded.
-        progress: told of the bytes of a download, or of the frames of the demo as they are made.
+    """Open a sequence, whose frames have a number and may be read in any order; see `open_source`.
 
     Raises:
-        InputError: there is no such sequence, or something in it is wrong.
-        DownloadError: it is not here and cannot be downloaded.
+        InputError: as `open_source`, or the source is a stream.
+        DownloadError: as `open_source`.
     """
-    if name == "demo":
-        # The demo is rendered on first use, with libraries that nothing else here needs.
-        from v3d_torch.datasets.demo import ensure_demo
-
-        return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
-    folder = sequence_folder(name, data_root=data_root, download=download, progress=progress)
-    return TUMSequence(folder, camera)
+    source = open_source(
+        name, data_root=data_root, camera=camera, options=options, download=download, progress=progress
+    )
+    if not isinstance(source, RGBDSequence):
+        raise InputError(
+            f"{name}: is a stream, whose frames come only once and in order; save it first with"
+            f" python -m v3d_torch.record --seq {name} --out FOLDER"
+        )
+    return source

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
@@ -11,8 +12,8 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 
 @runtime_checkable
-class RGBDSequence(Protocol):
-    """A sequence of RGB-D frames in order of time. Iterating over it works too, by ``__getitem__``."""
+class RGBDStream(Protocol):
+    """RGB-D frames in order of time, taken one after the other. It may have no end, as a live camera."""
 
     @property
     def name(self) -> str:
@@ -23,15 +24,36 @@ class RGBDSequence(Protocol):
         """The camera that took all frames."""
 
     @property
-    def stamps(self) -> Tensor:
-        """Time of each colour image, seconds, float64, shape :math:`(N,)`, strictly increasing."""
-
-    @property
     def groundtruth(self) -> Trajectory | None:
         """Measured camera poses, at their own stamps; None where there are none."""
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        """All frames; stamps are strictly increasing, indices count from 0."""
+
+
+@runtime_checkable
+class RGBDSequence(RGBDStream, Protocol):
+    """RGB-D frames of a known number, in any order."""
+
+    @property
+    def stamps(self) -> Tensor:
+        """Time of each colour image, seconds, float64, shape :math:`(N,)`, strictly increasing."""
 
     def __len__(self) -> int:
         """Number of frames."""
 
     def __getitem__(self, index: int) -> RGBDFrame:
         """Frame ``index``, from 0; raises IndexError behind the last."""
+
+
+@runtime_checkable
+class KnowsWhoMoves(Protocol):
+    """A sequence that has true masks besides its frames. They are for evaluation: the system must not see them."""
+
+    def who_moves(self, index: int) -> Tensor | None:
+        """What moves in frame ``index``; None where it is not known.
+
+        Returns:
+            0 for what is static, 1-254 for a person who moves, the same in all frames, 255 for what belongs to
+            neither (a person who is only about there), uint8, shape :math:`(H, W)`.
+        """

@@ -21,6 +21,9 @@ PRESETS: tuple[str, ...] = tuple(
 )
 """Names that `load_camera` knows without a file."""
 
+CameraChoice = str | Path | PinholeCamera | None
+"""What a user may say of the camera: itself, a preset's name or a file; None leaves it to the sequence."""
+
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -62,15 +65,27 @@ def load_camera(path_or_name: str | Path) -> PinholeCamera:
     return _from_yaml(text, str(path)) if path.suffix in (".yaml", ".yml") else _from_numbers(text, str(path))
 
 
-def find_camera(folder: Path) -> PinholeCamera:
-    """The camera of a sequence's folder: its ``camera.yaml``, its ``K.txt``, else the TUM camera that its name tells.
+def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera | None = None) -> PinholeCamera:
+    """The camera that the user names, else the one of the sequence's folder.
+
+    Args:
+        camera: the user's choice.
+        folder: its ``camera.yaml`` or ``K.txt`` is taken, else what its dataset says, else the TUM camera that its
+            name tells.
+        published: the camera of the dataset that the folder belongs to, where all its sequences have one.
 
     Raises:
-        InputError: the folder says nothing about its camera, or what it says is wrong.
+        InputError: nothing says what the camera is, or what says it is wrong.
     """
+    if isinstance(camera, PinholeCamera):
+        return camera
+    if camera is not None:
+        return load_camera(camera)
     for name in ("camera.yaml", "K.txt"):
         if (folder / name).is_file():
             return load_camera(folder / name)
+    if published is not None:
+        return published
     if match := re.search(r"(?:freiburg|fr)_?([123])(?!\d)", folder.resolve().name.lower()):
         return load_camera(f"tum_fr{match[1]}")
     raise InputError(
@@ -86,7 +101,7 @@ def _from_yaml(text: str, source: str) -> PinholeCamera:
         raise InputError(f"{source}: is not valid YAML ({str(error).splitlines()[0]})") from error
     if not isinstance(tree, dict):
         raise InputError(f"{source}: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys")
-    return _checked(tree, source)
+    return checked_camera(tree, source)
 
 
 def _from_numbers(text: str, source: str) -> PinholeCamera:
@@ -106,10 +121,15 @@ def _from_numbers(text: str, source: str) -> PinholeCamera:
             " or a 3x3 camera matrix without skew"
         )
     fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, "depth_scale": depth_scale}
-    return _checked(fields, source)
+    return checked_camera(fields, source)
 
 
-def _checked(fields: dict[Any, Any], source: str) -> PinholeCamera:
+def checked_camera(fields: dict[Any, Any], source: str) -> PinholeCamera:
+    """A camera from the fields of `PinholeCamera`, read from ``source``.
+
+    Raises:
+        InputError: a field is missing, unknown or no such number.
+    """
     try:
         return PinholeCamera(**_CameraFile.model_validate(fields).model_dump())
     except ValidationError as error:

@@ -73,10 +73,28 @@ def read_associations(path: Path) -> list[Pair]:
     return [Pair(stamp, *files) for stamp, files in ordered]
 
 
-def pair_images(colour: list[tuple[float, str]], depth: list[tuple[float, str]]) -> list[Pair]:
-    """Join two lists one to one by nearest stamps, at most `MAX_DIFFERENCE` apart; the colour stamp is the pair's."""
-    indices = associate([stamp for stamp, _ in colour], [stamp for stamp, _ in depth], MAX_DIFFERENCE)
-    return [Pair(*colour[i], depth[j][1]) for i, j in indices]
+def pair_lists(colour: Path, depth: Path) -> list[Pair]:
+    """Join the images of two lists in a folder one to one by nearest stamps, at most `MAX_DIFFERENCE` apart.
+
+    Returns:
+        Pairs with the colour image's stamp.
+
+    Raises:
+        InputError: as `read_image_list`, a list is missing, or there is no pair.
+    """
+    for path in (colour, depth):
+        if not path.is_file():
+            raise InputError(
+                f"{path.parent}: has no {path.name}; the sequence's images are listed in {colour.name} and {depth.name}"
+            )
+    images, depths = read_image_list(colour), read_image_list(depth)
+    indices = associate([stamp for stamp, _ in images], [stamp for stamp, _ in depths], MAX_DIFFERENCE)
+    if not indices:
+        raise InputError(
+            f"{colour.parent}: no stamp in {colour.name} lies within {MAX_DIFFERENCE} s of one in {depth.name};"
+            " do both lists belong to this sequence?"
+        )
+    return [Pair(*images[i], depths[j][1]) for i, j in indices]
 
 
 def _stamp(word: str, path: Path, number: int) -> float:

@@ -1,4 +1,4 @@
-"""Where a sequence's folder is: given, among the user's data, in the cache, or to be downloaded."""
+"""Where a sequence is: given, among the user's data, in the cache, or to be downloaded."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from v3d_torch.extract import extract_tar
 from v3d_torch.files import one_process_makes
 
 
-def sequence_folder(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
-    """The folder of a sequence.
+def sequence_path(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
+    """The folder or file of a sequence.
 
-    Looked for in this order: ``name`` as a folder; in ``data_root``, else ``$V3D_DATA``; in the cache
+    Looked for in this order: ``name`` as a folder or file; in ``data_root``, else ``$V3D_DATA``; in the cache
     (`v3d_torch.download.cache_dir`). In the latter two a folder may be called by any name of the sequence. Last, a TUM
     sequence is downloaded into ``data_root`` where it is given, else into the cache; ``$V3D_DATA`` is only read, it may
     be shared.
 
     Raises:
-        InputError: no such folder and no such sequence.
+        InputError: no such folder or file and no such sequence.
         DownloadError: the sequence is not here and cannot be downloaded; the message says how to get it by hand.
     """
-    if (folder := Path(name).expanduser()).is_dir():
-        return folder
+    if (path := Path(name).expanduser()).exists():
+        return path
     full_name = canonical_name(name)
     shared = os.environ.get("V3D_DATA")
     search = data_root or (Path(shared) if shared else cache_dir())
@@ -44,8 +44,8 @@ def sequence_folder(name: str, *, data_root: Path | None, download: bool, progre
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:
-    """A folder under ``root`` that is called so, or by another name of the same sequence."""
-    if (root / name).is_dir():
+    """What is called so under ``root``, or a folder that another name of the same sequence stands on."""
+    if (root / name).exists():
         return root / name
     if full_name is None or not root.is_dir():
         return None

@@ -117,9 +117,11 @@ def download_url(full_name: str) -> str:
 
 
 def unknown_name(name: str) -> InputError:
-    """The error for a name that is neither a folder nor a sequence; it offers the nearest names."""
+    """The error for a name that is neither a path nor a sequence; it offers the nearest names."""
     choices = {short_name(full): full for full in SEQUENCES}
     spellings = {spelling: short for short, full in choices.items() for spelling in (short, full)} | {"demo": "demo"}
     near = difflib.get_close_matches(name.strip().lower(), spellings, n=3, cutoff=0.5)
     offers = list(dict.fromkeys(spellings[spelling] for spelling in near)) or ["demo", "fr3/w/xyz"]
-    return InputError(f"{name}: is neither a folder nor the name of a sequence; did you mean {' or '.join(offers)}?")
+    return InputError(
+        f"{name}: is neither a file, a folder nor the name of a sequence; did you mean {' or '.join(offers)}?"
+    )

@@ -1,0 +1,99 @@
+"""Writes bags of ROS 1, ROS 2 and mcap with images, for the tests of what reads them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+Kind = Literal["bag", "db3", "mcap"]
+KINDS: tuple[Kind, ...] = ("bag", "db3", "mcap")
+RGB, DEPTH, INFO = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw", "/camera/color/camera_info"
+
+Message = tuple[str, float, Any]
+"""Topic, time of arrival in seconds, content from `Messages`."""
+
+
+class Messages:
+    """Makes messages for one kind of bag, and writes them."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.kind = kind
+        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+
+    def header(self, stamp: float, frame: str) -> Any:
+        nanoseconds = round(stamp * 1e9)
+        time = self.store.types["builtin_interfaces/msg/Time"](nanoseconds // 10**9, nanoseconds % 10**9)
+        number = (0,) if self.kind == "bag" else ()
+        return self.store.types["std_msgs/msg/Header"](*number, time, frame)
+
+    def image(
+        self,
+        stamp: float,
+        encoding: str,
+        pixels: NDArray[Any],
+        *,
+        pad: int = 0,
+        big: bool = False,
+        frame: str = "optical",
+    ) -> Any:
+        """An image message of pixels (H, W) or (H, W, C), with ``pad`` bytes behind each row."""
+        height, width = pixels.shape[:2]
+        if big:
+            pixels = pixels.astype(pixels.dtype.newbyteorder(">"))
+        rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
+        data = np.concatenate([rows, np.full((height, pad), 99, np.uint8)], axis=1)
+        make = self.store.types["sensor_msgs/msg/Image"]
+        return make(self.header(stamp, frame), height, width, encoding, int(big), data.shape[1], data.reshape(-1))
+
+    def compressed(self, stamp: float, form: str, content: bytes) -> Any:
+        make = self.store.types["sensor_msgs/msg/CompressedImage"]
+        return make(self.header(stamp, "optical"), form, np.frombuffer(content, np.uint8))
+
+    def info(
+        self, width: int, height: int, k: list[float], d: list[float], p: list[float], model: str = "plumb_bob"
+    ) -> Any:
+        roi = self.store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        numbers = [np.array(values, np.float64) for values in (d, k, np.eye(3).reshape(-1), p)]
+        make = self.store.types["sensor_msgs/msg/CameraInfo"]
+        return make(self.header(0, "optical"), height, width, model, *numbers, 0, 0, roi)
+
+    def write(self, path: Path, messages: Iterable[Message]) -> Path:
+        """Write a ``.bag`` file, or a ROS 2 bag's folder; what was written comes back."""
+        if self.kind == "bag":
+            path = path.with_suffix(".bag")
+            writer: Any = Writer1(path)
+            serialize: Any = self.store.serialize_ros1
+        else:
+            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            writer = Writer2(path, version=9, storage_plugin=plugin)
+            serialize = self.store.serialize_cdr
+        with writer:
+            connections: dict[str, Any] = {}
+            for topic, arrival, message in messages:
+                kind = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                writer.write(connections[topic], round(arrival * 1e9), bytes(serialize(message, kind)))
+        return path
+
+
+def png(pixels: NDArray[Any]) -> bytes:
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "png")
+    return file.getvalue()
+
+
+def compressed_depth(units: NDArray[np.uint16], a: float = 0.0, b: float = 0.0) -> bytes:
+    """As compressed_depth_image_transport writes it: an enumeration, two numbers, a PNG."""
+    return struct.pack("<iff", 0, a, b) + png(units)

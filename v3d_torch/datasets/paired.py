@@ -1,0 +1,58 @@
+"""Sequences whose every frame is a colour file and a depth file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.datasets.images import read_colour, read_depth
+from v3d_torch.datasets.lists import Pair
+from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.errors import InputError
+from v3d_torch.types import Trajectory
+
+
+class PairedImages(StoredFrames):
+    """Frames of a folder of images.
+
+    Args:
+        folder: the sequence's folder.
+        pairs: the frames' files, in order of time.
+        camera: that took them.
+        groundtruth: measured poses of that camera, where there are some.
+        name: for tables; None takes the folder's name.
+
+    Raises:
+        InputError: a file is missing.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        pairs: list[Pair],
+        camera: PinholeCamera,
+        groundtruth: Trajectory | None = None,
+        *,
+        name: str | None = None,
+    ) -> None:
+        missing = [file for pair in pairs for file in (pair.colour, pair.depth) if not (folder / file).is_file()]
+        if missing:
+            raise InputError(
+                f"{folder / missing[0]}: is listed but not there ({len(missing)} such files);"
+                " copy the whole sequence again"
+            )
+        super().__init__(name or folder.resolve().name, [pair.stamp for pair in pairs], camera, groundtruth)
+        self.folder = folder
+        self._pairs = pairs
+
+    def _read(self, index: int) -> tuple[Tensor, Tensor]:
+        colour, depth = (self.folder / file for file in (self._pairs[index].colour, self._pairs[index].depth))
+        return self._sized(colour, self._colour(colour)), self._sized(depth, self._depth(depth))
+
+    def _colour(self, path: Path) -> Tensor:
+        return read_colour(path)
+
+    def _depth(self, path: Path) -> Tensor:
+        return read_depth(path, self.camera.depth_scale)
