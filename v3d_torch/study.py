@@ -1,0 +1,136 @@
+"""The runs of the ablation study: every variant with every seed on every sequence, one after the other."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from v3d_torch.config import Config, SegmentationConfig
+from v3d_torch.config_file import load_config
+from v3d_torch.console import open_sequence, result_folder, track
+from v3d_torch.datasets import RGBDSequence
+from v3d_torch.errors import ConfigError, InputError, OutputError
+from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, Outcome, csv_text, markdown, screen_table
+from v3d_torch.files import write_text
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.slam import Segmenter
+from v3d_torch.types import Instances, RGBDFrame
+
+
+class SegmentOnce:
+    """Keeps what a segmenter says of each frame of a sequence, and says the same, bit for bit, when asked again.
+
+    The network takes the most time of a run, and the variants differ only in what comes after it.
+    """
+
+    def __init__(self, segment: Segmenter) -> None:
+        self._segment = segment
+        self._kept: dict[int, Instances] = {}
+
+    def __call__(self, frame: RGBDFrame) -> Instances:
+        """Instances of a frame; frames are told apart by their index."""
+        if frame.index not in self._kept:
+            instances = self._segment(frame)
+            packed = np.packbits(instances.masks.numpy(), axis=-1)  # eight pixels a byte, or a long sequence takes GBs
+            self._kept[frame.index] = replace(instances, masks=torch.from_numpy(packed))
+        kept = self._kept[frame.index]
+        masks = np.unpackbits(kept.masks.numpy(), axis=-1, count=frame.image.shape[-1]).astype(bool)
+        return replace(kept, masks=torch.from_numpy(masks))
+
+
+def run_study(
+    names: Sequence[str],
+    variants: Sequence[str],
+    *,
+    seeds: int,
+    overrides: Sequence[str],
+    data_root: Path | None,
+    out: Path | None,
+) -> None:
+    """Run the study with everything shown and written; see ``python -m v3d_torch.ablate --help``.
+
+    Raises:
+        V3DError: on bad input, or when the study was interrupted or a run failed; what the others gave is written.
+    """
+    # A log or a pipe has no width: there the tables are not squeezed into 80 columns.
+    console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
+    configs = {
+        (variant, seed): load_config(None, [*overrides, *_changes(variant), f"seed={seed}"])
+        for variant in variants
+        for seed in range(seeds)
+    }
+    sequences = _open(names, data_root, console)
+    network = cache(make_segmenter)
+    for config in configs.values():
+        network(config.segmentation)  # what cannot be had is said before the first run, not after hours
+    folder = result_folder(out, "ablation")
+    outcomes: list[Outcome] = []
+    try:
+        for name, sequence in sequences.items():
+            segmenters: dict[SegmentationConfig, Segmenter] = {}
+            for (variant, seed), config in configs.items():
+                segment = segmenters.setdefault(config.segmentation, SegmentOnce(network(config.segmentation)))
+                place = result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
+                metrics, failure = _run(sequence, segment, config, place, console)
+                outcomes.append(Outcome(name, variant, seed, metrics, failure))
+                console.print(str(outcomes[-1]), markup=False)
+                write_text(folder / "ablation.md", markdown(outcomes))
+                write_text(folder / "ablation.csv", csv_text(outcomes))
+            console.print(screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
+    except KeyboardInterrupt as interrupt:
+        done, total = len(outcomes), len(configs) * len(sequences)
+        raise InputError(f"interrupted after {done} of {total} runs; what they gave is in {folder}") from interrupt
+    console.print(f"{LEGEND}\n{PAPER_SAYS}", markup=False)
+    console.print(f"results: {folder}", markup=False)
+    if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
+        raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
+
+
+def _changes(variant: str) -> Sequence[str]:
+    if variant not in VARIANTS:
+        raise ConfigError(f"--variants {variant}: there is no such variant; there are {', '.join(VARIANTS)}")
+    return VARIANTS[variant]
+
+
+def _open(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
+    """All sequences by name, before the first of them runs."""
+    sequences: dict[str, RGBDSequence] = {}
+    for name in dict.fromkeys(names):
+        sequence = open_sequence(name, data_root, None, console)
+        if sequence.name in sequences:
+            raise InputError(f"--seq {name}: another sequence is called {sequence.name} too, give them apart")
+        sequences[sequence.name] = sequence
+    return sequences
+
+
+def _run(
+    sequence: RGBDSequence, segment: Segmenter, config: Config, folder: Path, console: Console
+) -> tuple[dict[str, object], str | None]:
+    """One run, its results written.
+
+    Returns:
+        Its metrics, or none of them and the sentence that it failed with.
+
+    Raises:
+        KeyboardInterrupt: the user ended it.
+        OutputError: when the results cannot be written.
+    """
+    try:
+        pipeline, _ = track(sequence, segment, config, folder, console)
+    except OutputError:
+        raise
+    except Exception as error:  # a variant that breaks must not cost the others; its log has the traceback
+        return {}, f"{type(error).__name__}: {error}"
+    if pipeline.run.interrupted:
+        raise KeyboardInterrupt
+    if pipeline.run.failure is not None:
+        return {}, pipeline.run.failure
+    return json.loads((folder / "metrics.json").read_text(encoding="utf-8")), None
