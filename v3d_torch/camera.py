@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.calibration import distort_points, undistort_points
-from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
 
 
@@ -86,6 +86,33 @@ class PinholeCamera:
         v = self.fy * points[..., 1] / points[..., 2] + self.cy
         return torch.stack([u, v], dim=-1)
 
+    @cached_property
+    def _field(self) -> Tensor:
+        """Least and greatest x / z and y / z of all that is in the image, with a pixel to spare, shape (2, 2)."""
+        ends = self.rays[..., :2].flatten(0, 1).to(torch.float64).aminmax(dim=0)
+        pixel = torch.tensor([1 / self.fx, 1 / self.fy], dtype=torch.float64)
+        return torch.stack([ends.min - pixel, ends.max + pixel])
+
+    def locate(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
+        """Pixels of points in the image as delivered, and whether they are before the camera and in its field.
+
+        A lens' polynomial maps some of what lies far outside of the image into it: such points are not in the field.
+
+        Args:
+            points: camera frame, metres, shape :math:`(P, 3)`.
+            min_depth: nearer points are not seen, metres.
+
+        Returns:
+            (u, v), float64, shape :math:`(P, 2)`, and bool, shape :math:`(P,)`.
+        """
+        before = points[:, 2] > min_depth
+        slope = torch.where(before[:, None], points[:, :2] / points[:, 2:], torch.inf)
+        low, high = self._field
+        seen = ((slope >= low) & (slope <= high)).all(dim=1)
+        pixels = self.distort(self.project(torch.where(seen[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))))
+        u, v = pixels.unbind(dim=1)
+        return pixels, seen & (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
+
     def lift(self, uv: Tensor, depth: Tensor) -> Tensor:
         """Undistorted pixels with their depth to points in the camera frame.
 
@@ -113,8 +140,25 @@ class PinholeCamera:
         return self.lift(pixels, ones).reshape(self.height, self.width, 3).to(torch.float32)
 
 
-class BackProjector(torch.nn.Module):
+def back_project(depth: Tensor, rays: Tensor) -> Tensor:
     r"""Depth image to a point per pixel: :math:`x = (u - c_x) z / f_x,\; y = (v - c_y) z / f_y` (paper, Sec. III-B.1).
+
+    Args:
+        depth: metres along z, float32 or float64, shape :math:`(B, 1, H, W)`; 0 = no measurement.
+        rays: direction through every pixel at unit depth, shape :math:`(H, W, 3)`, or :math:`(B, H, W, 3)` for a camera
+            each; see `PinholeCamera.rays`.
+
+    Returns:
+        Points in the camera frame, metres, dtype of ``depth``, shape :math:`(B, H, W, 3)`; (0, 0, 0) where there is no
+        depth. Differentiable in ``depth`` and, for cameras that are learnt, in ``rays``.
+    """
+    KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
+    KORNIA_CHECK_SHAPE(rays, ["*", *map(str, depth.shape[2:]), "3"])
+    return rays.to(depth.dtype) * depth[:, 0, :, :, None]
+
+
+class BackProjector(torch.nn.Module):
+    """:func:`back_project` as a module.
 
     Args:
         camera: gives the ray of each pixel, lens distortion included.
@@ -125,13 +169,5 @@ class BackProjector(torch.nn.Module):
         self._camera = camera
 
     def forward(self, depth: Tensor) -> Tensor:
-        """Back-project; differentiable in ``depth``.
-
-        Args:
-            depth: metres, float32 or float64, shape :math:`(B, 1, H, W)`.
-
-        Returns:
-            Points in the camera frame, metres, shape :math:`(B, H, W, 3)`; (0, 0, 0) where there is no depth.
-        """
-        rays = self._camera.rays.to(depth.dtype).expand(depth.shape[0], -1, -1, -1)
-        return depth_to_3d_v2(depth[:, 0], self._camera.K.to(depth.dtype), xyz_grid=rays)
+        """Back-project depth images, metres, shape :math:`(B, 1, H, W)`; see :func:`back_project`."""
+        return back_project(depth, self._camera.rays)

@@ -34,3 +34,19 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
     rank = torch.empty_like(order).scatter_(1, order, torch.arange(order.shape[1]).expand_as(order))
     kept = (rank < torch.as_tensor(n).reshape(-1, 1)) & (size >= min_points)
     return clustered & kept.gather(1, cluster)
+
+
+class LargestClusters(torch.nn.Module):
+    """:func:`largest_clusters` as a module.
+
+    Args:
+        min_points: a cluster with fewer points is never kept.
+    """
+
+    def __init__(self, min_points: int = 1) -> None:
+        super().__init__()
+        self.min_points = min_points
+
+    def forward(self, labels: Tensor, valid: Tensor, n: int | Tensor = 1) -> Tensor:
+        """Keep the points of the ``n`` largest clusters of labels :math:`(B, N)`; see :func:`largest_clusters`."""
+        return largest_clusters(labels, valid, n, self.min_points)

@@ -32,9 +32,9 @@ def hough_vote(
     previous: Tensor,
     current: Tensor,
     present: Tensor,
-    distance_threshold: float,
-    vote_threshold: float,
-    temperature: float | None = None,
+    distance_threshold: float | Tensor,
+    vote_threshold: float | Tensor,
+    temperature: float | Tensor | None = None,
 ) -> Votes:
     r"""Let every object vote for those whose distance to it has changed.
 
@@ -51,7 +51,8 @@ def hough_vote(
             differentiated. None is the paper's step function.
 
     Returns:
-        Votes, differentiable in both centroids: ``change`` always, ``pair`` and ``votes`` with a temperature.
+        Votes, differentiable in both centroids: ``change`` always, ``pair`` and ``votes`` with a temperature, and then
+        in threshold and temperature, too, where these are tensors.
     """
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
@@ -77,7 +78,7 @@ def _distances(centroids: Tensor, present: Tensor) -> Tensor:
 
 
 class HoughVoting(torch.nn.Module):
-    """:func:`hough_vote` as a module.
+    """:func:`hough_vote` as a module. A setting given as a `torch.nn.Parameter` is learnt.
 
     Args:
         distance_threshold: change of a distance that counts as a vote, metres.
@@ -85,7 +86,12 @@ class HoughVoting(torch.nn.Module):
         temperature: softness of the vote, metres; None for the paper's step function.
     """
 
-    def __init__(self, distance_threshold: float, vote_threshold: float, temperature: float | None = None) -> None:
+    def __init__(
+        self,
+        distance_threshold: float | Tensor,
+        vote_threshold: float | Tensor,
+        temperature: float | Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.distance_threshold = distance_threshold
         self.vote_threshold = vote_threshold

@@ -1,0 +1,49 @@
+from .camera import BackProjector, PinholeCamera, back_project
+from .config import Config
+from .config_file import load_config
+from .datasets import load_sequence, open_source
+from .depth import DepthSmoother, smooth_depth
+from .errors import V3DError
+from .objects.assignment import match_instances
+from .objects.chamfer import ChamferDistance, chamfer_distance
+from .objects.clusters import LargestClusters, largest_clusters
+from .objects.dbscan import DBSCAN, dbscan
+from .objects.intra_motion import Deformation, IntraObjectMotion, intra_object_motion
+from .objects.tracker import InstanceTracker
+from .objects.voting import HoughVoting, Votes, hough_vote
+from .objects.voxel import VoxelPool, Voxels, voxel_pool
+from .slam import V3DSLAM
+from .types import Instances, RGBDFrame
+
+__all__ = [
+    "DBSCAN",
+    "V3DSLAM",
+    "BackProjector",
+    "ChamferDistance",
+    "Config",
+    "Deformation",
+    "DepthSmoother",
+    "HoughVoting",
+    "InstanceTracker",
+    "Instances",
+    "IntraObjectMotion",
+    "LargestClusters",
+    "PinholeCamera",
+    "RGBDFrame",
+    "V3DError",
+    "Votes",
+    "VoxelPool",
+    "Voxels",
+    "back_project",
+    "chamfer_distance",
+    "dbscan",
+    "hough_vote",
+    "intra_object_motion",
+    "largest_clusters",
+    "load_config",
+    "load_sequence",
+    "match_instances",
+    "open_source",
+    "smooth_depth",
+    "voxel_pool",
+]
