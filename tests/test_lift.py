@@ -115,6 +115,35 @@ def test_wall_is_told_from_the_object_from_a_gap_of_two_radii_on(gap: float) -> 
     assert float(clouds.points[0, clouds.valid[0], 2].max()) < OBJECT + 0.01
 
 
+@pytest.mark.parametrize("stride", [1, 2, 5])
+def test_own_pixels_are_those_of_the_object_and_not_of_the_wall_that_the_mask_caught(stride: int) -> None:
+    """Columns and rows of the board are multiples of the strides: what holds for a pixel holds for its block."""
+    exact, bled = (lift(board(), mask, stride=stride).own for mask in (rectangle(), rectangle(grown=7)))
+    assert exact.dtype == torch.bool
+    assert torch.equal(exact, rectangle()[None])
+    assert torch.equal(bled, rectangle()[None])
+
+
+def test_own_pixels_lie_in_the_voxels_that_are_kept() -> None:
+    """Pixel by pixel, on a noisy board with flying pixels and holes, for two overlapping masks."""
+    generator = torch.Generator().manual_seed(3)
+    depth = board() + 0.005 * torch.randn(board().shape, generator=generator)
+    flying = torch.rand(depth.shape, generator=generator)
+    depth = torch.where(flying < 0.03, depth + 8 * flying, torch.where(flying > 0.95, 0.0, depth))
+    masks = (rectangle(grown=9), rectangle((300, 450), (100, 200)))
+    clouds = lift(depth, *masks, stride=1)
+    voxels = (CAMERA.rays * depth[0, ..., None] / 0.02).floor().long()
+    for points, valid, own, mask in zip(clouds.points, clouds.valid, clouds.own, masks, strict=True):
+        kept = {tuple(voxel) for voxel in (points[valid] / 0.02).floor().long().tolist()}
+        expected = torch.zeros_like(mask)
+        expected[mask] = torch.tensor([tuple(voxel) in kept for voxel in voxels[mask].tolist()])
+        expected &= depth[0] > 0
+        # The mean of a voxel may, by rounding, lie on its face; hardly any does.
+        assert float((own ^ expected).sum()) < 0.001 * float(expected.sum())
+        assert 0.3 * int(mask.sum()) < int(own.sum()) < 0.97 * int(mask.sum())
+        assert not own[(depth[0] == 0) | ~mask].any()
+
+
 def test_flying_pixels_between_object_and_wall_are_dropped() -> None:
     depth = board()
     generator = torch.Generator().manual_seed(0)
@@ -171,6 +200,8 @@ def test_instances_without_a_cloud_have_no_centroid_and_leave_the_others_alone()
     clouds = lift(depth, hole, far, rectangle(), speck, torch.zeros_like(hole))
     torch.testing.assert_close(torch.isnan(clouds.centroid).all(dim=1), torch.tensor([True, True, False, True, True]))
     assert clouds.valid.sum(dim=1)[[0, 1, 4]].tolist() == [0, 0, 0]
+    assert not clouds.own[[0, 1, 4]].any()
+    assert torch.equal(clouds.own[2], rectangle())
     torch.testing.assert_close(clouds.centroid[2], lift(depth, rectangle()).centroid[0])
 
 
@@ -186,6 +217,7 @@ def test_no_instances() -> None:
     assert len(clouds) == 0
     assert clouds.centroid.shape == (0, 3)
     assert clouds.valid.shape[0] == 0
+    assert clouds.own.shape == (0, CAMERA.height, CAMERA.width)
 
 
 def test_just_enough_points_are_enough() -> None:

@@ -32,6 +32,8 @@ class SegmentationConfig(Section):
     than a false one."""
     iou_threshold: float = Field(0.7, ge=0, le=1)
     """Boxes of one class that overlap more than this are one instance (non-maximum suppression; YOLOv8's own)."""
+    duplicate_share: float = Field(0.7, gt=0, le=1)
+    """An instance of which more than this lies within a better one of its class is that one seen again, or its part."""
     max_instances: int = Field(32, gt=0)
     """Most instances kept in an image, by score: bounds memory, far above what a room shows."""
     threads: int = Field(2, gt=0)
@@ -73,13 +75,20 @@ class IdentityConfig(Section):
     """No object in a room moves faster, m/s: a person who runs. A centroid farther off is another object's."""
     max_jump: float = Field(0.5, gt=0)
     """By so much a centroid may be off in any time, metres: it moves when an object is cut or covered."""
+    centroid_sigma: float = Field(0.05, gt=0)
+    """Standard deviation of the centroid of an object wholly in sight, metres: arms and legs swing by more, outlines
+    err by less."""
+    partial_sigma: float = Field(0.45, ge=0)
+    """What comes on top where nearly nothing of the object is in sight, metres; in between by the share that is not.
+    A person cut off at the waist has a centroid a quarter of a height off."""
+    acceleration_noise: float = Field(2.0, gt=0)
+    """Standard deviation of the change of velocity in a second, m/s^2: who walks can stop or turn within one."""
     least_overlap: float = Field(0.5, ge=0, le=1)
     """An instance of another class continues an object only where their masks overlap by this: a class may flicker
     between frames, but a cup does not turn into the table under it."""
-    max_gap: float = Field(0.5, gt=0)
-    """An object that is not seen is predicted for so long, seconds: about a step of a person who walks."""
-    velocity_gain: float = Field(0.5, gt=0, le=1)
-    """Share of the newest displacement in an object's velocity: halves the centroid noise, follows within 3 frames."""
+    max_gap: float = Field(0.5, ge=0)
+    """An object that is not seen is predicted for so long, seconds: about a step of a person who walks. 0 for the
+    ablation."""
     history: float = Field(1.0, gt=0)
     """Centroids are remembered for so long, seconds: bounds the longest baseline of the vote."""
 
@@ -107,11 +116,20 @@ class BackgroundConfig(Section):
 
     enabled: bool = True
     """Off for the paper's literal rules."""
+    baselines: tuple[float, ...] = (0.3, 0.9)
+    """What is seen now is compared with what was seen so many seconds ago: a walker goes 0.3 m in the first, somebody
+    slow in the second."""
     moved_share: float = Field(0.5, gt=0, le=1)
     """An object has moved when at least half of it, of what is in sight, has."""
-    deformed_share: float = Field(0.15, gt=0, le=1)
+    deformed_share: float = Field(0.1, gt=0, le=1)
     """It has deformed when so much has. Silhouettes err by a pixel or two and make up some hundredths of a person; a
-    torso of 0.4 m that sways by 6 cm reaches this."""
+    torso of 0.4 m that sways by 4 cm reaches this."""
+    still_share: float = Field(0.1, gt=0, le=1)
+    """It stands still when less than this came over each of the baselines: outlines err by some hundredths."""
+    min_area: float = Field(0.02, gt=0)
+    """What came, has no name and is smaller, is noise, square metres: a hand with its forearm is about this."""
+    max_depth: float = Field(6.0, gt=0)
+    """Farther points are not looked at, metres: their depth errs by as much as what is to be found."""
     tolerance: float = Field(0.01, gt=0)
     """Depth that differs by this times z^2 is the same, 1/m: four times a structured-light camera's error."""
     min_tolerance: float = Field(0.04, gt=0)
@@ -143,9 +161,20 @@ class MaskConfig(Section):
     """A person is taken for moving until seen still for so long, seconds (the paper sets persons aside till judged)."""
     hold_dynamic: float = Field(1.0, ge=0)
     """An object judged dynamic or deforming stays so for this long after the last evidence, seconds: gaits pause."""
+    confirm_moving: int = Field(3, gt=0)
+    """The verdict is held only after so many frames with evidence: one may be noise of the depth."""
+    bridge_score: float = Field(0.3, ge=0)
+    """A missed object that was never seen to move is left out if the scores of its sightings add up to this: two weak
+    ones or a strong one. The network sees a person in rolled furniture for single frames."""
+    seam: int = Field(2, ge=0)
+    """Pixels by which a left-out mask grows whatever the depth: colour and depth are not aligned better."""
     margin: int = Field(8, ge=0)
-    """Pixels by which a left-out mask grows: a network mask at a quarter of the resolution errs by about two of its
-    pixels, and an ORB patch near the border sees both sides."""
+    """Pixels by which it grows where the depth is the object's own, or missing: a network mask at a quarter of the
+    resolution errs by about two of its pixels."""
+    tolerance: float = Field(0.05, gt=0)
+    """Depth within this of the points around it is the object's own, metres; its error, with z^2, comes on top."""
+    tolerance_growth: float = Field(0.01, ge=0)
+    """Growth of that with the square of depth, 1/m: four times a structured-light camera's error."""
 
 
 class ObjectsConfig(Section):

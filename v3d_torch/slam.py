@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,8 +17,10 @@ from v3d_torch.loop.closing import LoopCloser
 from v3d_torch.mapping.local_map import Keyframe
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
+from v3d_torch.objects.background import BackgroundWatch, DepthView
 from v3d_torch.objects.dynamics import ObjectDynamics, Scene
 from v3d_torch.objects.lift import CloudLifter
+from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.tracker import MapTracker
@@ -53,6 +56,8 @@ class V3DSLAM:
         self.detect = ORB(config.features, camera)
         self.lift = CloudLifter(config.objects.clouds, camera)
         self.motion = MotionEstimator(config.motion, config.features, camera, config.seed)
+        self.watch = BackgroundWatch(config.objects.background, camera)
+        self.propose = partial(unnamed_instances, camera=camera, min_area=config.objects.background.min_area)
         self.judge = ObjectDynamics(config.objects, camera)
         self.track = MapTracker(config.tracking, config.features, camera)
         self.mapper = Mapper(config, camera)
@@ -69,18 +74,21 @@ class V3DSLAM:
         """
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
             instances = self.segment(frame)
-            people = instances.masks[instances.labels == PERSON].any(dim=0)
         with self.clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with self.clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
-        with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
-            clouds = self.lift(depth, instances)
-        with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what is no person
+        with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
+            people = instances.masks[instances.labels == PERSON].any(dim=0)
             motion = self._move(frame.stamp, features, ~features.on(people))
             T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
+        with self.clock("background"):  # what does not fit that motion, also what the network has no name for
+            arrivals = self.watch(DepthView(frame.stamp, depth, T_cw), trusted=motion is not None)
+            instances = instances.joined(self.propose(arrivals, instances, depth))
+        with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
+            clouds = self.lift(depth, instances)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
-            scene = self.judge(frame.stamp, instances, clouds, depth, invert(T_cw))
+            scene = self.judge(frame.stamp, instances, clouds, depth, invert(T_cw), arrivals)
             keep = features.on(scene.static)
             static = features[keep]
         with self.clock("tracking"):  # III-E: the pose in the local map
@@ -90,6 +98,8 @@ class V3DSLAM:
             reference = self._reference(estimate)
             self.poses.record(frame.stamp, estimate, reference)
             keyframe = self.mapper(frame, static, estimate, reference)
+            if estimate.status is not Status.LOST:
+                self.watch.remember(DepthView(frame.stamp, depth, self.poses.T_cw))
             self._last = View(frame.stamp, static, estimate.landmarks if keyframe is None else keyframe.landmarks)
         if keyframe is not None:
             self.poses.anchor(keyframe)
@@ -97,6 +107,7 @@ class V3DSLAM:
                 T_new_old = self.loops.close(keyframe, self.mapper.map)
                 if T_new_old is not None:
                     self.judge.tracker.move_world(T_new_old)
+                    self.watch.move_world(T_new_old)
         return scene
 
     def _move(self, stamp: float, features: Features, usable: Tensor) -> Motion | None:

@@ -36,7 +36,7 @@ class Instances:
 
     Attributes:
         masks: bool, shape :math:`(N, H, W)`; masks may overlap.
-        labels: COCO class index (0 = person, 0..79), int64, shape :math:`(N,)`.
+        labels: COCO class index (0 = person, 0..79; -1 = unnamed), int64, shape :math:`(N,)`.
         scores: float32 in [0, 1], shape :math:`(N,)`.
         boxes: float32, shape :math:`(N, 4)`: left, top, right, bottom in pixels.
     """
@@ -48,6 +48,15 @@ class Instances:
 
     def __len__(self) -> int:
         return self.labels.shape[0]
+
+    def joined(self, others: Instances) -> Instances:
+        """These instances, then the others."""
+        return Instances(
+            masks=torch.cat([self.masks, others.masks]),
+            labels=torch.cat([self.labels, others.labels]),
+            scores=torch.cat([self.scores, others.scores]),
+            boxes=torch.cat([self.boxes, others.boxes]),
+        )
 
     @staticmethod
     def empty(height: int, width: int) -> Instances:

@@ -1,20 +1,25 @@
-"""The background's word on an object: whether the places where its points were are still filled.
+"""The background's word: places that were empty and are filled now, and places that are looked through now.
 
 The paper's votes and Chamfer distances compare centroids and clouds, and both change when an object is cut by the image
 border, covered by another one, or segmented differently. The camera's motion over the background, known from hundreds
 of points, gives a test that does not: a point of a still object is seen again where it was, or is hidden. Where the
-camera looks through the place, the point has gone.
+camera looks through the place, the point has gone; where an earlier view looked through it, the point has come.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import BackgroundConfig
+from v3d_torch.lie import invert
 
 
 @dataclass(frozen=True)
@@ -22,54 +27,148 @@ class DepthView:
     """What a depth image says of the world.
 
     Attributes:
+        stamp: seconds.
         depth: metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
         T_cw: world to camera, float64, shape :math:`(4, 4)`.
     """
 
+    stamp: float
     depth: Tensor
     T_cw: Tensor
+
+    _SLACK: ClassVar[float] = 0.01  # of the image's width, 0.6 degrees of a Kinect's: poses are no better
+
+    @cached_property
+    def nearest(self) -> Tensor:
+        """The least depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 where the pixel has none.
+
+        A place counts as looked through only where all around it is: a surface seen at a grazing angle, or with a pose
+        that is off by some pixels, would else seem to come and go.
+        """
+        depth = self.depth[0]
+        side = 2 * round(self._SLACK * depth.shape[1]) + 1
+        least = cv2.erode(torch.where(depth > 0, depth, torch.inf).numpy(), np.ones((side, side), np.uint8))
+        return torch.where(depth > 0, torch.from_numpy(least), 0.0)
+
+
+def look_through(points: Tensor, view: DepthView, camera: PinholeCamera, config: BackgroundConfig) -> Tensor:
+    """Whether a view looks through places.
+
+    Args:
+        points: world frame, metres, float64, shape :math:`(P, 3)`.
+        view: of another time.
+        camera: of the view.
+        config: tolerances.
+
+    Returns:
+        1 where the view sees something behind the place, 0 where it sees something in it, nan where the place is
+        hidden, outside the image or without depth; float64, shape :math:`(P,)`.
+    """
+    seen = points @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
+    expected = seen[:, 2]
+    pixels, inside = camera.locate(seen, config.min_depth)
+    u, v = pixels[inside].round().to(torch.int64).unbind(dim=1)
+    measured = torch.zeros_like(expected)
+    measured[inside] = view.nearest[v, u].to(torch.float64)
+    tolerance = (config.tolerance * expected.square()).clamp(min=config.min_tolerance)
+    in_sight = (measured > 0) & (measured > expected - tolerance)
+    return torch.where(in_sight, (measured > expected + tolerance).to(torch.float64), torch.nan)
 
 
 def vacated_share(cloud: Tensor, view: DepthView, camera: PinholeCamera, config: BackgroundConfig) -> float:
     """Share of a cloud's points, of those in sight, whose place another view looks through.
 
     Args:
-        cloud: world frame, metres, float32, shape :math:`(P, 3)`.
+        cloud: world frame, metres, shape :math:`(P, 3)`.
         view: of another time.
         camera: of the view.
         config: tolerances.
 
     Returns:
-        Between 0 (all are still there) and 1 (all have gone); nan when too few are in sight to tell.
+        Between 0 (all are there) and 1 (all are not); nan when too few are in sight to tell.
     """
-    points = cloud.to(torch.float64) @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
-    points = points[points[:, 2] > config.min_depth]
-    u, v = camera.distort(camera.project(points)).round().to(torch.int64).unbind(dim=1)
-    inside = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    expected = points[inside, 2]
-    measured = view.depth[0, v[inside], u[inside]].to(torch.float64)
-    tolerance = (config.tolerance * expected.square()).clamp(min=config.min_tolerance)
-    in_sight = (measured > 0) & (measured > expected - tolerance)
-    if int(in_sight.sum()) < config.min_points:
-        return torch.nan
-    return float((measured[in_sight] > (expected + tolerance)[in_sight]).double().mean())
+    return _share(look_through(cloud.to(torch.float64), view, camera, config), config.min_points)
 
 
-def moved_share(
-    then: tuple[Tensor, DepthView], now: tuple[Tensor, DepthView], camera: PinholeCamera, config: BackgroundConfig
-) -> float:
-    """Share of an object that moved between two times: left its places, or came to places that were empty.
+@dataclass(frozen=True)
+class Arrivals:
+    """Pixels whose point lies where an earlier view saw nothing.
+
+    Attributes:
+        came: 1 where it does, 0 where something was there before, nan where it cannot be told, float64, for each
+            baseline, on every ``stride``-th pixel, shape :math:`(B, h, w)`.
+        stride: pixels.
+    """
+
+    came: Tensor
+    stride: int
+
+    def share(self, mask: Tensor, least: int) -> Tensor:
+        """Share of an object's pixels that came.
+
+        Args:
+            mask: bool, shape :math:`(H, W)`.
+            least: fewer pixels of which it can be told make nan.
+
+        Returns:
+            For each baseline, float64, shape :math:`(B,)`.
+        """
+        within = self.came[:, mask[:: self.stride, :: self.stride]]
+        return torch.tensor([_share(row, least) for row in within], dtype=torch.float64)
+
+
+class BackgroundWatch:
+    """Remembers what was seen lately, and tells what has come since.
 
     Args:
-        then: cloud in the world, and the view that saw it.
-        now: the same of the later time.
-        camera: of both views.
-        config: tolerances.
-
-    Returns:
-        The greater of both shares; nan when neither can be told.
+        config: baselines and tolerances.
+        camera: of all views.
     """
-    left = vacated_share(then[0], now[1], camera, config)
-    came = vacated_share(now[0], then[1], camera, config)
-    known = [share for share in (left, came) if share == share]  # nan is not equal to itself
-    return max(known, default=torch.nan)
+
+    _SLACK = 0.2  # seconds: a view as old as the baseline must be among the kept, at 5 frames a second too
+    _ROW = 160  # pixels of a row that are looked at, of a Kinect's every 4th: 2 cm at 2.5 m, as fine as the clouds
+
+    def __init__(self, config: BackgroundConfig, camera: PinholeCamera) -> None:
+        self._config = config
+        self._camera = camera
+        self._views: list[DepthView] = []
+        self._stride = max(1, round(camera.width / self._ROW))
+        self._rays = camera.rays[:: self._stride, :: self._stride].to(torch.float64)
+
+    def __call__(self, now: DepthView, *, trusted: bool = True) -> Arrivals:
+        """Compare a view with those remembered.
+
+        Args:
+            now: the view.
+            trusted: whether its pose is known. Against a guess all would seem to have come: then nothing is told.
+        """
+        config = self._config
+        z = now.depth[0, :: self._stride, :: self._stride].to(torch.float64)
+        T_wc = invert(now.T_cw)
+        points = (self._rays * z[..., None]).reshape(-1, 3) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        known = (z > config.min_depth) & (z <= config.max_depth)
+        baselines = config.baselines if config.enabled and trusted else ()
+        came = torch.full((len(baselines), *z.shape), torch.nan, dtype=torch.float64)
+        for row, baseline in zip(came, baselines, strict=True):
+            then = self._before(now.stamp - baseline)
+            if then is not None:
+                row[known] = look_through(points[known.flatten()], then, self._camera, config)
+        return Arrivals(came, self._stride)
+
+    def remember(self, view: DepthView) -> None:
+        """Keep a view, its pose now as good as it gets, for those to come."""
+        oldest = view.stamp - max(self._config.baselines, default=0.0) - self._SLACK
+        self._views = [kept for kept in self._views if kept.stamp >= oldest] + [view]
+
+    def move_world(self, T_new_old: Tensor) -> None:
+        """Carry the views along when the map is corrected under them, float64, shape :math:`(4, 4)`."""
+        self._views = [DepthView(v.stamp, v.depth, v.T_cw @ invert(T_new_old)) for v in self._views]
+
+    def _before(self, stamp: float) -> DepthView | None:
+        """The newest view at least that old."""
+        return next((view for view in reversed(self._views) if view.stamp <= stamp + 1e-3), None)
+
+
+def _share(told: Tensor, least: int) -> float:
+    known = told[~torch.isnan(told)]
+    return float(known.mean()) if len(known) >= least else torch.nan

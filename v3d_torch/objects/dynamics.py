@@ -11,9 +11,11 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import ObjectsConfig, VotingConfig
-from v3d_torch.objects.background import moved_share
-from v3d_torch.objects.chamfer import chamfer_distance
+from v3d_torch.lie import invert
+from v3d_torch.objects.background import Arrivals, DepthView, vacated_share
+from v3d_torch.objects.intra_motion import intra_object_motion
 from v3d_torch.objects.lift import ObjectClouds
+from v3d_torch.objects.silhouette import silhouette
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
@@ -75,7 +77,7 @@ class ObjectDynamics:
 
     Args:
         config: of the object stage.
-        camera: tells which points both of two frames could see.
+        camera: of all frames.
     """
 
     def __init__(self, config: ObjectsConfig, camera: PinholeCamera) -> None:
@@ -84,7 +86,15 @@ class ObjectDynamics:
         self._last_stamp = -torch.inf
         self.tracker = InstanceTracker(config.identity, camera, config.clouds.voxel_size)
 
-    def __call__(self, stamp: float, instances: Instances, clouds: ObjectClouds, depth: Tensor, T_wc: Tensor) -> Scene:
+    def __call__(
+        self,
+        stamp: float,
+        instances: Instances,
+        clouds: ObjectClouds,
+        depth: Tensor,
+        T_wc: Tensor,
+        arrivals: Arrivals,
+    ) -> Scene:
         """Judge the objects of a frame.
 
         Args:
@@ -93,96 +103,133 @@ class ObjectDynamics:
             clouds: of the instances, camera frame.
             depth: metres, shape :math:`(1, H, W)`.
             T_wc: camera to world as the motion from the frame before gives it.
+            arrivals: what came since earlier frames, see `BackgroundWatch`.
         """
         tracks = self.tracker(stamp, instances, clouds, depth, T_wc)
+        view = DepthView(stamp, depth, invert(T_wc))
+        came = {track: arrivals.share(track.own, self._config.background.min_points) for track in tracks}
         seen = [track for track in tracks if not track.missed]
-        votes = self._vote(stamp, seen)
-        chamfer = self._deform(stamp, seen)
+        votes = self._vote(seen, came, view)
+        chamfer = self._deform(seen, came, view)
         self._last_stamp = stamp
+        verdicts = {track: self._judge(track, came[track], stamp) for track in tracks}
         objects = [
             Judged(
                 id=track.id,
                 label=track.label,
                 mask=track.mask,
                 centroid=track.predict(stamp),
-                votes=votes.get(track.id, 0),
-                chamfer=chamfer.get(track.id, torch.nan),
-                verdict=self._judge(track, stamp),
+                votes=votes.get(track, 0),
+                chamfer=chamfer.get(track, torch.nan),
+                verdict=verdict,
                 missed=track.missed,
             )
-            for track in tracks
+            for track, verdict in verdicts.items()
         ]
-        moving = [judged for judged in objects if not self._may_be_tracked(judged)]
-        people = [judged for judged in objects if judged.label == PERSON]
-        static = self._clear_of(moving, depth.shape[-2:])
-        return Scene(objects, static, static & self._clear_of(people, depth.shape[-2:]))
+        moving = [track for track, verdict in verdicts.items() if not self._may_be_tracked(verdict)]
+        people = [track for track in tracks if track.label == PERSON]
+        static = self._clear_of(moving, view)
+        return Scene(objects, static, static & self._clear_of(people, view))
 
-    def _vote(self, stamp: float, tracks: list[Track]) -> dict[int, int]:
+    def _vote(self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView) -> dict[Track, int]:
         """Votes of each object, the most over all baselines; marks those that are voted dynamic."""
-        config = self._config.voting
-        most: dict[int, int] = {}
-        for baseline in config.baselines if config.enabled else ():
+        config, background = self._config.voting, self._config.background
+        most: dict[Track, int] = {}
+        if not config.enabled:
+            return most
+        # What is seen for the first time has no distance that could have changed: the background alone has a vote.
+        voted = {
+            track for track in tracks if background.enabled and bool((came[track] >= background.moved_share).any())
+        }
+        for baseline in config.baselines:
             pairs = {track: pair for track in tracks if (pair := track.pair(baseline)) is not None}
             if baseline == 0:  # the frame before: what it has not is not compared (Alg. 1)
                 pairs = {track: pair for track, pair in pairs.items() if pair[0].stamp >= self._last_stamp}
             if not pairs:
                 continue
-            share = self._config.background.moved_share
-            moved = torch.tensor([self._background_agrees(*pair, share) for pair in pairs.values()])
+            share = background.moved_share
+            moved = torch.tensor(
+                [self._has_moved(then, came[track], view, share) for track, (then, _) in pairs.items()]
+            )
             then = torch.stack([then.centroid for then, _ in pairs.values()])
             now = torch.stack([now.centroid for _, now in pairs.values()])
-            votes, dynamic = elect(then, now, moved if self._config.background.enabled else None, config)
-            for track, count, voted in zip(pairs, votes.tolist(), dynamic.tolist(), strict=True):
-                most[track.id] = max(most.get(track.id, 0), count)
-                if voted:
-                    track.last_dynamic = stamp
+            votes, dynamic = elect(then, now, moved if background.enabled else None, config)
+            for track, count, elected in zip(pairs, votes.tolist(), dynamic.tolist(), strict=True):
+                most[track] = max(most.get(track, 0), count)
+                if elected:
+                    voted.add(track)
+        for track in voted:
+            track.last_dynamic = view.stamp
+            track.evidence += 1
         return most
 
-    def _deform(self, stamp: float, tracks: list[Track]) -> dict[int, float]:
+    def _deform(self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView) -> dict[Track, float]:
         """Root mean Chamfer distance of each living object to its own past; marks those that deform."""
         config = self._config.chamfer
         share = self._config.background.deformed_share
-        measured: dict[int, float] = {}
+        measured: dict[Track, float] = {}
         for track in tracks if config.enabled else ():
             pair = track.pair(config.baseline)
             if pair is None or track.label not in LIVING:
                 continue
             then, now = pair
-            squared = chamfer_distance(then.cloud[None], now.cloud[None])
-            measured[track.id] = float((squared / 2).sqrt())
-            if measured[track.id] >= config.distance_threshold and self._background_agrees(then, now, share):
-                track.last_deforming = stamp
+            motion = intra_object_motion(then.cloud[None], now.cloud[None], config.distance_threshold)
+            measured[track] = float(motion.distance)
+            if motion.deforming and self._has_moved(then, came[track], view, share):
+                track.last_deforming = view.stamp
         return measured
 
-    def _background_agrees(self, then: Sighting, now: Sighting, share: float) -> bool:
-        """Whether so much of an object has left its places; not where too little of them is in sight to tell."""
+    def _has_moved(self, then: Sighting, came: Tensor, view: DepthView, share: float) -> bool:
+        """Whether so much of an object has come, or has left its places; always, where the background has no say."""
         config = self._config.background
-        if not config.enabled:
+        if not config.enabled or bool((came >= share).any()):
             return True
-        return moved_share((then.cloud, then.view), (now.cloud, now.view), self._camera, config) >= share
+        return vacated_share(then.cloud, view, self._camera, config) >= share
 
-    def _judge(self, track: Track, stamp: float) -> Verdict:
+    def _judge(self, track: Track, came: Tensor, stamp: float) -> Verdict:
         config = self._config.mask
-        if stamp - track.last_dynamic <= config.hold_dynamic:
+        if track.last_dynamic == stamp:
+            return Verdict.DYNAMIC
+        # Over every baseline its places were filled: it stands there since the longest of them.
+        still = len(came) > 0 and bool((came < self._config.background.still_share).all())
+        if track.missed and (still or (track.score < config.bridge_score and track.last_dynamic == -torch.inf)):
+            return Verdict.STATIC
+        if stamp - track.last_dynamic <= config.hold_dynamic and track.evidence >= config.confirm_moving:
             return Verdict.DYNAMIC
         if stamp - track.last_deforming <= config.hold_dynamic:
             return Verdict.DEFORMING
-        if track.label == PERSON and stamp - track.first_seen < config.confirm_still:
+        if not still and track.label in LIVING and stamp - track.first_seen < config.confirm_still:
             return Verdict.UNKNOWN
         return Verdict.STATIC
 
-    def _may_be_tracked(self, judged: Judged) -> bool:
-        deforming = judged.verdict is Verdict.DEFORMING and self._config.chamfer.include_deforming
-        return deforming or judged.verdict is Verdict.STATIC
+    def _may_be_tracked(self, verdict: Verdict) -> bool:
+        deforming = verdict is Verdict.DEFORMING and self._config.chamfer.include_deforming
+        return deforming or verdict is Verdict.STATIC
 
-    def _clear_of(self, objects: list[Judged], size: torch.Size) -> Tensor:
-        """Pixels outside of the given objects, these grown by the margin, bool, shape (H, W)."""
-        covered = torch.zeros(size, dtype=torch.bool)
-        for judged in objects:
-            covered |= judged.mask
-        side = 2 * self._config.mask.margin + 1
-        grown = cv2.dilate(covered.to(torch.uint8).numpy(), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
-        return torch.from_numpy(grown == 0)
+    def _clear_of(self, tracks: list[Track], view: DepthView) -> Tensor:
+        """Pixels outside of the given objects, bool, shape (H, W)."""
+        covered = torch.zeros(view.depth.shape[-2:], dtype=torch.bool)
+        for track in tracks:
+            covered |= track.mask if track.missed else self._outline(track, view)
+        return ~_grown(covered, self._config.mask.seam)
+
+    def _outline(self, track: Track, view: DepthView) -> Tensor:
+        """Pixels of an object, and of its rim: those whose depth is its own, or missing; bool, shape (H, W)."""
+        config = self._config.mask
+        if not track.newest.located:  # too few points to tell which depths are its own
+            return _grown(track.mask, config.margin)
+        cloud = track.newest.cloud.to(torch.float64) @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
+        tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
+        spacing = self._config.clouds.voxel_size
+        _, explained = silhouette(cloud, view.depth, self._camera, spacing, config.margin, tolerance)
+        unmeasured = view.depth[0] <= 0
+        return track.own | (_grown(track.mask, config.margin) & (explained | unmeasured))
+
+
+def _grown(mask: Tensor, pixels: int) -> Tensor:
+    """A mask with all that is no farther from it, bool, shape (H, W)."""
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return torch.from_numpy(cv2.dilate(mask.to(torch.uint8).numpy(), around) > 0)
 
 
 def elect(then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig) -> tuple[Tensor, Tensor]:

@@ -23,11 +23,13 @@ class ObjectClouds:
         points: voxel means in the camera frame, metres, float32, shape :math:`(N, P, 3)`.
         valid: which are points and not padding, bool, shape :math:`(N, P)`.
         centroid: mean of the points, float32, shape :math:`(N, 3)`; nan where a cloud has too few points.
+        own: pixels of each mask whose point is in the cloud, bool, shape :math:`(N, H, W)`.
     """
 
     points: Tensor
     valid: Tensor
     centroid: Tensor
+    own: Tensor
 
     def __len__(self) -> int:
         return self.points.shape[0]
@@ -53,18 +55,30 @@ class CloudLifter:
             instances: of the same image.
         """
         config = self._config
-        points, valid = self._gather(depth, instances)
-        points, valid, _ = voxel_pool(points, valid, config.voxel_size)
+        points, valid, pixel = self._gather(depth, instances)
+        points, valid, _, owner = voxel_pool(points, valid, config.voxel_size)
         labels = dbscan(points, valid, config.eps, config.min_samples)
         # The paper keeps as many blobs as there are instances; here each instance has its own cloud and keeps one.
         valid = largest_clusters(labels, valid, 1)
         count = valid.sum(dim=1)
         centroid = (points * valid[..., None]).sum(dim=1) / count.clamp(min=1)[:, None]
         centroid[count < config.min_points] = torch.nan
-        return ObjectClouds(points, valid, centroid)
+        return ObjectClouds(points, valid, centroid, self._own(instances.masks, valid, owner, pixel))
 
-    def _gather(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor]:
-        """Every n-th masked pixel with depth as a padded set of points, :math:`(N, P, 3)` and :math:`(N, P)`."""
+    def _own(self, masks: Tensor, valid: Tensor, owner: Tensor, pixel: Tensor) -> Tensor:
+        """Pixels of each mask whose point is in a voxel that stayed, bool, :math:`(N, H, W)`."""
+        step, (height, width) = self._config.stride, masks.shape[-2:]
+        own = torch.zeros_like(masks[:, ::step, ::step])
+        instance, point = torch.nonzero(owner >= 0, as_tuple=True)
+        own.flatten(1)[instance, pixel[instance, point]] = valid[instance, owner[instance, point]]
+        return own.repeat_interleave(step, dim=1).repeat_interleave(step, dim=2)[:, :height, :width] & masks
+
+    def _gather(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor, Tensor]:
+        """Every n-th masked pixel with depth as a padded set of points.
+
+        Returns:
+            Points :math:`(N, P, 3)`, which exist :math:`(N, P)`, and their pixels, numbered row by row, :math:`(N, P)`.
+        """
         step = self._config.stride
         cloud = self._project(depth[None])[0, ::step, ::step].reshape(-1, 3)
         z = depth[0, ::step, ::step].reshape(-1)
@@ -76,4 +90,6 @@ class CloudLifter:
         place = torch.arange(instance.shape[0]) - (count.cumsum(0) - count)[instance]
         points = torch.zeros(len(instances), max(longest, 1), 3)
         points[instance, place] = cloud[pixel]
-        return points, torch.arange(max(longest, 1)) < count[:, None]
+        pixels = torch.zeros(len(instances), max(longest, 1), dtype=torch.int64)
+        pixels[instance, place] = pixel
+        return points, torch.arange(max(longest, 1)) < count[:, None], pixels

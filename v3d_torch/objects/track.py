@@ -9,7 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from v3d_torch.objects.background import DepthView
+from v3d_torch.config import IdentityConfig
+from v3d_torch.objects.motion_filter import MotionFilter
+from v3d_torch.segmentation.coco import UNNAMED
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,11 @@ class Sighting:
         stamp: seconds.
         centroid: world frame, metres, float64, shape :math:`(3,)`; nan when its cloud was too small.
         cloud: world frame, metres, float32, shape :math:`(P, 3)`.
-        view: the depth image that it was seen in.
     """
 
     stamp: float
     centroid: Tensor
     cloud: Tensor
-    view: DepthView
 
     @property
     def located(self) -> bool:
@@ -41,31 +41,42 @@ class Track:
     Attributes:
         id: number of the object, from 1, never used again.
         mask: its pixels in the newest frame, bool, shape :math:`(H, W)`; predicted where the network missed it.
+        own: those of them whose depth is its own, bool, shape :math:`(H, W)`.
         first_seen: seconds.
-        sightings: newest last, not older than the history of the configuration.
-        velocity: world frame, m/s, float64, shape :math:`(3,)`.
+        config: noise of centroids, and for how long they are remembered.
+        sightings: newest last, not older than the history of the configuration; at least one.
         missed: whether the newest frame has it only by prediction.
         labels: how often the network gave it which class.
+        score: sum of the scores that the network gave it.
+        evidence: frames in which it was voted dynamic.
         last_dynamic: stamp of the last vote that went through, seconds.
         last_deforming: stamp of the last Chamfer distance above the threshold, seconds.
     """
 
     id: int
     mask: Tensor
+    own: Tensor
     first_seen: float
-    sightings: list[Sighting]
-    velocity: Tensor = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+    config: IdentityConfig
+    sightings: list[Sighting] = field(default_factory=list)
     missed: bool = False
     labels: Counter[int] = field(default_factory=Counter)
+    score: float = 0.0
+    evidence: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
 
     _TOLERANCE: ClassVar[float] = 1e-3  # seconds: stamps are rounded, frame times jitter
 
+    def __post_init__(self) -> None:
+        self._motion = MotionFilter(self.config)
+        self._most_points = 1
+
     @property
     def label(self) -> int:
-        """The class that the network gave most often: it may flicker from frame to frame."""
-        return self.labels.most_common(1)[0][0]
+        """The class that the network gave most often: it may flicker from frame to frame. A name once given stays."""
+        named = Counter({label: count for label, count in self.labels.items() if label != UNNAMED})
+        return (named or self.labels).most_common(1)[0][0]
 
     @property
     def newest(self) -> Sighting:
@@ -89,16 +100,30 @@ class Track:
                 return (then, now) if then.located and now.located else None
         return None
 
+    @property
+    def velocity(self) -> Tensor:
+        """World frame, m/s, float64, shape :math:`(3,)`; 0 while the sightings are too few to tell."""
+        return self._motion.velocity
+
     def predict(self, stamp: float) -> Tensor:
         """Centroid at ``stamp`` with constant velocity (paper, Sec. II), world frame, shape :math:`(3,)`."""
-        return self.located.centroid + self.velocity * (stamp - self.located.stamp)
+        return self._motion.predict(stamp)
 
-    def extend(self, sighting: Sighting, gain: float, history: float) -> None:
-        """Take in a new sighting: update the velocity, forget what is older than ``history`` seconds."""
-        elapsed = sighting.stamp - self.located.stamp
-        displacement = sighting.centroid - self.located.centroid
-        if elapsed > 0 and torch.isfinite(displacement).all():
-            self.velocity = (1 - gain) * self.velocity + gain * displacement / elapsed
+    def extend(self, sighting: Sighting) -> None:
+        """Take in a new sighting, and forget what is older than the history."""
+        self._most_points = max(self._most_points, len(sighting.cloud))
+        hidden = 1 - len(sighting.cloud) / self._most_points  # the centroid of a part is not that of the whole
+        sigma = self.config.centroid_sigma + self.config.partial_sigma * hidden
+        self._motion.update(sighting.stamp, sighting.centroid, sigma)
         self.sightings.append(sighting)
-        while sighting.stamp - self.sightings[0].stamp > history + self._TOLERANCE and len(self.sightings) > 2:
+        oldest = sighting.stamp - self.config.history - self._TOLERANCE
+        while self.sightings[0].stamp < oldest and len(self.sightings) > 2:
             self.sightings.pop(0)
+
+    def move_world(self, T_new_old: Tensor) -> None:
+        """Carry all of it along when the map is corrected under it, see `InstanceTracker.move_world`."""
+        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        self._motion.move_world(T_new_old)
+        self.sightings = [
+            Sighting(s.stamp, R @ s.centroid + t, s.cloud @ R.T.to(s.cloud) + t.to(s.cloud)) for s in self.sightings
+        ]

@@ -18,5 +18,13 @@ COCO_NAMES: tuple[str, ...] = (
 PERSON = COCO_NAMES.index("person")
 """The class that the paper sets aside as potentially moving (Sec. III-A)."""
 
+UNNAMED = -1
+"""What moves and has no class: the network missed it, or has no name for it."""
+
 LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
 """Classes that deform by themselves: people and animals. Things are rigid: they move as a whole or not at all."""
+
+
+def class_name(label: int) -> str:
+    """Name of a class index, also of `UNNAMED`."""
+    return "unnamed" if label == UNNAMED else COCO_NAMES[label]

@@ -12,6 +12,7 @@ from v3d_torch.config import SegmentationConfig
 from v3d_torch.errors import WeightsError
 from v3d_torch.segmentation.coco import COCO_NAMES
 from v3d_torch.segmentation.decode import decode
+from v3d_torch.segmentation.duplicates import without_duplicates
 from v3d_torch.segmentation.export import exported
 from v3d_torch.segmentation.letterbox import CELL, letterbox
 from v3d_torch.segmentation.networks.head import STRIDES
@@ -59,7 +60,7 @@ class YOLOSegmenter:
         """
         canvas, window = letterbox(image, self.height, self.width)
         predictions, prototypes = self._session.run(None, {self._input: canvas.numpy()})
-        return decode(
+        instances = decode(
             torch.from_numpy(predictions)[0],
             torch.from_numpy(prototypes)[0],
             window,
@@ -67,6 +68,7 @@ class YOLOSegmenter:
             iou_threshold=self._iou_threshold,
             max_instances=self.config.max_instances,
         )
+        return without_duplicates(instances, self.config.duplicate_share)
 
 
 def _open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
