@@ -270,7 +270,8 @@ def test_an_interrupt_ends_the_run_and_keeps_it(tmp_path: Path) -> None:
 
 
 def test_masks_show_what_is_left_out(tmp_path: Path) -> None:
-    config = load_config(overrides=["objects.mask.margin=0", "objects.mask.confirm_still=100"])
+    exactly = ["objects.mask.margin=0", "objects.mask.seam=0", "objects.background.enabled=false"]
+    config = load_config(overrides=[*exactly, "objects.mask.confirm_still=100"])
     pipeline(masks=tmp_path / "masks", config=config)()
     paths = sorted((tmp_path / "masks").iterdir())
     assert [path.name for path in paths] == [f"{index / 10:.6f}.png" for index in range(FRAMES)]
