@@ -84,7 +84,8 @@ class V3DSLAM:
             T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             arrivals = self.watch(DepthView(frame.stamp, depth, T_cw), trusted=motion is not None)
-            instances = instances.joined(self.propose(arrivals, instances, depth))
+            if self.config.segmentation.source != "none":  # the baseline has no masks at all
+                instances = instances.joined(self.propose(arrivals, instances, depth))
         with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
