@@ -24,7 +24,6 @@ from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.tracker import MapTracker
-from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.timing import StageClock
 from v3d_torch.types import Instances, RGBDFrame
 
@@ -79,8 +78,7 @@ class V3DSLAM:
         with self.clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
-            people = instances.masks[instances.labels == PERSON].any(dim=0)
-            motion = self._move(frame.stamp, features, ~features.on(people))
+            motion = self._move(frame.stamp, features, torch.ones(len(features), dtype=torch.bool))
             T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             arrivals = self.watch(DepthView(frame.stamp, depth, T_cw), trusted=motion is not None)
