@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
-from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
@@ -29,6 +28,7 @@ import yaml
 
 import v3d_torch
 from v3d_torch.errors import OutputError
+from v3d_torch.evaluation.cells import row, spread
 from v3d_torch.evaluation.tables import paper_scores, paper_sequence
 from v3d_torch.files import write_text
 from v3d_torch.mapping.recorder import Status
@@ -186,19 +186,6 @@ def ate_cell(runs: Sequence[Outcome]) -> str:
     if failed == len(runs):
         return "failed"
     return spread([run.ate for run in runs if run.ate is not None], ".4f") + (f", {failed} failed" if failed else "")
-
-
-def spread(values: Sequence[float], form: str) -> str:
-    """Median and range of some values, which is left out when there is none to see."""
-    if not values:
-        return "-"
-    middle, low, high = (format(value, form) for value in (median(values), min(values), max(values)))
-    return middle if low == high else f"{middle} [{low}-{high}]"
-
-
-def row(cells: Sequence[str]) -> str:
-    """A row of a Markdown table."""
-    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
 def unique(items: Iterable[T]) -> list[T]:

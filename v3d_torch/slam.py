@@ -78,7 +78,7 @@ class V3DSLAM:
         with self.clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
-            motion = self._move(frame.stamp, features, torch.ones(len(features), dtype=torch.bool))
+            motion = self._move(frame.stamp, features)
             T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             arrivals = self.watch(DepthView(frame.stamp, depth, T_cw), trusted=motion is not None)
@@ -109,10 +109,10 @@ class V3DSLAM:
                     self.watch.move_world(T_new_old)
         return scene
 
-    def _move(self, stamp: float, features: Features, usable: Tensor) -> Motion | None:
+    def _move(self, stamp: float, features: Features) -> Motion | None:
         if self._last is None:
             return None
-        return self.motion(self._last.features, features, usable, elapsed=stamp - self._last.stamp)
+        return self.motion(self._last.features, features, elapsed=stamp - self._last.stamp)
 
     def _carry(self, motion: Motion | None, count: int) -> Tensor:
         """Ids of the landmarks that the motion's matches carry over from the last frame, -1 for none, (count,)."""

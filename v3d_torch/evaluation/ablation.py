@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 from rich.markup import escape
 from rich.table import Table
 
+from v3d_torch.evaluation.cells import row, spread
+
 FULL = "full"
 
 VARIANTS: Mapping[str, tuple[str, ...]] = {
@@ -124,9 +126,9 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
         headings, rows = _summary(runs)
         lines += ["", f"## {sequence}", f"Seeds: {len({run.seed for run in runs})}. {verdict(runs)}", ""]
-        lines += [_line(["variant", *headings]), _line(["---", *["---:"] * len(headings)])]
+        lines += [row(["variant", *headings]), row(["---", *["---:"] * len(headings)])]
         for variant, cells in rows.items():
-            lines.append(_line([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
+            lines.append(row([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
         lines += ["", *(f"- {run}" for run in runs if run.failure is not None)]
     return "\n".join(lines) + "\n"
 
@@ -178,7 +180,7 @@ def _summary(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[_Ce
             lowest = format(min(medians.values()), column.form)
             for variant, values in measured.items():
                 best = column.is_error and bool(values) and format(medians[variant], column.form) == lowest
-                rows[variant].append(_Cell(_spread(values, column.form), best))
+                rows[variant].append(_Cell(spread(values, column.form), best))
     failed = {variant: sum(run.failure is not None for run in outcomes if run.variant == variant) for variant in rows}
     if any(failed.values()):
         headings.append("failed")
@@ -192,15 +194,3 @@ def _by_variant(outcomes: Sequence[Outcome], place: str) -> Iterator[tuple[str, 
     for variant in dict.fromkeys(outcome.variant for outcome in outcomes):
         values = [outcome.figure(place) for outcome in outcomes if outcome.variant == variant]
         yield variant, [value for value in values if value is not None]
-
-
-def _spread(values: Sequence[float], form: str) -> str:
-    """Median and range, which is left out where there is none to see."""
-    if not values:
-        return "-"
-    middle, low, high = (format(value, form) for value in (median(values), min(values), max(values)))
-    return middle if low == high else f"{middle} [{low}-{high}]"
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"

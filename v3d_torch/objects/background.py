@@ -143,12 +143,14 @@ class BackgroundWatch:
             trusted: whether its pose is known. Against a guess all would seem to have come: then nothing is told.
         """
         config = self._config
+        baselines = config.baselines if config.enabled and trusted else ()
         z = now.depth[0, :: self._stride, :: self._stride].to(torch.float64)
+        came = torch.full((len(baselines), *z.shape), torch.nan, dtype=torch.float64)
+        if not baselines:
+            return Arrivals(came, self._stride)
         T_wc = invert(now.T_cw)
         points = (self._rays * z[..., None]).reshape(-1, 3) @ T_wc[:3, :3].T + T_wc[:3, 3]
         known = (z > config.min_depth) & (z <= config.max_depth)
-        baselines = config.baselines if config.enabled and trusted else ()
-        came = torch.full((len(baselines), *z.shape), torch.nan, dtype=torch.float64)
         for row, baseline in zip(came, baselines, strict=True):
             then = self._before(now.stamp - baseline)
             if then is not None:

@@ -45,28 +45,24 @@ class MotionEstimator:
         self._camera = camera
         self._seed = seed
 
-    def __call__(
-        self, a: Features, b: Features, usable: Tensor | None = None, elapsed: float = math.inf
-    ) -> Motion | None:
+    def __call__(self, a: Features, b: Features, elapsed: float = math.inf) -> Motion | None:
         """Motion from view ``a`` to view ``b``.
 
         Args:
             a: known view; its features with depth take part.
             b: new view.
-            usable: which features of ``b`` take part, bool, shape :math:`(N,)`; all of them when None.
             elapsed: time between the views, seconds, which bounds how far a camera can have come.
 
         Returns:
             None when fewer than ``min_inliers`` matches agree on one motion, or on one that no hand can make.
         """
         config = self._config
-        candidates = torch.arange(len(b)) if usable is None else torch.nonzero(usable)[:, 0]
         chosen = torch.nonzero(a.depth > 0)[:, 0]
         chosen = chosen[spread(a.pixel[chosen], config.count, self._cell)]
         pairs = match_descriptors(
-            a.descriptors[chosen], b.descriptors[candidates], max_hamming=config.max_hamming, max_ratio=config.max_ratio
+            a.descriptors[chosen], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
         )
-        pairs = torch.stack([chosen[pairs[:, 0]], candidates[pairs[:, 1]]], dim=1)
+        pairs = torch.stack([chosen[pairs[:, 0]], pairs[:, 1]], dim=1)
         if pairs.shape[0] < config.min_inliers:
             return None
         epipolar = epipolar_inliers(
