@@ -22,7 +22,7 @@ from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.depth import DepthSmoother
 from v3d_torch.lie import invert, se3_exp
-from v3d_torch.objects.background import BackgroundWatch, DepthView
+from v3d_torch.objects.background import BackgroundWatch
 from v3d_torch.objects.dynamics import Judged, ObjectDynamics, Scene, Verdict
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
@@ -365,10 +365,10 @@ class ObjectStage:
 
     def __call__(self, stamp: float, instances: Instances, depth: Tensor, T_wc: Tensor) -> Scene:
         depth = self._smooth(depth[None])[0]
-        view = DepthView(stamp, depth, invert(T_wc))
+        view = self._watch.look(stamp, depth, invert(T_wc))
         arrivals = self._watch(view)
         instances = instances.joined(unnamed_instances(arrivals, instances, depth, CAMERA, self._min_area))
-        scene = self._judge(stamp, instances, self._lift(depth, instances), depth, T_wc, arrivals)
+        scene = self._judge(instances, self._lift(depth, instances), view, arrivals)
         self._watch.remember(view)
         return scene
 

@@ -178,6 +178,21 @@ def test_kept_instances_are_the_same_bit_for_bit_and_nobody_can_change_them() ->
     assert asked == [0, 1, 2, 3]
 
 
+def test_a_frame_that_is_turned_is_another_picture() -> None:
+    asked = []
+
+    def segment(frame: RGBDFrame) -> Instances:
+        asked.append(frame.image.shape[1:])
+        return Instances.empty(*frame.image.shape[1:])
+
+    once = SegmentOnce(segment)
+    image = torch.randint(0, 255, (3, 5, 13), generator=torch.Generator().manual_seed(0)).byte()
+    for turns in (0, 1, 2, 3, 2, 1, 0):
+        turned = torch.rot90(image, turns, dims=(1, 2))
+        assert once(RGBDFrame(0, 0.0, turned, torch.zeros(1, *turned.shape[1:]))).masks.shape[1:] == turned.shape[1:]
+    assert asked == [(5, 13), (13, 5), (5, 13), (13, 5)]
+
+
 # --- what goes wrong
 
 

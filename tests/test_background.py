@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -60,6 +61,33 @@ def test_nearest_is_the_least_measured_depth_around(height: int, width: int, sid
     measured = np.where(depth[0] > 0, depth[0], np.inf)
     expected = np.where(depth[0] > 0, minimum_filter(measured, side, mode="constant", cval=np.inf), 0.0)
     assert torch.equal(DepthView(0.0, depth, HERE).nearest, torch.from_numpy(expected.astype(np.float32)))
+
+
+def turned(degrees: float) -> Tensor:
+    """World to a camera that is turned to the right."""
+    return se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, -math.radians(degrees), 0.0], dtype=torch.float64))
+
+
+def test_the_faster_the_camera_turns_the_farther_a_place_may_be_off() -> None:
+    """3 degrees in 0.1 s: in the 0.02 s between colour and depth 0.6 degrees, times the focal length in pixels."""
+    depth = torch.full((1, CAMERA.height, CAMERA.width), WALL)
+    watching = BackgroundWatch(BackgroundConfig(sync=0.02), CAMERA)
+    assert watching.look(0.0, depth, HERE).shift == 0  # nothing to measure a turn by
+    watching.remember(view())
+    assert watching.look(0.1, depth, HERE).shift == 0
+    assert watching.look(0.1, depth, turned(3.0)).shift == round(math.radians(0.6) * CAMERA.fx)
+    assert watching.look(0.1, depth, turned(60.0)).shift == round(math.radians(12.0) * CAMERA.fx)
+    assert BackgroundWatch(BackgroundConfig(sync=0.0), CAMERA).look(0.1, depth, turned(60.0)).shift == 0
+    moved = torch.eye(4, dtype=torch.float64)
+    moved[0, 3] = 0.5
+    assert watching.look(0.1, depth, moved).shift == 0
+
+
+@pytest.mark.parametrize(("shift", "expected"), [(0, 1.0), (6, 0.0)])
+def test_a_place_beside_something_is_not_looked_through_by_a_camera_that_turns(shift: int, expected: float) -> None:
+    """The box was 5 pixels beside the place, no more than its depth may be off: nothing has left."""
+    seen = replace(view(((65, 85), OBJECT)), shift=shift)
+    assert vacated_share(surface((57, 63)), seen, CAMERA, CONFIG) == expected
 
 
 def test_all_are_still_there() -> None:

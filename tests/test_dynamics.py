@@ -131,12 +131,12 @@ class Stage:
         self, stamp: float, named: Instances, depth: Tensor, T_wc: Tensor, lifted: Tensor | None = None
     ) -> Scene:
         """Judge a frame; clouds are of the depth ``lifted`` where the background is to see another one."""
-        view = DepthView(stamp, depth, invert(T_wc))
+        view = self._watch.look(stamp, depth, invert(T_wc))
         arrivals = self._watch(view)
         unnamed = unnamed_instances(arrivals, named, depth, CAMERA, self._config.background.min_area)
         self.instances = named.joined(unnamed)
         clouds = self._lift(depth if lifted is None else lifted, self.instances)
-        scene = self._judge(stamp, self.instances, clouds, depth, T_wc, arrivals)
+        scene = self._judge(self.instances, clouds, view, arrivals)
         self._watch.remember(view)
         return scene
 
@@ -624,7 +624,7 @@ class Literal:
         clouds = ObjectClouds(centroids[:, None] + ball, torch.ones(count, 64, dtype=torch.bool), centroids, masks)
         instances = Instances(masks, torch.full((count,), CHAIR), torch.ones(count), torch.zeros(count, 4))
         view = DepthView(self._frame / 30, torch.full((1, CAMERA.height, CAMERA.width), WALL), invert(T_wc))
-        scene = self._judge(view.stamp, instances, clouds, view.depth, T_wc, self._watch(view))
+        scene = self._judge(instances, clouds, view, self._watch(view))
         self._watch.remember(view)
         return {judged.id: judged for judged in scene.objects}
 

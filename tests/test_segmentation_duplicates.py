@@ -74,6 +74,12 @@ def test_another_class_within_stays() -> None:
     assert kept([WHOLE, HEAD, HEAD], [PERSON, CHAIR, PERSON]) == [0, 1]
 
 
+def test_the_same_pixels_by_another_name_are_the_same_thing() -> None:
+    nearly = rectangle(8, 0, 40, 40)
+    assert kept([WHOLE, nearly, OTHER], [PERSON, CHAIR, CHAIR]) == [0, 2]
+    assert kept([nearly, WHOLE, OTHER], [PERSON, CHAIR, CHAIR]) == [0, 2]
+
+
 def test_neighbours_that_overlap_a_little_stay() -> None:
     assert kept([rectangle(0, 0, 32, 48), rectangle(16, 0, 48, 48)], [PERSON] * 2) == [0, 1]
 
@@ -110,12 +116,14 @@ def naive(masks: np.ndarray, labels: Sequence[int], share: float) -> list[int]:
     stay: list[int] = []
     for i in range(len(masks)):
         for j in stay:
-            both = area = 0
+            both = area = other = 0
             for v, u in np.ndindex(*masks.shape[1:]):
                 if v % STRIDE == 0 and u % STRIDE == 0:
                     both += bool(masks[i, v, u] and masks[j, v, u])
                     area += bool(masks[i, v, u])
-            if labels[i] == labels[j] and both > share * max(area, 1):
+                    other += bool(masks[j, v, u])
+            coincide = both > share * max(other, 1)
+            if both > share * max(area, 1) and (labels[i] == labels[j] or coincide):
                 break
         else:
             stay.append(i)

@@ -24,6 +24,7 @@ from v3d_torch.segmentation import (
     make_segmenter,
 )
 from v3d_torch.segmentation.export import exported
+from v3d_torch.segmentation.upright import Upright
 from v3d_torch.segmentation.weights import REGISTRY, resolve
 from v3d_torch.types import RGBDFrame
 
@@ -97,6 +98,19 @@ def test_a_mirrored_image_gives_mirrored_masks() -> None:
     mask = segmenter.segment(image).masks[0]
     mirrored = segmenter.segment(image.flip(2)).masks[0].flip(1)
     assert (mask & mirrored).sum() / (mask | mirrored).sum() > 0.96
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_rolled_camera_finds_the_person_as_well(turns: int) -> None:
+    """The mask is the one of the upright picture, turned as the camera is."""
+    network = YOLOSegmenter(SegmentationConfig(threads=1))
+    image = photograph("astronaut")
+    held = torch.rot90(image, turns, dims=(1, 2)).contiguous()
+    here = torch.eye(4, dtype=torch.float64)
+    seen = Upright(network)(RGBDFrame(0, 0.0, held, torch.ones(1, 512, 512), here))
+    assert seen.labels[0] == PERSON
+    mask, expected = seen.masks[0], torch.rot90(network.segment(image).masks[0], turns, dims=(0, 1))
+    assert (mask & expected).sum() / (mask | expected).sum() > 0.9
 
 
 def test_an_onnx_file_given_by_hand_is_used_at_its_own_size(tmp_path: Path) -> None:

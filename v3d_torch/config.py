@@ -34,6 +34,8 @@ class SegmentationConfig(Section):
     """Boxes of one class that overlap more than this are one instance (non-maximum suppression; YOLOv8's own)."""
     duplicate_share: float = Field(0.7, gt=0, le=1)
     """An instance of which more than this lies within a better one of its class is that one seen again, or its part."""
+    upright: bool = True
+    """Whether the network is shown the images of a rolled camera upright (off in the paper)."""
     max_instances: int = Field(32, gt=0)
     """Most instances kept in an image, by score: bounds memory, far above what a room shows."""
     threads: int = Field(2, gt=0)
@@ -83,7 +85,7 @@ class IdentityConfig(Section):
     A person cut off at the waist has a centroid a quarter of a height off."""
     acceleration_noise: float = Field(2.0, gt=0)
     """Standard deviation of the change of velocity in a second, m/s^2: who walks can stop or turn within one."""
-    least_overlap: float = Field(0.5, ge=0, le=1)
+    least_overlap: float = Field(0.4, ge=0, le=1)
     """An instance of another class continues an object only where their masks overlap by this: a class may flicker
     between frames, but a cup does not turn into the table under it."""
     max_gap: float = Field(0.5, ge=0)
@@ -127,13 +129,17 @@ class BackgroundConfig(Section):
     still_share: float = Field(0.1, gt=0, le=1)
     """It stands still when less than this came over each of the baselines: outlines err by some hundredths."""
     min_area: float = Field(0.02, gt=0)
-    """What came, has no name and is smaller, is noise, square metres: a hand with its forearm is about this."""
+    """What came, has no name and is smaller, is noise, square metres: a hand with its forearm is about this. Infinite
+    for the ablation."""
     max_depth: float = Field(6.0, gt=0)
     """Farther points are not looked at, metres: their depth errs by as much as what is to be found."""
     tolerance: float = Field(0.01, gt=0)
     """Depth that differs by this times z^2 is the same, 1/m: four times a structured-light camera's error."""
     min_tolerance: float = Field(0.04, gt=0)
     """And so is depth that differs by this, metres: the thickness of clothes and of a voxel."""
+    sync: float = Field(0.02, ge=0)
+    """Colour and depth of a frame are taken so far apart, seconds: TUM pairs what is no farther, and a rolling shutter
+    takes as long to read half an image. A camera that turns sees them as many pixels apart as it turns meanwhile."""
     min_depth: float = Field(0.3, gt=0)
     """Nearer points are out of such a camera's range, metres."""
     min_points: int = Field(30, gt=0)
@@ -161,7 +167,7 @@ class MaskConfig(Section):
     """A person is taken for moving until seen still for so long, seconds (the paper sets persons aside till judged)."""
     hold_dynamic: float = Field(1.0, ge=0)
     """An object judged dynamic or deforming stays so for this long after the last evidence, seconds: gaits pause."""
-    confirm_moving: int = Field(3, gt=0)
+    confirm_moving: int = Field(2, gt=0)
     """The verdict is held only after so many frames with evidence: one may be noise of the depth."""
     bridge_score: float = Field(0.3, ge=0)
     """A missed object that was never seen to move is left out if the scores of its sightings add up to this: two weak

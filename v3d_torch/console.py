@@ -33,8 +33,8 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.results import write_results
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import class_name
-from v3d_torch.slam import V3DSLAM, Segmenter
-from v3d_torch.types import RGBDFrame
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame, Segmenter
 
 _LOG = logging.getLogger("v3d_torch")
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -12,12 +11,12 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
-from v3d_torch.lie import invert, rigid
+from v3d_torch.lie import rigid
 from v3d_torch.loop.closing import LoopCloser
 from v3d_torch.mapping.local_map import Keyframe
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
-from v3d_torch.objects.background import BackgroundWatch, DepthView
+from v3d_torch.objects.background import BackgroundWatch
 from v3d_torch.objects.dynamics import ObjectDynamics, Scene
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
@@ -25,9 +24,7 @@ from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.tracker import MapTracker
 from v3d_torch.timing import StageClock
-from v3d_torch.types import Instances, RGBDFrame
-
-Segmenter = Callable[[RGBDFrame], Instances]
+from v3d_torch.types import RGBDFrame, Segmenter
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class V3DSLAM:
             What the object stage says of the frame.
         """
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(frame)
+            instances = self.segment(replace(frame, T_cw=self.poses.predict(frame.stamp)))
         with self.clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with self.clock("features"):  # III-A: ORB
@@ -81,13 +78,14 @@ class V3DSLAM:
             motion = self._move(frame.stamp, features)
             T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
-            arrivals = self.watch(DepthView(frame.stamp, depth, T_cw), trusted=motion is not None)
+            view = self.watch.look(frame.stamp, depth, T_cw)
+            arrivals = self.watch(view, trusted=motion is not None)
             if self.config.segmentation.source != "none":  # the baseline has no masks at all
                 instances = instances.joined(self.propose(arrivals, instances, depth))
         with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
-            scene = self.judge(frame.stamp, instances, clouds, depth, invert(T_cw), arrivals)
+            scene = self.judge(instances, clouds, view, arrivals)
             keep = features.on(scene.static)
             static = features[keep]
         with self.clock("tracking"):  # III-E: the pose in the local map
@@ -98,7 +96,7 @@ class V3DSLAM:
             self.poses.record(frame.stamp, estimate, reference)
             keyframe = self.mapper(frame, static, estimate, reference)
             if estimate.status is not Status.LOST:
-                self.watch.remember(DepthView(frame.stamp, depth, self.poses.T_cw))
+                self.watch.remember(replace(view, T_cw=self.poses.T_cw))
             self._last = View(frame.stamp, static, estimate.landmarks if keyframe is None else keyframe.landmarks)
         if keyframe is not None:
             self.poses.anchor(keyframe)

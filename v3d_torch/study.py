@@ -20,9 +20,8 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, Outcome, csv_text, markdown, screen_table
 from v3d_torch.files import write_text
-from v3d_torch.segmentation import make_segmenter
-from v3d_torch.slam import Segmenter
-from v3d_torch.types import Instances, RGBDFrame
+from v3d_torch.segmentation import held_upright, make_source
+from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 
 class SegmentOnce:
@@ -33,15 +32,16 @@ class SegmentOnce:
 
     def __init__(self, segment: Segmenter) -> None:
         self._segment = segment
-        self._kept: dict[int, Instances] = {}
+        self._kept: dict[tuple[int, int], Instances] = {}
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Instances of a frame; frames are told apart by their index."""
-        if frame.index not in self._kept:
+        """Instances of a frame; frames are told apart by index and image, which may have been turned."""
+        key = (frame.index, hash(frame.image.numpy().tobytes()))
+        if key not in self._kept:
             instances = self._segment(frame)
             packed = np.packbits(instances.masks.numpy(), axis=-1)  # eight pixels a byte, or a long sequence takes GBs
-            self._kept[frame.index] = replace(instances, masks=torch.from_numpy(packed))
-        kept = self._kept[frame.index]
+            self._kept[key] = replace(instances, masks=torch.from_numpy(packed))
+        kept = self._kept[key]
         masks = np.unpackbits(kept.masks.numpy(), axis=-1, count=frame.image.shape[-1]).astype(bool)
         return replace(kept, masks=torch.from_numpy(masks))
 
@@ -68,16 +68,17 @@ def run_study(
         for seed in range(seeds)
     }
     sequences = _open(names, data_root, console)
-    network = cache(make_segmenter)
+    network = cache(make_source)
     for config in configs.values():
-        network(config.segmentation)  # what cannot be had is said before the first run, not after hours
+        network(_as_held(config))  # what cannot be had is said before the first run, not after hours
     folder = result_folder(out, "ablation")
     outcomes: list[Outcome] = []
     try:
         for name, sequence in sequences.items():
-            segmenters: dict[SegmentationConfig, Segmenter] = {}
+            sources: dict[SegmentationConfig, Segmenter] = {}
             for (variant, seed), config in configs.items():
-                segment = segmenters.setdefault(config.segmentation, SegmentOnce(network(config.segmentation)))
+                source = sources.setdefault(_as_held(config), SegmentOnce(network(_as_held(config))))
+                segment = held_upright(source, config.segmentation)
                 place = result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
                 metrics, failure = _run(sequence, segment, config, place, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
@@ -98,6 +99,11 @@ def _changes(variant: str) -> Sequence[str]:
     if variant not in VARIANTS:
         raise ConfigError(f"--variants {variant}: there is no such variant; there are {', '.join(VARIANTS)}")
     return VARIANTS[variant]
+
+
+def _as_held(config: Config) -> SegmentationConfig:
+    """What the network itself is told: images are turned, where they are, before it sees them."""
+    return config.segmentation.model_copy(update={"upright": False})
 
 
 def _open(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:

@@ -7,6 +7,7 @@ means "no measurement"; stamps are seconds.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -22,12 +23,14 @@ class RGBDFrame:
         stamp: time of the colour image, seconds.
         image: colour, uint8 RGB, shape :math:`(3, H, W)`, as the camera delivers it (distorted).
         depth: metres, float32, shape :math:`(1, H, W)`, pixel by pixel on the colour image; 0 = no measurement.
+        T_cw: world to camera where the camera is expected to be, float64, shape :math:`(4, 4)`; None before it is.
     """
 
     index: int
     stamp: float
     image: Tensor
     depth: Tensor
+    T_cw: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,10 @@ class Instances:
             scores=torch.zeros(0),
             boxes=torch.zeros(0, 4),
         )
+
+
+Segmenter = Callable[[RGBDFrame], Instances]
+"""Finds the instances in a frame's colour image."""
 
 
 @dataclass(frozen=True)

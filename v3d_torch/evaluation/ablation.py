@@ -21,7 +21,10 @@ VARIANTS: Mapping[str, tuple[str, ...]] = {
     "no_voting": ("objects.voting.enabled=false",),
     "no_chamfer": ("objects.chamfer.enabled=false",),
     "no_bridging": ("objects.identity.max_gap=0",),
+    "no_unnamed": ("objects.background.min_area=.inf",),
+    "as_held": ("segmentation.upright=false",),
     "paper": (
+        "segmentation.upright=false",
         "objects.voting.baselines=[0.0]",
         "objects.background.enabled=false",
         "objects.chamfer.baseline=0.0",

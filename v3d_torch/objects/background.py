@@ -8,7 +8,7 @@ camera looks through the place, the point has gone; where an earlier view looked
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import BackgroundConfig
-from v3d_torch.lie import invert
+from v3d_torch.lie import invert, se3_log
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,13 @@ class DepthView:
         stamp: seconds.
         depth: metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
         T_cw: world to camera, float64, shape :math:`(4, 4)`.
+        shift: pixels by which the depth may lie beside the colour that the pose is of, because the camera turned.
     """
 
     stamp: float
     depth: Tensor
     T_cw: Tensor
+    shift: int = 0
 
     _SLACK: ClassVar[float] = 0.01  # of the image's width, 0.6 degrees of a Kinect's: poses are no better
 
@@ -46,7 +48,7 @@ class DepthView:
         that is off by some pixels, would else seem to come and go.
         """
         depth = self.depth[0]
-        side = 2 * round(self._SLACK * depth.shape[1]) + 1
+        side = 2 * (round(self._SLACK * depth.shape[1]) + self.shift) + 1
         least = cv2.erode(torch.where(depth > 0, depth, torch.inf).numpy(), np.ones((side, side), np.uint8))
         return torch.where(depth > 0, torch.from_numpy(least), 0.0)
 
@@ -135,6 +137,21 @@ class BackgroundWatch:
         self._stride = max(1, round(camera.width / self._ROW))
         self._rays = camera.rays[:: self._stride, :: self._stride].to(torch.float64)
 
+    def look(self, stamp: float, depth: Tensor, T_cw: Tensor) -> DepthView:
+        """A view with what it may be off by, as fast as the camera has turned since the last one remembered.
+
+        Args:
+            stamp: seconds.
+            depth: metres, shape :math:`(1, H, W)`.
+            T_cw: world to camera, float64, shape :math:`(4, 4)`.
+        """
+        if not self._views:
+            return DepthView(stamp, depth, T_cw)
+        last = self._views[-1]
+        angle = float(se3_log(T_cw @ invert(last.T_cw))[3:].norm())
+        rate = angle / max(stamp - last.stamp, 1e-3)
+        return DepthView(stamp, depth, T_cw, round(self._camera.fx * rate * self._config.sync))
+
     def __call__(self, now: DepthView, *, trusted: bool = True) -> Arrivals:
         """Compare a view with those remembered.
 
@@ -164,7 +181,7 @@ class BackgroundWatch:
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the views along when the map is corrected under them, float64, shape :math:`(4, 4)`."""
-        self._views = [DepthView(v.stamp, v.depth, v.T_cw @ invert(T_new_old)) for v in self._views]
+        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
 
     def _before(self, stamp: float) -> DepthView | None:
         """The newest view at least that old."""

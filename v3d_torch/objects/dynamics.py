@@ -86,27 +86,17 @@ class ObjectDynamics:
         self._last_stamp = -torch.inf
         self.tracker = InstanceTracker(config.identity, camera, config.clouds.voxel_size)
 
-    def __call__(
-        self,
-        stamp: float,
-        instances: Instances,
-        clouds: ObjectClouds,
-        depth: Tensor,
-        T_wc: Tensor,
-        arrivals: Arrivals,
-    ) -> Scene:
+    def __call__(self, instances: Instances, clouds: ObjectClouds, view: DepthView, arrivals: Arrivals) -> Scene:
         """Judge the objects of a frame.
 
         Args:
-            stamp: seconds.
             instances: of the frame.
             clouds: of the instances, camera frame.
-            depth: metres, shape :math:`(1, H, W)`.
-            T_wc: camera to world as the motion from the frame before gives it.
+            view: its depth, with the pose that the motion from the frame before gives it.
             arrivals: what came since earlier frames, see `BackgroundWatch`.
         """
-        tracks = self.tracker(stamp, instances, clouds, depth, T_wc)
-        view = DepthView(stamp, depth, invert(T_wc))
+        stamp = view.stamp
+        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
         came = {track: arrivals.share(track.own, self._config.background.min_points) for track in tracks}
         seen = [track for track in tracks if not track.missed]
         votes = self._vote(seen, came, view)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from v3d_torch.config import SegmentationConfig
@@ -10,16 +9,38 @@ from v3d_torch.errors import ConfigError
 from v3d_torch.segmentation.coco import COCO_NAMES, PERSON
 from v3d_torch.segmentation.none import NoSegmentation
 from v3d_torch.segmentation.stored import StoredMasks
+from v3d_torch.segmentation.upright import Upright
 from v3d_torch.segmentation.yolo import YOLOSegmenter
-from v3d_torch.types import Instances, RGBDFrame
+from v3d_torch.types import Segmenter
 
-__all__ = ["COCO_NAMES", "PERSON", "NoSegmentation", "StoredMasks", "YOLOSegmenter", "make_segmenter"]
+__all__ = [
+    "COCO_NAMES",
+    "PERSON",
+    "NoSegmentation",
+    "StoredMasks",
+    "Upright",
+    "YOLOSegmenter",
+    "held_upright",
+    "make_segmenter",
+    "make_source",
+]
 
 
-def make_segmenter(
-    config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None
-) -> Callable[[RGBDFrame], Instances]:
-    """The source of instances that the configuration names.
+def make_segmenter(config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None) -> Segmenter:
+    """The source of instances that the configuration names, for one run: it follows the camera's roll.
+
+    See `make_source` for arguments and errors.
+    """
+    return held_upright(make_source(config, weights, masks_dir), config)
+
+
+def held_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
+    """A network that is shown upright images where the configuration says so; masks from files are as they are."""
+    return Upright(source) if config.upright and config.source == "yolo" else source
+
+
+def make_source(config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None) -> Segmenter:
+    """The source of instances, one image like another.
 
     Args:
         config: of the stage; ``source`` decides.

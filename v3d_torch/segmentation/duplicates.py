@@ -11,7 +11,7 @@ _STRIDE = 4
 
 
 def without_duplicates(instances: Instances, share: float) -> Instances:
-    """Leave out instances that lie within a better one of their class.
+    """Leave out instances that lie within a better one of their class, or that one of another class coincides with.
 
     Suppression by boxes does not find them: head and shoulders fill a small part of the box of the person.
 
@@ -25,7 +25,8 @@ def without_duplicates(instances: Instances, share: float) -> Instances:
     masks = instances.masks[:, ::_STRIDE, ::_STRIDE].flatten(1).to(torch.float32)
     area = masks.sum(dim=1)
     within = (masks @ masks.T) / area[:, None].clamp(min=1)
-    same = (within > share) & (instances.labels[:, None] == instances.labels)
+    # A person may hold a cup, or hide most of a chair; but what also lies in it is the same thing by another name.
+    same = (within > share) & ((instances.labels[:, None] == instances.labels) | (share < within.T))
     kept: list[int] = []
     for i in range(len(instances)):  # each depends on those before it; there are a few dozen at most
         if not same[i, kept].any():
