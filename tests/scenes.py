@@ -26,6 +26,7 @@ from v3d_torch.objects.background import BackgroundWatch
 from v3d_torch.objects.dynamics import Judged, ObjectDynamics, Scene, Verdict
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
+from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.types import Instances
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
@@ -353,6 +354,10 @@ class Run:
         return float(pixels.double().mean())
 
 
+NO_WITNESSES = Witnesses(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
+"""Scenes are depth alone."""
+
+
 class ObjectStage:
     """The object stage as `V3DSLAM` calls it: the one place that knows its signature."""
 
@@ -368,7 +373,7 @@ class ObjectStage:
         view = self._watch.look(stamp, depth, invert(T_wc))
         arrivals = self._watch(view)
         instances = instances.joined(unnamed_instances(arrivals, instances, depth, CAMERA, self._min_area))
-        scene = self._judge(instances, self._lift(depth, instances), view, arrivals)
+        scene = self._judge(instances, self._lift(depth, instances), view, arrivals, NO_WITNESSES)
         self._watch.remember(view)
         return scene
 

@@ -20,6 +20,7 @@ from v3d_torch.objects.background import BackgroundWatch, DepthView
 from v3d_torch.objects.dynamics import Judged, ObjectDynamics, Scene, Verdict
 from v3d_torch.objects.lift import CloudLifter, ObjectClouds
 from v3d_torch.objects.unnamed import unnamed_instances
+from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.segmentation.coco import PERSON, UNNAMED
 from v3d_torch.types import Instances
 
@@ -117,6 +118,9 @@ def handheld(t: float) -> Tensor:
     )
 
 
+NO_WITNESSES = Witnesses(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
+
+
 class Stage:
     """The object stage in the order of `V3DSLAM`; ``instances`` are those of the last frame, the unnamed among them."""
 
@@ -126,6 +130,7 @@ class Stage:
         self._lift = CloudLifter(config.clouds, CAMERA)
         self._judge = ObjectDynamics(config, CAMERA)
         self.instances = Instances.empty(CAMERA.height, CAMERA.width)
+        self.witnesses = NO_WITNESSES
 
     def __call__(
         self, stamp: float, named: Instances, depth: Tensor, T_wc: Tensor, lifted: Tensor | None = None
@@ -136,7 +141,7 @@ class Stage:
         unnamed = unnamed_instances(arrivals, named, depth, CAMERA, self._config.background.min_area)
         self.instances = named.joined(unnamed)
         clouds = self._lift(depth if lifted is None else lifted, self.instances)
-        scene = self._judge(self.instances, clouds, view, arrivals)
+        scene = self._judge(self.instances, clouds, view, arrivals, self.witnesses)
         self._watch.remember(view)
         return scene
 
@@ -386,6 +391,24 @@ def test_a_person_is_unknown_until_seen_still_for_long_enough(rate: float) -> No
             assert frame[2].verdict is Verdict.STATIC
 
 
+@pytest.mark.parametrize(("fitting", "verdict"), [(1.0, Verdict.STATIC), (0.2, Verdict.UNKNOWN)])
+def test_a_person_whose_features_fit_the_motion_is_none_or_stands(fitting: float, verdict: Verdict) -> None:
+    """Rolled furniture over most of the image: at first sight all that tells are the features on it."""
+    depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
+    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mask[:, :, : 3 * CAMERA.width // 4] = True
+    person = Instances(mask, torch.tensor([PERSON]), torch.tensor([0.5]), torch.zeros(1, 4))
+    rows, columns = torch.meshgrid(torch.arange(2, CAMERA.height, 6), torch.arange(2, CAMERA.width, 6), indexing="ij")
+    pixel = torch.stack([columns.flatten(), rows.flatten()], dim=1)
+    fits = torch.rand(len(pixel), generator=torch.Generator().manual_seed(0)) < 0.8
+    on_person = mask[0, pixel[:, 1], pixel[:, 0]]
+    fits[on_person] &= torch.rand(int(on_person.sum()), generator=torch.Generator().manual_seed(1)) < fitting
+    stage = Stage(ObjectsConfig())
+    stage.witnesses = Witnesses(pixel, fits)
+    (judged,) = stage(0.0, person, depth, HERE).objects
+    assert judged.verdict is verdict
+
+
 @pytest.mark.parametrize("label", [PERSON, DOG])
 @pytest.mark.parametrize(("told", "verdict"), [("true", Verdict.STATIC), ("false", Verdict.UNKNOWN)])
 def test_what_stood_there_already_is_static_at_first_sight(label: int, told: str, verdict: Verdict) -> None:
@@ -624,7 +647,7 @@ class Literal:
         clouds = ObjectClouds(centroids[:, None] + ball, torch.ones(count, 64, dtype=torch.bool), centroids, masks)
         instances = Instances(masks, torch.full((count,), CHAIR), torch.ones(count), torch.zeros(count, 4))
         view = DepthView(self._frame / 30, torch.full((1, CAMERA.height, CAMERA.width), WALL), invert(T_wc))
-        scene = self._judge(instances, clouds, view, self._watch(view))
+        scene = self._judge(instances, clouds, view, self._watch(view), NO_WITNESSES)
         self._watch.remember(view)
         return {judged.id: judged for judged in scene.objects}
 

@@ -165,6 +165,10 @@ class MaskConfig(Section):
 
     confirm_still: float = Field(1.0, ge=0)
     """A person is taken for moving until seen still for so long, seconds (the paper sets persons aside till judged)."""
+    fit_share: float = Field(0.5, ge=0, le=1)
+    """Unless of its features, compared with the rest of the image, at least this share fits the camera's motion."""
+    fit_least: int = Field(10, gt=0)
+    """Fewer features vouch for nobody: some lie on the rim of whoever hides the rest."""
     hold_dynamic: float = Field(1.0, ge=0)
     """An object judged dynamic or deforming stays so for this long after the last evidence, seconds: gaits pause."""
     confirm_moving: int = Field(2, gt=0)

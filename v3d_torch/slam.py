@@ -20,6 +20,7 @@ from v3d_torch.objects.background import BackgroundWatch
 from v3d_torch.objects.dynamics import ObjectDynamics, Scene
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
+from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.tracker import MapTracker
@@ -85,7 +86,7 @@ class V3DSLAM:
         with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
-            scene = self.judge(instances, clouds, view, arrivals)
+            scene = self.judge(instances, clouds, view, arrivals, self._witnesses(motion, features))
             keep = features.on(scene.static)
             static = features[keep]
         with self.clock("tracking"):  # III-E: the pose in the local map
@@ -111,6 +112,13 @@ class V3DSLAM:
         if self._last is None:
             return None
         return self.motion(self._last.features, features, elapsed=stamp - self._last.stamp)
+
+    def _witnesses(self, motion: Motion | None, features: Features) -> Witnesses:
+        """Which features fit the motion since the last frame; none where nobody knows it."""
+        fits = torch.zeros(len(features), dtype=torch.bool)
+        if motion is not None:
+            fits[motion.pairs[:, 1]] = True
+        return Witnesses(features.pixel, fits)
 
     def _carry(self, motion: Motion | None, count: int) -> Tensor:
         """Ids of the landmarks that the motion's matches carry over from the last frame, -1 for none, (count,)."""

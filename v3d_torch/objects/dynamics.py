@@ -19,6 +19,7 @@ from v3d_torch.objects.silhouette import silhouette
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
+from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.segmentation.coco import LIVING, PERSON
 from v3d_torch.types import Instances
 
@@ -86,7 +87,9 @@ class ObjectDynamics:
         self._last_stamp = -torch.inf
         self.tracker = InstanceTracker(config.identity, camera, config.clouds.voxel_size)
 
-    def __call__(self, instances: Instances, clouds: ObjectClouds, view: DepthView, arrivals: Arrivals) -> Scene:
+    def __call__(
+        self, instances: Instances, clouds: ObjectClouds, view: DepthView, arrivals: Arrivals, witnesses: Witnesses
+    ) -> Scene:
         """Judge the objects of a frame.
 
         Args:
@@ -94,6 +97,7 @@ class ObjectDynamics:
             clouds: of the instances, camera frame.
             view: its depth, with the pose that the motion from the frame before gives it.
             arrivals: what came since earlier frames, see `BackgroundWatch`.
+            witnesses: features, and which of them fit the camera's motion.
         """
         stamp = view.stamp
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
@@ -102,7 +106,8 @@ class ObjectDynamics:
         votes = self._vote(seen, came, view)
         chamfer = self._deform(seen, came, view)
         self._last_stamp = stamp
-        verdicts = {track: self._judge(track, came[track], stamp) for track in tracks}
+        fits = self._fit(tracks, witnesses)
+        verdicts = {track: self._judge(track, came[track], stamp, fits[track]) for track in tracks}
         objects = [
             Judged(
                 id=track.id,
@@ -120,6 +125,14 @@ class ObjectDynamics:
         people = [track for track in tracks if track.label == PERSON]
         static = self._clear_of(moving, view)
         return Scene(objects, static, static & self._clear_of(people, view))
+
+    def _fit(self, tracks: list[Track], witnesses: Witnesses) -> dict[Track, bool]:
+        """Whether the features on each object fit the camera's motion."""
+        if not tracks:
+            return {}
+        config = self._config.mask
+        vouched = witnesses.vouch_for(torch.stack([track.own for track in tracks]), config.fit_share, config.fit_least)
+        return dict(zip(tracks, vouched.tolist(), strict=True))
 
     def _vote(self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView) -> dict[Track, int]:
         """Votes of each object, the most over all baselines; marks those that are voted dynamic."""
@@ -176,7 +189,7 @@ class ObjectDynamics:
             return True
         return vacated_share(then.cloud, view, self._camera, config) >= share
 
-    def _judge(self, track: Track, came: Tensor, stamp: float) -> Verdict:
+    def _judge(self, track: Track, came: Tensor, stamp: float, fits: bool) -> Verdict:
         config = self._config.mask
         if track.last_dynamic == stamp:
             return Verdict.DYNAMIC
@@ -188,7 +201,8 @@ class ObjectDynamics:
             return Verdict.DYNAMIC
         if stamp - track.last_deforming <= config.hold_dynamic:
             return Verdict.DEFORMING
-        if not still and track.label in LIVING and stamp - track.first_seen < config.confirm_still:
+        doubted = track.label in LIVING and stamp - track.first_seen < config.confirm_still
+        if doubted and not still and not fits:
             return Verdict.UNKNOWN
         return Verdict.STATIC
 
