@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scenes import NO_WITNESSES
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -116,9 +117,6 @@ def handheld(t: float) -> Tensor:
     return se3_exp(
         torch.tensor([0.4 * t - 0.2, 0.05 * math.sin(6 * t), 0.15 * t, 0.03, 0.15 - 0.2 * t, 0.02 * t]).double()
     )
-
-
-NO_WITNESSES = Witnesses(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
 
 
 class Stage:

@@ -87,7 +87,8 @@ class IdentityConfig(Section):
     """Standard deviation of the change of velocity in a second, m/s^2: who walks can stop or turn within one."""
     least_overlap: float = Field(0.4, ge=0, le=1)
     """An instance of another class continues an object only where their masks overlap by this: a class may flicker
-    between frames, but a cup does not turn into the table under it."""
+    between frames, but a cup does not turn into the table under it. At 0.5 ids of people change
+    more often on each of the composed sequences with a moving camera."""
     max_gap: float = Field(0.5, ge=0)
     """An object that is not seen is predicted for so long, seconds: about a step of a person who walks. 0 for the
     ablation."""

@@ -69,15 +69,16 @@ class V3DSLAM:
         Returns:
             What the object stage says of the frame.
         """
+        predicted = self.poses.predict(frame.stamp)
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(replace(frame, T_cw=self.poses.predict(frame.stamp)))
+            instances = self.segment(replace(frame, T_cw=predicted))
         with self.clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with self.clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             motion = self._move(frame.stamp, features)
-            T_cw = self.poses.predict(frame.stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
+            T_cw = predicted if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             view = self.watch.look(frame.stamp, depth, T_cw)
             arrivals = self.watch(view, trusted=motion is not None)

@@ -123,8 +123,11 @@ class ObjectDynamics:
         ]
         moving = [track for track, verdict in verdicts.items() if not self._may_be_tracked(verdict)]
         people = [track for track in tracks if track.label == PERSON]
-        static = self._clear_of(moving, view)
-        return Scene(objects, static, static & self._clear_of(people, view))
+        # Who moves is mostly a person: each outline is drawn once and serves both.
+        outlines = {track: self._outline(track, view) for track in dict.fromkeys([*moving, *people])}
+        size = view.depth.shape[-2:]
+        static = self._clear_of([outlines[track] for track in moving], size)
+        return Scene(objects, static, static & self._clear_of([outlines[track] for track in people], size))
 
     def _fit(self, tracks: list[Track], witnesses: Witnesses) -> dict[Track, bool]:
         """Whether the features on each object fit the camera's motion."""
@@ -210,16 +213,18 @@ class ObjectDynamics:
         deforming = verdict is Verdict.DEFORMING and self._config.chamfer.include_deforming
         return deforming or verdict is Verdict.STATIC
 
-    def _clear_of(self, tracks: list[Track], view: DepthView) -> Tensor:
+    def _clear_of(self, outlines: list[Tensor], size: torch.Size) -> Tensor:
         """Pixels outside of the given objects, bool, shape (H, W)."""
-        covered = torch.zeros(view.depth.shape[-2:], dtype=torch.bool)
-        for track in tracks:
-            covered |= track.mask if track.missed else self._outline(track, view)
+        covered = torch.zeros(size, dtype=torch.bool)
+        for outline in outlines:
+            covered |= outline
         return ~_grown(covered, self._config.mask.seam)
 
     def _outline(self, track: Track, view: DepthView) -> Tensor:
         """Pixels of an object, and of its rim: those whose depth is its own, or missing; bool, shape (H, W)."""
         config = self._config.mask
+        if track.missed:  # predicted by its depth as it is
+            return track.mask
         if not track.newest.located:  # too few points to tell which depths are its own
             return _grown(track.mask, config.margin)
         cloud = track.newest.cloud.to(torch.float64) @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
