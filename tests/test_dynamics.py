@@ -515,7 +515,7 @@ def test_the_margin_bounds_how_far_his_own_depth_is_followed() -> None:
         walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)),
         seconds=0.1,
         grown=-6,
-        overrides=("objects.mask.margin=2", "objects.mask.seam=0"),
+        overrides=("objects.mask.margin=2", "objects.mask.reach=0", "objects.mask.seam=0"),
     )[-1]
     own, away = frame.owner == 2, away_from(frame[3].mask)
     assert frame.scene.static[own & (away >= 3)].all()

@@ -182,6 +182,14 @@ class MaskConfig(Section):
     margin: int = Field(8, ge=0)
     """Pixels by which it grows where the depth is the object's own, or missing: a network mask at a quarter of the
     resolution errs by about two of its pixels."""
+    reach: int = Field(32, ge=0)
+    """Pixels by which it grows over surface that goes on without an edge: a hand at 3 m. The more it may, the more
+    of a table goes with whoever touches it."""
+    edge: float = Field(0.04, gt=0)
+    """Depth that differs by more than this share of it from one pixel to the fourth next is an edge: a surface seen
+    at 80 degrees differs by 0.03."""
+    least_part: float = Field(0.4, ge=0, le=1)
+    """It does not grow over a surface of which it would be a smaller part than this: the floor, a table."""
     tolerance: float = Field(0.05, gt=0)
     """Depth within this of the points around it is the object's own, metres; its error, with z^2, comes on top."""
     tolerance_growth: float = Field(0.01, ge=0)

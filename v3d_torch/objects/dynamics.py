@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from v3d_torch.lie import invert
 from v3d_torch.objects.background import Arrivals, DepthView, vacated_share
 from v3d_torch.objects.intra_motion import intra_object_motion
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.outlines import Outliner, grown
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
@@ -124,7 +123,8 @@ class ObjectDynamics:
         moving = [track for track, verdict in verdicts.items() if not self._may_be_tracked(verdict)]
         people = [track for track in tracks if track.label == PERSON]
         # Who moves is mostly a person: each outline is drawn once and serves both.
-        outlines = {track: self._outline(track, view) for track in dict.fromkeys([*moving, *people])}
+        draw = Outliner(view, arrivals, self._config.mask, self._camera, self._config.clouds.voxel_size)
+        outlines = {track: draw(track) for track in dict.fromkeys([*moving, *people])}
         size = view.depth.shape[-2:]
         static = self._clear_of([outlines[track] for track in moving], size)
         return Scene(objects, static, static & self._clear_of([outlines[track] for track in people], size))
@@ -218,27 +218,7 @@ class ObjectDynamics:
         covered = torch.zeros(size, dtype=torch.bool)
         for outline in outlines:
             covered |= outline
-        return ~_grown(covered, self._config.mask.seam)
-
-    def _outline(self, track: Track, view: DepthView) -> Tensor:
-        """Pixels of an object, and of its rim: those whose depth is its own, or missing; bool, shape (H, W)."""
-        config = self._config.mask
-        if track.missed:  # predicted by its depth as it is
-            return track.mask
-        if not track.newest.located:  # too few points to tell which depths are its own
-            return _grown(track.mask, config.margin)
-        cloud = track.newest.cloud.to(torch.float64) @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
-        tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
-        spacing = self._config.clouds.voxel_size
-        _, explained = silhouette(cloud, view.depth, self._camera, spacing, config.margin, tolerance)
-        unmeasured = view.depth[0] <= 0
-        return track.own | (_grown(track.mask, config.margin) & (explained | unmeasured))
-
-
-def _grown(mask: Tensor, pixels: int) -> Tensor:
-    """A mask with all that is no farther from it, bool, shape (H, W)."""
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
-    return torch.from_numpy(cv2.dilate(mask.to(torch.uint8).numpy(), around) > 0)
+        return ~grown(covered, self._config.mask.seam)
 
 
 def elect(then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig) -> tuple[Tensor, Tensor]:
