@@ -246,6 +246,41 @@ class MotionConfig(Section):
     """Nor turns it faster, rad/s: a full turn in a second."""
 
 
+class DenseConfig(Section):
+    """Camera motion from all pixels, where features fail."""
+
+    halvings: tuple[int, ...] = (4, 2, 1)
+    """How often the image is halved on each level, coarse to fine. A turn of 60 pixels from frame to frame is 4 on the
+    coarsest. Full resolution takes half as long again, gains 0.1 mm on the demo and nothing on real images."""
+    points: int = Field(5000, gt=0)
+    """About so many pixels of a level take part, one of each cell: bounds the time. On the demo, twice as many gain
+    0.03 mm."""
+    iterations: int = Field(10, gt=0)
+    """Most Levenberg-Marquardt steps on a level."""
+    max_depth: float = Field(8.0, gt=0)
+    """Depth beyond is taken for none, metres, as for features."""
+    edge: float = Field(0.05, gt=0)
+    """Neighbours whose depth differs by more than this share lie on two surfaces, as in the depth's re-estimation."""
+    occlusion: float = Field(0.1, gt=0)
+    """Where inverse depth differs by more than this share, something else is seen: it tells nothing of the motion."""
+    freedom: float = Field(5.0, gt=0)
+    """Degrees of freedom of the t-distribution (Kerl et al., ICRA 2013, who found it from residuals)."""
+    inverse_depth_sigma: float = Field(0.003, gt=0)
+    """Least standard deviation of inverse depth, 1/m: twice the sensor's (Khoshelham and Elberink, Sensors 2012)."""
+    coarse_inverse_depth_sigma: float = Field(0.02, gt=0)
+    """The same above the finest level, so that brightness leads there: depth is taken at another time than colour, and
+    in a fast turn tells of another motion, which is an optimum of its own."""
+    min_overlap: float = Field(0.3, gt=0, le=1)
+    """Share of the reference's points that the current view must see."""
+    min_inlier_share: float = Field(0.75, gt=0, le=1)
+    """Share of those points, of the ones with depth, whose depth must agree."""
+    min_correlation: float = Field(0.9, gt=0, le=1)
+    """Least correlation of both views' brightness; unlike a residual it does not depend on light."""
+    min_observability: float = Field(1e-3, gt=0, le=1)
+    """Smallest over greatest eigenvalue of the information, translation measured in median depths: below, some motion
+    is not seen, as along a wall without texture. Of 693 pairs of neighbouring frames of TUM's fr1_rpy, 2 lie below."""
+
+
 class TrackingConfig(Section):
     """Frames against the local map."""
 
@@ -276,6 +311,9 @@ class MappingConfig(Section):
     """A frame that finds fewer landmarks than this share of its reference keyframe's becomes a keyframe."""
     min_tracked: int = Field(100, gt=0)
     """So does one that finds fewer landmarks than this."""
+    odometry_after: float = Field(0.5, ge=0)
+    """A camera that finds nothing of the map for so long, and knows its motion, maps on by that, seconds. Motions add
+    up their errors; most often the map is found again first."""
     restart_after: float = Field(1.0, gt=0)
     """A camera lost for so long maps on from where it is guessed to be, seconds; its poses are flagged as adrift."""
     max_landmark_depth: float = Field(4.0, gt=0)
@@ -324,6 +362,7 @@ class Config(Section):
     objects: ObjectsConfig = ObjectsConfig()
     features: FeaturesConfig = FeaturesConfig()
     motion: MotionConfig = MotionConfig()
+    dense: DenseConfig = DenseConfig()
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()
     loop: LoopConfig = LoopConfig()

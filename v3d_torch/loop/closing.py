@@ -69,8 +69,7 @@ class LoopCloser:
                 continue
             known = keyframe.landmarks[keyframe.landmarks >= 0]
             local = sparse_map.local(known, self._local_keyframes)
-            carried = torch.full((len(features),), -1, dtype=torch.int64)
-            carried[motion.pairs[:, 1]] = keyframe.landmarks[motion.pairs[:, 0]]
+            carried = motion.carry(keyframe.landmarks, len(features))
             tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, carried)
             if tracking is not None and tracking.count >= self._config.min_inliers:
                 return Place(keyframe, tracking)
