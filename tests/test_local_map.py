@@ -343,10 +343,15 @@ def test_keyframes_come_at_the_latest_after_the_gap() -> None:
     assert [index for index, keyframe in enumerate(made) if keyframe] == [0, 5, 10, 15]
 
 
-def test_odometry_is_mapped_at_once_so_that_the_map_goes_on() -> None:
-    take = Frames()
+def test_odometry_is_mapped_after_its_patience_so_that_the_map_goes_on() -> None:
+    take = Frames(odometry_after=0.3, max_gap=1000)
     assert take(0, Status.LOST)
-    assert take(0, Status.ODOMETRY)
+    for _ in range(2):  # a frame that finds the map starts the patience anew
+        assert [take(0, Status.ODOMETRY) for _ in range(8)] == [False] * 8
+        assert not take(300)
+    made = [take(0, Status.ODOMETRY) for _ in range(20)]
+    assert made.index(True) in (9, 10)  # 0.3 s at 30 frames a second
+    assert not take.mapper.map.keyframes[-1].adrift
 
 
 def test_no_map_starts_where_too_little_is_seen() -> None:
