@@ -98,13 +98,13 @@ def test_convention_landmarks_lie_where_their_keyframe_saw_them() -> None:
     torch.testing.assert_close(target.landmarks["reach"], sight.norm(dim=1) * 1.2 ** seen.octave.double())
 
 
-def test_new_landmarks_are_near_new_and_as_many_as_wanted() -> None:
-    target = sparse_map(min_tracked=10, landmarks_per_keyframe=60, max_landmark_depth=2.0)
+def test_new_landmarks_have_depth_are_new_and_as_many_as_wanted() -> None:
+    target = sparse_map(landmarks_per_keyframe=60)
     insert(target, [])
     first = target.insert(1, 0.0, EYE, features(200), torch.full((200,), -1))
     made = first.landmarks >= 0
     assert made.sum() == 60
-    assert (features(200).depth[made] <= 2.0).all()
+    assert (features(200).depth[made] > 0).all()
     known = torch.full((200,), -1)
     known[:25] = torch.arange(25)
     second = target.insert(2, 0.1, EYE, features(200), known)
@@ -114,7 +114,7 @@ def test_new_landmarks_are_near_new_and_as_many_as_wanted() -> None:
 
 
 def test_a_far_scene_is_mapped_too() -> None:
-    target = sparse_map(max_landmark_depth=4.0, min_tracked=50)
+    target = sparse_map()
     assert (target.insert(0, 0.0, EYE, features(120, depth=6.0), torch.full((120,), -1)).landmarks >= 0).all()
 
 
@@ -235,7 +235,7 @@ class Walk:
     def __init__(self, keyframes: int, error: float) -> None:
         # Twice the width of the image: new ones come into view as others leave it.
         self.points = CAMERA.lift(features(300, seed=1).uv * torch.tensor([2, 1]), 2 + numbers(300, seed=2))
-        self.map = sparse_map(max_landmark_depth=8)
+        self.map = sparse_map()
         o = torch.zeros(keyframes, dtype=torch.float64)
         steps = torch.arange(keyframes, dtype=torch.float64)
         self.T_cw = se3_exp(torch.stack([-0.1 * steps, o, o, o, -0.01 * steps, o], dim=1))

@@ -316,8 +316,6 @@ class MappingConfig(Section):
     up their errors; most often the map is found again first."""
     restart_after: float = Field(1.0, gt=0)
     """A camera lost for so long maps on from where it is guessed to be, seconds; its poses are flagged as adrift."""
-    max_landmark_depth: float = Field(4.0, gt=0)
-    """New landmarks lie nearer, metres: beyond, a single depth is worth little."""
     landmarks_per_keyframe: int = Field(1000, gt=0)
     """Landmarks that a keyframe sees at most, old and new (ORB-SLAM2's number of features)."""
     bundle_keyframes: int = Field(8, ge=0)

@@ -214,11 +214,12 @@ class SparseMap:
         self.landmarks["alive"][(elusive & (age > 0)) | lonely] = False
 
     def _fresh(self, features: Features, landmarks: Tensor) -> Tensor:
-        """Features that become landmarks: unmatched, with good depth, as many as the map wants, spread."""
-        near = (features.depth > 0) & (features.depth <= self._config.max_landmark_depth)
-        if int(near.sum()) < self._config.min_tracked:
-            near = features.depth > 0  # a far scene is better than none
-        fresh = torch.nonzero((landmarks < 0) & near)[:, 0]
+        """Features that become landmarks: unmatched, with depth, as many as the map wants, spread.
+
+        Far ones as well: their depth is worth little, and has its weight, but they tell how the camera turns. Where
+        people fill the view they are often all there is.
+        """
+        fresh = torch.nonzero((landmarks < 0) & (features.depth > 0))[:, 0]
         wanted = max(self._config.landmarks_per_keyframe - int((landmarks >= 0).sum()), 0)
         return fresh[spread(features.pixel[fresh], wanted, self._features.cell)]
 
