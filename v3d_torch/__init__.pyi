@@ -12,7 +12,7 @@ from .objects.intra_motion import Deformation, IntraObjectMotion, intra_object_m
 from .objects.tracker import InstanceTracker
 from .objects.voting import HoughVoting, Votes, hough_vote
 from .objects.voxel import VoxelPool, Voxels, voxel_pool
-from .slam import V3DSLAM
+from .slam import V3DSLAM, Tracked
 from .types import Instances, RGBDFrame
 
 __all__ = [
@@ -30,6 +30,7 @@ __all__ = [
     "LargestClusters",
     "PinholeCamera",
     "RGBDFrame",
+    "Tracked",
     "V3DError",
     "Votes",
     "VoxelPool",

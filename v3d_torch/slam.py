@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
+
+from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
+from v3d_torch.errors import ConfigError
 from v3d_torch.lie import invert, rigid
 from v3d_torch.localise import Localiser
 from v3d_torch.loop.closing import LoopCloser
@@ -22,22 +25,54 @@ from v3d_torch.odometry.motion import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, View
 from v3d_torch.odometry.orb import ORB
 from v3d_torch.odometry.tracker import MapTracker
+from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
 from v3d_torch.types import RGBDFrame, Segmenter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked(Scene):
+    """What is known of a frame when it has been taken in. Later corrections of its pose are in `V3DSLAM.poses`.
+
+    Attributes:
+        stamp: seconds.
+        T_wc: camera to world, float64, shape :math:`(4, 4)`; the world is the first frame's camera.
+        status: how the pose was found.
+    """
+
+    stamp: float
+    T_wc: Tensor
+    status: Status
 
 
 class V3DSLAM:
     """Tracks an RGB-D camera and maps what stands still.
 
+    Every stage is an attribute, and any callable of the same signature can take its place.
+
     Args:
-        camera: intrinsics.
-        segment: gives the instances of a frame.
+        camera: intrinsics; None takes those of the first frame.
+        segment: gives the instances of a frame; None takes what the configuration names.
         config: of all stages.
+
+    Raises:
+        WeightsError: the network's weights are not to be had.
     """
 
-    def __init__(self, camera: PinholeCamera, segment: Segmenter, config: Config | None = None) -> None:
-        self.config = config = config or Config()
-        self.segment = segment
+    def __init__(
+        self, camera: PinholeCamera | None = None, segment: Segmenter | None = None, config: Config | None = None
+    ) -> None:
+        self.config = config or Config()
+        self.segment = segment or make_segmenter(self.config.segmentation)
+        self.poses = PoseRecorder()
+        self.clock = StageClock()
+        self._last: View | None = None
+        self._ready = camera is not None
+        if camera is not None:
+            self._set_up(camera)
+
+    def _set_up(self, camera: PinholeCamera) -> None:
+        config = self.config
         self.smooth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge)
         self.detect = ORB(config.features, camera)
         self.lift = CloudLifter(config.objects.clouds, camera)
@@ -50,16 +85,18 @@ class V3DSLAM:
         self.mapper = Mapper(config, camera)
         self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
         self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
-        self.poses = PoseRecorder()
-        self.clock = StageClock()
-        self._last: View | None = None
 
-    def __call__(self, frame: RGBDFrame) -> Scene:
-        """Take in the next frame; its pose is then in ``poses``.
+    def __call__(self, frame: RGBDFrame) -> Tracked:
+        """Take in the next frame.
 
-        Returns:
-            What the object stage says of the frame.
+        Raises:
+            ConfigError: nobody said which camera took the first frame.
         """
+        if not self._ready:
+            if frame.camera is None:
+                raise ConfigError("the camera is not known: give it to V3DSLAM, or frames that carry it")
+            self._set_up(frame.camera)
+            self._ready = True
         predicted = self.poses.predict(frame.stamp)
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
             instances = self.segment(replace(frame, T_cw=predicted))
@@ -100,4 +137,5 @@ class V3DSLAM:
                 if T_new_old is not None:
                     self.judge.tracker.move_world(T_new_old)
                     self.watch.move_world(T_new_old)
-        return scene
+        status = self.poses.statuses[-1]
+        return Tracked(**vars(scene), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)

@@ -47,7 +47,7 @@ class StoredFrames(ABC):
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, there is none with index {index}")
         image, depth = self._read(index)
-        return RGBDFrame(index=index, stamp=float(self.stamps[index]), image=image, depth=depth)
+        return RGBDFrame(index=index, stamp=float(self.stamps[index]), image=image, depth=depth, camera=self.camera)
 
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:

@@ -44,14 +44,16 @@ class Outliner:
         """Pixels of an object, bool, shape :math:`(H, W)`."""
         config, depth = self._config, self._view.depth
         if not track.newest.located:  # too few points to tell which depths are its own
-            return grown(track.mask, config.margin)
+            return track.mask if track.missed else grown(track.mask, config.margin)
         T_cw = self._view.T_cw
         cloud = track.cloud_at(self._view.stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
         tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
-        _, explained = silhouette(cloud, depth, self._camera, self._spacing, config.margin, tolerance)
-        rim = track.mask if track.missed else grown(track.mask, config.margin) & (explained | (depth[0] <= 0))
         _, reached = silhouette(cloud, depth, self._camera, self._spacing, config.reach, tolerance)
-        return track.own | rim | (self._going_on(track, reached) & reached)
+        going_on = self._going_on(track, reached) & reached
+        if track.missed:  # a mask that is predicted by its depth is as it is
+            return track.mask | going_on
+        _, explained = silhouette(cloud, depth, self._camera, self._spacing, config.margin, tolerance)
+        return track.own | going_on | (grown(track.mask, config.margin) & (explained | (depth[0] <= 0)))
 
     def _going_on(self, track: Track, reached: Tensor) -> Tensor:
         """Where an object's pixels go on within reach, up to the next edge, bool, shape (H, W)."""
