@@ -281,7 +281,20 @@ def test_help_is_instant_and_names_every_option() -> None:
         [sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, env=environment(), check=True
     )
     assert time.monotonic() - start < 3
-    for option in ("seq", "data-root", "camera", "config", "set", "segmenter", "masks", "weights", "seed", "out"):
+    for option in (
+        "seq",
+        "data-root",
+        "camera",
+        "config",
+        "set",
+        "segmenter",
+        "masks",
+        "weights",
+        "seed",
+        "out",
+        "viz",
+        "rerun",
+    ):
         assert f"--{option}" in done.stdout
     probe = "import sys, v3d_torch.run; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603

@@ -118,7 +118,10 @@ class Pipeline:
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
                 self.run.failure = f"interrupted after {done} of {total} frames"
         self.run.seconds = time.perf_counter() - start
-        self._viewer.finish(self.slam)
+        try:
+            self._viewer.finish(self.slam)
+        except V3DError as error:
+            self.run.failure = self.run.failure or str(error)
         return self.run
 
     def _note(self, frame: RGBDFrame, scene: Scene) -> None:

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 from torch import Tensor
 
+from v3d_torch.viz.ballots import lines_of
 from v3d_torch.viz.figures import VERDICT_COLOURS, Overlay, draw_objects, known_verdict, save
 
 VOTE_COLOUR = "#ff1f1f"
@@ -48,10 +49,9 @@ def voting_figure(
     axes.axis("off")
     draw_objects(axes, image, list(objects.values()))
     drawn = [ballot for ballot in ballots if centres.keys() >= set(ballot)]
-    bold = {frozenset(ballot) for ballot in drawn if objects[ballot[1]][2] == "dynamic"}
-    thin = {frozenset(ballot) for ballot in drawn} - bold
+    bold, thin = lines_of(drawn, [number for number, (_, _, verdict) in objects.items() if verdict == "dynamic"])
     for pairs, linewidth, rim, alpha in ((thin, 0.7, 0.7, 0.5), (bold, 2.0, 3.4, 1.0)):
-        lines = [[tuple(centres[one].tolist()) for one in pair] for pair in sorted(map(sorted, pairs))]
+        lines = [[tuple(centres[one].tolist()) for one in pair] for pair in pairs]
         effects = [Stroke(linewidth=rim, foreground="white"), Normal()]
         style = {"colors": VOTE_COLOUR, "linewidths": linewidth, "alpha": alpha}
         axes.add_collection(LineCollection(lines, path_effects=effects, zorder=2.5, **style))
