@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import rerun as rr
 import torch
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
-from torch import Tensor
 
 from v3d_torch.objects.dynamics import Judged, Scene, Verdict
 from v3d_torch.segmentation.coco import class_name
@@ -31,7 +31,8 @@ def log_scene(stream: rr.RecordingStream, scene: Scene) -> None:
     """Log masks and names on the image, clouds, centroids and votes in the world, and curves by object."""
     _log_masks(stream, scene)
     clouds = torch.cat([torch.zeros(0, 3), *(judged.cloud for judged in scene.objects)])
-    classes = [CLASS_IDS[judged.verdict] for judged in scene.objects for _ in range(len(judged.cloud))]
+    sizes = [len(judged.cloud) for judged in scene.objects]
+    classes = np.repeat([CLASS_IDS[judged.verdict] for judged in scene.objects], sizes).astype(np.uint16)
     stream.log("world/objects", rr.Points3D(clouds.numpy(), class_ids=classes, show_labels=False))
     _log_votes(stream, scene)
     for judged in scene.objects:
@@ -58,17 +59,17 @@ def rgba(colour: str) -> tuple[int, ...]:
 
 
 def _log_masks(stream: rr.RecordingStream, scene: Scene) -> None:
-    classes = torch.zeros(scene.static.shape, dtype=torch.uint8)
-    in_view = [judged for judged in scene.objects if judged.mask.any()]
-    for judged in in_view:
-        classes[judged.mask] = CLASS_IDS[judged.verdict]
-    stream.log("world/camera/image/masks", rr.SegmentationImage(classes.numpy(), opacity=0.5))
-    corners = np.array([_bounds(judged.mask) for judged in in_view]).reshape(-1, 2, 2)
+    classes = np.zeros(scene.static.shape, dtype=np.uint8)
+    for judged in scene.objects:
+        classes[judged.mask.numpy()] = CLASS_IDS[judged.verdict]
+    stream.log("world/camera/image/masks", rr.SegmentationImage(classes, opacity=0.5))
+    around = [(judged, cv2.boundingRect(judged.mask.numpy().view(np.uint8))) for judged in scene.objects]
+    in_view = [(judged, sides) for judged, sides in around if sides[2] > 0]  # left, top, width, height
     boxes = rr.Boxes2D(
-        mins=corners[:, 0],
-        sizes=corners[:, 1] - corners[:, 0],
-        labels=[_name(judged) for judged in in_view],
-        class_ids=[CLASS_IDS[judged.verdict] for judged in in_view],
+        mins=[sides[:2] for _, sides in in_view],
+        sizes=[sides[2:] for _, sides in in_view],
+        labels=[_name(judged) for judged, _ in in_view],
+        class_ids=[CLASS_IDS[judged.verdict] for judged, _ in in_view],
     )
     stream.log("world/camera/image/objects", boxes)
 
@@ -96,9 +97,3 @@ def _lines(pairs: list[Pair], places: dict[int, NDArray[np.float64]], colour: st
 
 def _name(judged: Judged) -> str:
     return f"{class_name(judged.label)} {judged.id}"
-
-
-def _bounds(mask: Tensor) -> list[list[int]]:
-    """Left and top, right and bottom of a mask's pixels."""
-    (rows,), (columns,) = mask.any(dim=1).nonzero(as_tuple=True), mask.any(dim=0).nonzero(as_tuple=True)
-    return [[int(columns[0]), int(rows[0])], [int(columns[-1]) + 1, int(rows[-1]) + 1]]
