@@ -19,6 +19,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config, DenseMapConfig
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError, OutputError
+from v3d_torch.evaluation import evaluate
 from v3d_torch.files import one_process_makes, write_png, write_text, written_whole
 from v3d_torch.lie import invert, se3_exp
 from v3d_torch.mapping.dense import DenseMap
@@ -241,7 +242,7 @@ def test_every_frame_is_reported_and_every_object_noted() -> None:
     assert [row["frame"] for row in done.dynamics] == list(range(FRAMES))
     assert {row["class"] for row in done.dynamics} == {"person"}
     assert done.dynamics[-1]["z"] == pytest.approx(WALL, abs=0.02)
-    assert [shot.stamp for shot in done.snapshots] == sorted(shot.stamp for shot in done.snapshots)
+    assert (stamps := [shot.frame.stamp for shot in done.snapshots]) == sorted(stamps)
     assert len(done.snapshots) == 6
     assert set(flow.slam.clock.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
     assert sum(flow.slam.clock.seconds.values()) <= done.seconds
@@ -293,8 +294,9 @@ def test_masks_that_cannot_be_written_end_the_run_with_a_sentence(tmp_path: Path
 def test_all_files_of_the_contract_are_there(results: Path) -> None:
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
     assert names == {
-        *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "map.ply"),
-        *("figures/trajectory.png", "figures/masks.png"),
+        *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json"),
+        *("frames.parquet", "dynamics.parquet", "map.ply"),
+        *("figures/trajectory.png", "figures/masks.png", "figures/clusters.png"),  # one object alone has no vote
     }
 
 
@@ -330,6 +332,28 @@ def test_metrics_have_their_stable_keys(results: Path, run: Pipeline) -> None:
     assert sum(metrics["seconds_per_stage"].values()) <= metrics["seconds"]
 
 
+def test_frames_are_a_table_of_how_each_was_found_and_how_long_it_took(results: Path, run: Pipeline) -> None:
+    table = pq.read_table(results / "frames.parquet").to_pandas()
+    assert table["frame"].tolist() == list(range(FRAMES))
+    assert np.allclose(table["stamp"], run.sequence.stamps.numpy())
+    assert set(table["status"]) == {"tracked"}
+    assert table["frame"][table["keyframe"]].tolist() == [one.frame for one in run.slam.mapper.map.keyframes]
+    metrics = json.loads((results / "metrics.json").read_text())
+    for stage, total in metrics["seconds_per_stage"].items():
+        assert (table[f"seconds_{stage}"] >= 0).all()
+        assert table[f"seconds_{stage}"].sum() == pytest.approx(total, abs=2e-3)  # the end was looked for once more
+    assert (table["seconds_loop"] > 0).tolist() == table["keyframe"].tolist()
+
+
+def test_ground_truth_is_kept_beside_the_trajectory(results: Path, run: Pipeline) -> None:
+    written, truth = read_trajectory(results / "groundtruth.txt"), run.sequence.groundtruth
+    assert truth is not None
+    torch.testing.assert_close(written.T_wc, truth.T_wc, rtol=0, atol=1e-8)
+    again = evaluate(written, read_trajectory(results / "trajectory.txt"))
+    metrics = json.loads((results / "metrics.json").read_text())
+    assert again.ate.rmse == pytest.approx(metrics["ate"]["rmse"], abs=1e-7)
+
+
 def test_dynamics_are_a_table_that_pandas_reads(results: Path, run: Pipeline) -> None:
     table = pq.read_table(results / "dynamics.parquet").to_pandas()
     assert list(table.columns) == [
@@ -359,7 +383,7 @@ def test_the_map_is_the_wall_in_its_colours(results: Path) -> None:
 
 
 def test_figures_are_pictures(results: Path) -> None:
-    for name in ("trajectory.png", "masks.png"):
+    for name in ("trajectory.png", "masks.png", "clusters.png"):
         image = cv2.imread(str(results / "figures" / name))
         assert image is not None and min(image.shape[:2]) >= 200 and max(image.shape[:2]) <= 4000
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
@@ -369,11 +393,14 @@ def test_without_ground_truth_there_are_no_scores(run: Pipeline, tmp_path: Path)
     bare = Pipeline(Wall(), run.slam)
     bare.sequence.groundtruth = None  # type: ignore[misc]
     bare.run = replace(run.run)
+    for stale in ("groundtruth.txt", "figures/voting.png"):  # of another run into the same folder
+        write_text(tmp_path / stale, "")
     assert write_results(tmp_path, bare) is None
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert "rmse" not in (metrics.get("ate") or {})
     assert metrics["frames"] == FRAMES
     assert (tmp_path / "figures" / "trajectory.png").is_file()
+    assert not (tmp_path / "groundtruth.txt").exists() and not (tmp_path / "figures" / "voting.png").exists()
 
 
 def test_results_that_cannot_be_written_are_named(run: Pipeline, tmp_path: Path) -> None:

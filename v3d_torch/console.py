@@ -35,6 +35,7 @@ from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
+from v3d_torch.viz.viewer import NULL_VIEWER, Viewer, make_viewer
 
 _LOG = logging.getLogger("v3d_torch")
 
@@ -64,6 +65,8 @@ def run_sequence(
     weights: Path | None,
     out: Path | None,
     save_masks: bool,
+    viz: str | None,
+    rerun_file: Path | None,
 ) -> None:
     """Run one sequence with everything shown and written; see ``python -m v3d_torch.run --help``.
 
@@ -76,8 +79,9 @@ def run_sequence(
         bar = _Bar(progress, "sequence")
         sequence = open_source(name, data_root=data_root, camera=camera, options=options, progress=bar)
     segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
+    viewer = make_viewer(viz, rerun_file, sequence)
     folder = result_folder(out, sequence.name)
-    pipeline, evaluation = track(sequence, segment, config, folder, console, save_masks=save_masks)
+    pipeline, evaluation = track(sequence, segment, config, folder, console, save_masks=save_masks, viewer=viewer)
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
         console.print(table)
@@ -101,6 +105,7 @@ def track(
     console: Console,
     *,
     save_masks: bool = False,
+    viewer: Viewer = NULL_VIEWER,
 ) -> tuple[Pipeline, Evaluation | None]:
     """Run a sequence through a new system, show a bar, and write the log and all results.
 
@@ -111,6 +116,7 @@ def track(
         folder: for the results, there already.
         console: for the bar.
         save_masks: whether to write what is left out of tracking.
+        viewer: looks on.
 
     Returns:
         What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
@@ -120,7 +126,8 @@ def track(
     """
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), folder / "masks" if save_masks else None)
+    masks = folder / "masks" if save_masks else None
+    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), masks, viewer)
     with _log_to(folder / "run.log"):
         total = len(sequence) if isinstance(sequence, Sized) else None
         _LOG.info("%s: %s frames", sequence.name, "any number of" if total is None else total)

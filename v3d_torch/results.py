@@ -23,10 +23,9 @@ from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.segmentation.coco import class_name
 from v3d_torch.trajectory import write_trajectory
 from v3d_torch.types import Trajectory
-from v3d_torch.viz.figures import mask_strip, trajectory_figure
+from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
     import resource
@@ -71,15 +70,38 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(slam.mapper.map.T_cw)))
     evaluation = None
+    (folder / "groundtruth.txt").unlink(missing_ok=True)  # of another sequence that left its results here
     if sequence.groundtruth is not None:
+        write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
         with suppress(InputError):  # too few poses to score are still worth writing
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
-    with written_whole(folder / "dynamics.parquet") as path:
-        pq.write_table(pa.Table.from_pylist(pipeline.run.dynamics, schema=_DYNAMICS), path)
+    _write_table(folder / "frames.parquet", *_frames(pipeline))
+    _write_table(folder / "dynamics.parquet", pipeline.run.dynamics, _DYNAMICS)
     _write_ply(folder / "map.ply", *pipeline.dense.fuse())
-    _draw(folder / "figures", pipeline, trajectory)
+    draw_run(folder / "figures", pipeline, trajectory)
     return evaluation
+
+
+def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
+    """How each frame was found, whether the map kept it, and the seconds of each stage; 0 where one did not run."""
+    slam, rows = pipeline.slam, pipeline.run.frames
+    stages = list(slam.clock.seconds)
+    columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
+    kept = {keyframe.frame for keyframe in slam.mapper.map.keyframes}
+    table: list[dict[str, object]] = [
+        {
+            **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in kept},
+            **{f"seconds_{stage}": row.get(stage, 0.0) for stage in stages},
+        }
+        for row, status in zip(rows, slam.poses.statuses, strict=False)  # interrupted within a frame: one row less
+    ]
+    return table, pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
+
+
+def _write_table(path: Path, rows: list[dict[str, object]], schema: pa.Schema) -> None:
+    with written_whole(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
 
 
 def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, object]:
@@ -131,15 +153,3 @@ def _write_ply(path: Path, points: Tensor, colours: Tensor) -> None:
         vertices[name] = colours[:, column].numpy()
     with written_whole(path) as temporary:
         plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(temporary)
-
-
-def _draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
-    groundtruth = pipeline.sequence.groundtruth
-    trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", title=pipeline.sequence.name)
-    snapshots = pipeline.run.snapshots
-    if snapshots:
-        overlays = [
-            [(judged.mask, f"{class_name(judged.label)} {judged.id}", judged.verdict.value) for judged in shot.objects]
-            for shot in snapshots
-        ]
-        mask_strip([shot.image for shot in snapshots], overlays, folder / "masks.png")

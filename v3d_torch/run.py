@@ -44,6 +44,8 @@ def main(
     seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
+    viz: Annotated[str | None, typer.Option(help="Look on while it runs, with: rerun.")] = None,
+    rerun: Annotated[Path | None, typer.Option(help="File (.rrd) to record for rerun, to look at it later.")] = None,
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
@@ -66,6 +68,8 @@ def main(
             weights=weights,
             out=out,
             save_masks=save_masks,
+            viz=viz,
+            rerun_file=rerun,
         )
 
 
