@@ -23,7 +23,8 @@ from v3d_torch.datasets.demo.sequence import FRAMES, RATE, write_sequence
 from v3d_torch.trajectory import read_trajectory
 
 FILES = {
-    *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "map.ply", "run.log"),
+    *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "run.log"),
+    *("map.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png"),
 }
 """What every run leaves behind."""

@@ -14,8 +14,8 @@ from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
-from v3d_torch.mapping.dense import DenseMap
 from v3d_torch.mapping.recorder import Status
+from v3d_torch.mapping.views import StaticViews
 from v3d_torch.objects.dynamics import Judged, Scene
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
@@ -68,7 +68,7 @@ class Pipeline:
     def __init__(self, sequence: RGBDStream, slam: V3DSLAM, masks: Path | None = None) -> None:
         self.sequence = sequence
         self.slam = slam
-        self.dense = DenseMap(slam.config.dense_map, sequence.camera)
+        self.views = StaticViews(sequence.camera, slam.config.dense_map.stride)
         self.run = Run()
         self._masks = masks
         self._step = 1
@@ -116,7 +116,7 @@ class Pipeline:
             write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
         keyframes = self.slam.mapper.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.dense.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
+            self.views.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
         self._keep_for_figure(frame, scene)
 
     def _keep_for_figure(self, frame: RGBDFrame, scene: Scene) -> None:

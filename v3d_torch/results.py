@@ -9,24 +9,25 @@ from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-import plyfile
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from torch import Tensor
 
 from v3d_torch.config_file import dump_config
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
+from v3d_torch.mapping.dense import fuse_points
+from v3d_torch.mapping.mesh import fuse_mesh
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.ply import write_ply
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.trajectory import write_trajectory
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figures import mask_strip, trajectory_figure
+from v3d_torch.viz.frustums import camera_path
 
 if sys.platform != "win32":
     import resource
@@ -77,7 +78,7 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     with written_whole(folder / "dynamics.parquet") as path:
         pq.write_table(pa.Table.from_pylist(pipeline.run.dynamics, schema=_DYNAMICS), path)
-    _write_ply(folder / "map.ply", *pipeline.dense.fuse())
+    _write_maps(folder, pipeline, trajectory)
     _draw(folder / "figures", pipeline, trajectory)
     return evaluation
 
@@ -121,16 +122,17 @@ def _peak_memory_mb() -> float | None:
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def _write_ply(path: Path, points: Tensor, colours: Tensor) -> None:
-    vertices = np.empty(
-        len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    )
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = points[:, column].numpy()
-    for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, column].numpy()
-    with written_whole(path) as temporary:
-        plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(temporary)
+def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
+    slam, views = pipeline.slam, pipeline.views
+    cloud = fuse_points(views, slam.config)
+    write_ply(folder / "map.ply", cloud.points, cloud.colours, normals=cloud.normals)
+    if slam.config.dense_map.mesh.enabled:
+        mesh = fuse_mesh(views, slam.config.dense_map)
+        write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    frames = [keyframe.frame for keyframe in slam.mapper.map.keyframes]
+    statuses = [status.value for status in slam.poses.statuses]
+    path = camera_path(trajectory, statuses, invert(slam.mapper.map.T_cw), frames, pipeline.sequence.camera)
+    write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)
 
 
 def _draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:

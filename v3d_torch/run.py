@@ -44,6 +44,7 @@ def main(
     seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the room, too.")] = False,
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
@@ -54,6 +55,7 @@ def main(
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
+    overrides += ["dense_map.mesh.enabled=true"] if mesh else []
     with exit_on_error():
         run_sequence(
             seq,
