@@ -152,7 +152,9 @@ class SparseMap:
         )
 
     def covisibility(self, least: int) -> Tensor:
-        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and all consecutive ones.
+        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and consecutive ones.
+
+        Not those between which the camera was lost: what joins them is a guess.
 
         Returns:
             int64, shape :math:`(E, 2)`, sorted.
@@ -164,7 +166,8 @@ class SparseMap:
         shared = scipy.sparse.triu(seen @ seen.T, k=1).tocoo()
         enough = shared.data >= least
         pairs = torch.from_numpy(np.stack([shared.row[enough], shared.col[enough]], axis=1).astype(np.int64))
-        first = torch.arange(len(self.keyframes) - 1)
+        adrift = torch.tensor([keyframe.adrift for keyframe in self.keyframes], dtype=torch.bool)
+        first = torch.nonzero(adrift[:-1] == adrift[1:])[:, 0]
         return torch.cat([pairs, torch.stack([first, first + 1], dim=1)]).unique(dim=0)
 
     def move_keyframes(self, T_cw: Tensor) -> None:
