@@ -262,6 +262,8 @@ class TrackingConfig(Section):
 class MappingConfig(Section):
     """Keyframes and landmarks."""
 
+    enabled: bool = True
+    """Off: the camera is localised in a map that was loaded, and the map stays as it is."""
     max_gap: int = Field(20, gt=0)
     """At the latest after so many frames there is a new keyframe, frames."""
     min_tracked_ratio: float = Field(0.7, gt=0, le=1)

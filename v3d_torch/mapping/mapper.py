@@ -17,14 +17,15 @@ class Mapper:
     Args:
         config: of the whole system.
         camera: of the frames.
+        known: map to go on with; None to begin a new one.
     """
 
-    def __init__(self, config: Config, camera: PinholeCamera) -> None:
+    def __init__(self, config: Config, camera: PinholeCamera, known: SparseMap | None = None) -> None:
         self._config = config
         self._camera = camera
         self._most_tracked = 0  # landmarks found by a frame since the last keyframe
         self._lost_since: float | None = None
-        self.map = SparseMap(config.mapping, config.features, camera)
+        self.map = SparseMap(config.mapping, config.features, camera) if known is None else known
 
     def __call__(
         self, frame: RGBDFrame, static: Features, estimate: Estimate, reference: Keyframe | None
@@ -51,6 +52,8 @@ class Mapper:
 
     def _wants(self, frame: RGBDFrame, static: Features, estimate: Estimate) -> bool:
         config = self._config.mapping
+        if not config.enabled:
+            return False
         self._most_tracked = max(self._most_tracked, estimate.count)
         if estimate.status is Status.LOST:
             return self._may_start(frame.stamp, static)
@@ -61,7 +64,12 @@ class Mapper:
         return weak or frame.index - self.map.keyframes[-1].frame >= config.max_gap
 
     def _may_start(self, stamp: float, static: Features) -> bool:
-        """A camera without a map, or lost for long, starts where it is guessed to be, once it sees enough."""
+        """A camera without a map, or lost for long, starts where it is guessed to be, once it sees enough.
+
+        A map of an earlier run is gone on with from a place that is found in it, and from no other.
+        """
+        if self.map.keyframes and self.map.keyframes[-1].known:
+            return False
         if self._lost_since is None:
             self._lost_since = stamp
         patience = self._config.mapping.restart_after if self.map.keyframes else 0.0

@@ -53,6 +53,7 @@ class StaticViews:
         stride: every n-th pixel is kept, by row and by column.
 
     Attributes:
+        stride: of the views.
         camera: of the views, without distortion.
         rays: exact direction through every pixel at unit depth, float32, shape :math:`(h, w, 3)`.
     """
@@ -61,6 +62,7 @@ class StaticViews:
     """Metres: the unit of TUM's depth images, which divides the millimetre; 16 bits reach 13 m, beyond any use."""
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
+        self.stride = stride
         self.camera = PinholeCamera(
             fx=camera.fx / stride,
             fy=camera.fy / stride,
@@ -96,4 +98,8 @@ class StaticViews:
         units = (depth[0, self._v, self._u] / self.UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
         units = torch.where(keep, units, 0).to(torch.uint16)
-        self._views.append(StaticView(keyframe, units, image[:, self._v, self._u]))
+        self.append(StaticView(keyframe, units, image[:, self._v, self._u]))
+
+    def append(self, view: StaticView) -> None:
+        """Keep a view of this camera."""
+        self._views.append(view)
