@@ -13,7 +13,7 @@ from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
 from v3d_torch.lie import rigid
 from v3d_torch.loop.closing import LoopCloser
-from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.mapping.local_map import Keyframe, SparseMap
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
 from v3d_torch.objects.background import BackgroundWatch
@@ -44,9 +44,12 @@ class V3DSLAM:
         camera: intrinsics.
         segment: gives the instances of a frame.
         config: of all stages.
+        known: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
     """
 
-    def __init__(self, camera: PinholeCamera, segment: Segmenter, config: Config | None = None) -> None:
+    def __init__(
+        self, camera: PinholeCamera, segment: Segmenter, config: Config | None = None, known: SparseMap | None = None
+    ) -> None:
         self.config = config = config or Config()
         self.segment = segment
         self.smooth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge)
@@ -57,8 +60,10 @@ class V3DSLAM:
         self.propose = partial(unnamed_instances, camera=camera, min_area=config.objects.background.min_area)
         self.judge = ObjectDynamics(config.objects, camera)
         self.track = MapTracker(config.tracking, config.features, camera)
-        self.mapper = Mapper(config, camera)
+        self.mapper = Mapper(config, camera, known)
         self.loops = LoopCloser(config.loop, self.motion, self.track, config.tracking.local_keyframes)
+        for keyframe in self.mapper.map.keyframes:
+            self.loops.learn(keyframe)
         self.poses = PoseRecorder()
         self.clock = StageClock()
         self._last: View | None = None
@@ -71,7 +76,8 @@ class V3DSLAM:
         """
         predicted = self.poses.predict(frame.stamp)
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(replace(frame, T_cw=predicted))
+            placed = self.poses.located or not self.mapper.map.keyframes  # a known map does not tell where in it
+            instances = self.segment(replace(frame, T_cw=predicted if placed else None))
         with self.clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with self.clock("features"):  # III-A: ORB
@@ -95,7 +101,9 @@ class V3DSLAM:
             estimate = self._localise(static, T_cw, carried, moved=motion is not None)
         with self.clock("mapping"):  # keyframes, landmarks, local bundle adjustment
             reference = self._reference(estimate)
-            self.poses.record(frame.stamp, estimate, reference)
+            T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)
+            if T_new_old is not None:
+                self._move_world(T_new_old)
             keyframe = self.mapper(frame, static, estimate, reference)
             if estimate.status is not Status.LOST:
                 self.watch.remember(replace(view, T_cw=self.poses.T_cw))
@@ -105,9 +113,13 @@ class V3DSLAM:
             with self.clock("loop"):  # III-E: loop detection, pose graph
                 T_new_old = self.loops.close(keyframe, self.mapper.map)
                 if T_new_old is not None:
-                    self.judge.tracker.move_world(T_new_old)
-                    self.watch.move_world(T_new_old)
+                    self._move_world(T_new_old)
         return scene
+
+    def _move_world(self, T_new_old: Tensor) -> None:
+        """Carry what is remembered along when the world is corrected under it."""
+        self.judge.tracker.move_world(T_new_old)
+        self.watch.move_world(T_new_old)
 
     def _move(self, stamp: float, features: Features) -> Motion | None:
         if self._last is None:
