@@ -18,7 +18,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError, OutputError
-from v3d_torch.files import one_process_makes, write_png, write_text, written_whole
+from v3d_torch.files import one_process_makes, refuse_unwritable, write_png, write_text, written_whole
 from v3d_torch.lie import se3_exp
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Scene
@@ -115,6 +115,17 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No space left"), written_whole(tmp_path / "y.txt"):
         raise OSError(28, "No space left on device")
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_could_not_be_written_later_is_refused_now(tmp_path: Path) -> None:
+    refuse_unwritable(tmp_path / "new" / "room.map")
+    assert (tmp_path / "new").is_dir() and not any((tmp_path / "new").iterdir())
+    (tmp_path / "file").write_text("old")
+    refuse_unwritable(tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "old"
+    for path in (tmp_path, tmp_path / "file" / "room.map"):
+        with pytest.raises(OutputError, match="cannot be written"):
+            refuse_unwritable(path)
 
 
 def test_convention_colours_of_a_png_are_red_green_blue(tmp_path: Path) -> None:

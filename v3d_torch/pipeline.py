@@ -61,14 +61,17 @@ class Pipeline:
         sequence: frames to take in, stored or as they come.
         slam: the system, new.
         masks: folder for an image per frame of what was left out of tracking; None for none.
+        views: of the keyframes of a known map; None for none.
     """
 
     _SNAPSHOTS = 6
 
-    def __init__(self, sequence: RGBDStream, slam: V3DSLAM, masks: Path | None = None) -> None:
+    def __init__(
+        self, sequence: RGBDStream, slam: V3DSLAM, masks: Path | None = None, views: StaticViews | None = None
+    ) -> None:
         self.sequence = sequence
         self.slam = slam
-        self.views = StaticViews(sequence.camera, slam.config.dense_map.stride)
+        self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.run = Run()
         self._masks = masks
         self._step = 1

@@ -68,9 +68,9 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     write_text(folder / "config.yaml", dump_config(slam.config))
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)
-    keyframes = slam.mapper.map.keyframes
-    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(slam.mapper.map.T_cw)))
+    own = torch.tensor([not keyframe.known for keyframe in slam.mapper.map.keyframes], dtype=torch.bool)
+    stamps = torch.tensor([keyframe.stamp for keyframe in slam.mapper.map.keyframes], dtype=torch.float64)
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps[own], invert(slam.mapper.map.T_cw[own])))
     evaluation = None
     if sequence.groundtruth is not None:
         with suppress(InputError):  # too few poses to score are still worth writing
@@ -97,7 +97,8 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],
-        "keyframes": len(slam.mapper.map.keyframes),
+        "keyframes": sum(not keyframe.known for keyframe in slam.mapper.map.keyframes),
+        "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.keyframes),
         "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
         "loops": slam.loops.count,
         "failure": run.failure,

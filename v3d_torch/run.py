@@ -45,6 +45,13 @@ def main(
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the room, too.")] = False,
+    map_out: Annotated[
+        Path | None, typer.Option("--save-map", metavar="FILE", help="Write the map, for later runs.")
+    ] = None,
+    map_in: Annotated[
+        Path | None, typer.Option("--load-map", metavar="FILE", help="Find the camera in a map, and go on with it.")
+    ] = None,
+    localise: Annotated[bool, typer.Option("--localise", help="With --load-map: leave the map as it is.")] = False,
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
@@ -56,6 +63,7 @@ def main(
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
+    overrides += ["mapping.enabled=false"] if localise else []
     with exit_on_error():
         run_sequence(
             seq,
@@ -68,6 +76,8 @@ def main(
             weights=weights,
             out=out,
             save_masks=save_masks,
+            map_in=map_in,
+            map_out=map_out,
         )
 
 
