@@ -82,7 +82,7 @@ def what_is_wrong(columns: Columns, sparse_map: SparseMap, views: StaticViews) -
     lengths: dict[str, int] = {}
     for name, empty in to_columns(sparse_map, views).items():
         column, group = columns[name], name.split("/")[0]
-        if column.dtype != empty.dtype or column.shape[1:] != empty.shape[1:]:
+        if column.dtype != empty.dtype or (len(column) and column.shape[1:] != empty.shape[1:]):
             return f"{name} is {column.dtype} of shape {tuple(column.shape)}"
         if lengths.setdefault(group, len(column)) != len(column):
             return f"{name} has {len(column)} rows of {lengths[group]}"

@@ -28,7 +28,17 @@ from v3d_torch.mapping.views import StaticViews
 
 _FORMAT, _VERSION = "v3d_torch map", 1
 
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, TypeError, RuntimeError, MemoryError)
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+    MemoryError,
+)
 """What zip archives, arrays and texts in them raise when bytes are wrong or missing."""
 
 
@@ -45,17 +55,18 @@ class StoredMap:
     views: StaticViews
 
 
-def save_map(path: Path, sparse_map: SparseMap, views: StaticViews) -> None:
+def save_map(path: Path, sparse_map: SparseMap, views: StaticViews | None = None) -> None:
     """Write a map; the same map makes the same bytes.
 
     Args:
         path: of the file, whatever its suffix.
         sparse_map: keyframes and landmarks.
-        views: what keyframes saw standing still; may be none, then the map cannot be drawn later.
+        views: what keyframes saw standing still; without them the map cannot be drawn later.
 
     Raises:
         OutputError: when the file cannot be written.
     """
+    views = StaticViews(sparse_map.camera, stride=1) if views is None else views
     about = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -63,7 +74,7 @@ def save_map(path: Path, sparse_map: SparseMap, views: StaticViews) -> None:
         "settings": {
             "features.scale": sparse_map.features.scale,
             "features.levels": sparse_map.features.levels,
-            "dense_map.stride": views.stride,
+            **({"dense_map.stride": views.stride} if len(views) else {}),
         },
     }
     arrays: dict[str, Any] = {name: column.numpy() for name, column in to_columns(sparse_map, views).items()}
