@@ -54,9 +54,7 @@ def fuse_mesh(views: StaticViews, config: DenseMapConfig) -> Mesh:
     # Neighbouring tiles share the voxels of the face between them: there they have the same vertices, bit for bit.
     vertices, same = torch.cat(found_vertices).unique(dim=0, return_inverse=True)
     faces = same[torch.cat(found_faces)]
-    faces = faces[
-        (faces != faces.roll(1, dims=1)).all(dim=1)
-    ]  # a surface that meets a voxel makes triangles of no area
+    faces = faces[(faces != faces.roll(1, dims=1)).all(dim=1)]  # some have no area, where the surface meets a voxel
     vertices = vertices * config.mesh.voxel_size
     normals = _normals(vertices, faces)
     return Mesh(vertices.to(torch.float32), faces, normals.to(torch.float32), _colours(vertices, views, config))
