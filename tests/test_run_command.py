@@ -24,7 +24,8 @@ from v3d_torch.trajectory import read_trajectory
 
 FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),
-    *("frames.parquet", "dynamics.parquet", "map.ply", "figures/trajectory.png", "figures/masks.png"),
+    *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+    *("figures/trajectory.png", "figures/masks.png"),
 }
 """What every run leaves behind where there is ground truth."""
 OBJECTS = {"figures/voting.png", "figures/clusters.png"}

@@ -24,10 +24,12 @@ from rich.table import Table
 from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
-from v3d_torch.errors import InputError, OutputError, V3DError
+from v3d_torch.errors import ConfigError, InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
+from v3d_torch.files import refuse_unwritable
 from v3d_torch.mapping.recorder import Status
+from v3d_torch.mapping.storage import StoredMap, load_map, save_map
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.results import write_results
@@ -67,6 +69,8 @@ def run_sequence(
     save_masks: bool,
     viz: str | None,
     rerun_file: Path | None,
+    map_in: Path | None,
+    map_out: Path | None,
 ) -> None:
     """Run one sequence with everything shown and written; see ``python -m v3d_torch.run --help``.
 
@@ -75,13 +79,22 @@ def run_sequence(
     """
     console = Console(soft_wrap=True)
     config = load_config(config_path, overrides)
+    if map_out is not None:
+        refuse_unwritable(map_out)
+    if map_in is None and not config.mapping.enabled:
+        raise ConfigError("mapping.enabled=false: there is no map to find the camera in; give one with --load-map")
     with _progress(console) as progress:
         bar = _Bar(progress, "sequence")
         sequence = open_source(name, data_root=data_root, camera=camera, options=options, progress=bar)
+    known = None if map_in is None else load_map(map_in, sequence.camera, config)
     segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
     viewer = make_viewer(viz, rerun_file, sequence)
     folder = result_folder(out, sequence.name)
-    pipeline, evaluation = track(sequence, segment, config, folder, console, save_masks=save_masks, viewer=viewer)
+    pipeline, evaluation = track(
+        sequence, segment, config, folder, console, save_masks=save_masks, viewer=viewer, known=known
+    )
+    if map_out is not None:
+        save_map(map_out, pipeline.slam.mapper.map, pipeline.views)
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
         console.print(table)
@@ -89,6 +102,8 @@ def run_sequence(
     if (failure := pipeline.run.failure) is not None:
         done = len(pipeline.slam.poses.statuses)
         raise InputError(f"{failure}; the results of the {done} frames before are in {folder}")
+    if known is not None and not pipeline.slam.poses.located:
+        raise InputError(f"{map_in}: no frame of {name} shows a place of this map; its results are in {folder}")
 
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
@@ -106,6 +121,7 @@ def track(
     *,
     save_masks: bool = False,
     viewer: Viewer = NULL_VIEWER,
+    known: StoredMap | None = None,
 ) -> tuple[Pipeline, Evaluation | None]:
     """Run a sequence through a new system, show a bar, and write the log and all results.
 
@@ -117,6 +133,7 @@ def track(
         console: for the bar.
         save_masks: whether to write what is left out of tracking.
         viewer: looks on.
+        known: map to find the camera in.
 
     Returns:
         What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
@@ -126,8 +143,9 @@ def track(
     """
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
+    slam = V3DSLAM(sequence.camera, segment, config, None if known is None else known.map)
     masks = folder / "masks" if save_masks else None
-    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), masks, viewer)
+    pipeline = Pipeline(sequence, slam, masks, viewer, None if known is None else known.views)
     with _log_to(folder / "run.log"):
         total = len(sequence) if isinstance(sequence, Sized) else None
         _LOG.info("%s: %s frames", sequence.name, "any number of" if total is None else total)
@@ -241,7 +259,10 @@ def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
     table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frames}")
     table.add_row("found", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
-    table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes)}, {slam.loops.count}")
+    earlier = sum(keyframe.known for keyframe in slam.mapper.map.keyframes)
+    table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes) - earlier}, {slam.loops.count}")
+    if earlier:
+        table.add_row("known map", f"{earlier} keyframes")
     table.add_row("objects judged", ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none")
     table.add_row("frames a second", f"{len(slam.poses.statuses) / run.seconds:.1f}" if run.seconds else "-")
     if evaluation is not None:

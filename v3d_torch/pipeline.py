@@ -14,8 +14,8 @@ from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
-from v3d_torch.mapping.dense import DenseMap
 from v3d_torch.mapping.recorder import Status
+from v3d_torch.mapping.views import StaticViews
 from v3d_torch.objects.dynamics import Judged, Scene, Verdict
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
@@ -67,16 +67,22 @@ class Pipeline:
         slam: the system, new.
         masks: folder for an image per frame of what was left out of tracking; None for none.
         viewer: looks on.
+        views: of the keyframes of a known map; None for none.
     """
 
     _SNAPSHOTS = 6
 
     def __init__(
-        self, sequence: RGBDStream, slam: V3DSLAM, masks: Path | None = None, viewer: Viewer = NULL_VIEWER
+        self,
+        sequence: RGBDStream,
+        slam: V3DSLAM,
+        masks: Path | None = None,
+        viewer: Viewer = NULL_VIEWER,
+        views: StaticViews | None = None,
     ) -> None:
         self.sequence = sequence
         self.slam = slam
-        self.dense = DenseMap(slam.config.dense_map, sequence.camera)
+        self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.run = Run()
         self._masks = masks
         self._viewer = viewer
@@ -132,7 +138,7 @@ class Pipeline:
             write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
         keyframes = self.slam.mapper.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.dense.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
+            self.views.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
         self._keep_for_figures(Snapshot(frame, self.slam.poses.T_cw, scene))
 
     def _keep_for_figures(self, shot: Snapshot) -> None:

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 import sys
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-import plyfile
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from torch import Tensor
 
 from v3d_torch.config_file import dump_config
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
+from v3d_torch.mapping.dense import fuse_points
+from v3d_torch.mapping.mesh import fuse_mesh
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.ply import write_ply
 from v3d_torch.trajectory import write_trajectory
 from v3d_torch.types import Trajectory
+from v3d_torch.viz.frustums import camera_path
 from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
@@ -50,7 +52,7 @@ _DYNAMICS = pa.schema(
 
 
 def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
-    """Write everything that a run leaves behind.
+    """Write everything that a run leaves behind, ``metrics.json`` last: where it is, all the rest is.
 
     Args:
         folder: of this run; made when it is not there.
@@ -66,20 +68,20 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     write_text(folder / "config.yaml", dump_config(slam.config))
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)
-    keyframes = slam.mapper.map.keyframes
-    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(slam.mapper.map.T_cw)))
+    own = torch.tensor([not keyframe.known for keyframe in slam.mapper.map.keyframes], dtype=torch.bool)
+    stamps = torch.tensor([keyframe.stamp for keyframe in slam.mapper.map.keyframes], dtype=torch.float64)
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps[own], invert(slam.mapper.map.T_cw[own])))
     evaluation = None
     (folder / "groundtruth.txt").unlink(missing_ok=True)  # of another sequence that left its results here
     if sequence.groundtruth is not None:
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
         with suppress(InputError):  # too few poses to score are still worth writing
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
-    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     _write_table(folder / "frames.parquet", *_frames(pipeline))
     _write_table(folder / "dynamics.parquet", pipeline.run.dynamics, _DYNAMICS)
-    _write_ply(folder / "map.ply", *pipeline.dense.fuse())
+    _write_maps(folder, pipeline, trajectory)
     draw_run(folder / "figures", pipeline, trajectory)
+    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     return evaluation
 
 
@@ -118,7 +120,8 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],
-        "keyframes": len(slam.mapper.map.keyframes),
+        "keyframes": sum(not keyframe.known for keyframe in slam.mapper.map.keyframes),
+        "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.keyframes),
         "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
         "loops": slam.loops.count,
         "failure": run.failure,
@@ -139,17 +142,22 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
 def _peak_memory_mb() -> float | None:
     if sys.platform == "win32":
         return None
+    if (status := Path("/proc/self/status")).is_file():  # Linux: there getrusage counts the parent process in
+        found = re.search(r"^VmHWM:\s*(\d+) kB$", status.read_text(encoding="utf-8"), re.MULTILINE)
+        if found is not None:
+            return int(found[1]) / (1 << 10)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def _write_ply(path: Path, points: Tensor, colours: Tensor) -> None:
-    vertices = np.empty(
-        len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    )
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = points[:, column].numpy()
-    for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, column].numpy()
-    with written_whole(path) as temporary:
-        plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(temporary)
+def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
+    slam, views = pipeline.slam, pipeline.views
+    cloud = fuse_points(views, slam.config)
+    write_ply(folder / "map.ply", cloud.points, cloud.colours, normals=cloud.normals)
+    if slam.config.dense_map.mesh.enabled:
+        mesh = fuse_mesh(views, slam.config.dense_map)
+        write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    frames = [keyframe.frame for keyframe in slam.mapper.map.keyframes]
+    statuses = [status.value for status in slam.poses.statuses]
+    path = camera_path(trajectory, statuses, invert(slam.mapper.map.T_cw), frames, pipeline.sequence.camera)
+    write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -46,6 +46,14 @@ def main(
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
     viz: Annotated[str | None, typer.Option(help="Look on while it runs, with: rerun.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="File (.rrd) to record for rerun, to look at it later.")] = None,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the room, too.")] = False,
+    map_out: Annotated[
+        Path | None, typer.Option("--save-map", metavar="FILE", help="Write the map, for later runs.")
+    ] = None,
+    map_in: Annotated[
+        Path | None, typer.Option("--load-map", metavar="FILE", help="Find the camera in a map, and go on with it.")
+    ] = None,
+    localise: Annotated[bool, typer.Option("--localise", help="With --load-map: leave the map as it is.")] = False,
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
@@ -56,6 +64,8 @@ def main(
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
+    overrides += ["dense_map.mesh.enabled=true"] if mesh else []
+    overrides += ["mapping.enabled=false"] if localise else []
     with exit_on_error():
         run_sequence(
             seq,
@@ -70,6 +80,8 @@ def main(
             save_masks=save_masks,
             viz=viz,
             rerun_file=rerun,
+            map_in=map_in,
+            map_out=map_out,
         )
 
 

@@ -14,6 +14,7 @@ from v3d_torch.errors import ConfigError
 from v3d_torch.lie import invert, rigid
 from v3d_torch.localise import Localiser
 from v3d_torch.loop.closing import LoopCloser
+from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.recorder import PoseRecorder, Status
 from v3d_torch.objects.background import BackgroundWatch
@@ -54,19 +55,25 @@ class V3DSLAM:
         camera: intrinsics; None takes those of the first frame.
         segment: gives the instances of a frame; None takes what the configuration names.
         config: of all stages.
+        known: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
 
     Raises:
         WeightsError: the network's weights are not to be had.
     """
 
     def __init__(
-        self, camera: PinholeCamera | None = None, segment: Segmenter | None = None, config: Config | None = None
+        self,
+        camera: PinholeCamera | None = None,
+        segment: Segmenter | None = None,
+        config: Config | None = None,
+        known: SparseMap | None = None,
     ) -> None:
         self.config = config or Config()
         self.segment = segment or make_segmenter(self.config.segmentation)
         self.poses = PoseRecorder()
         self.clock = StageClock()
         self._last: View | None = None
+        self._known = known
         self._ready = camera is not None
         if camera is not None:
             self._set_up(camera)
@@ -82,8 +89,10 @@ class V3DSLAM:
         self.propose = partial(unnamed_instances, camera=camera, min_area=config.objects.background.min_area)
         self.judge = ObjectDynamics(config.objects, camera)
         self.track = MapTracker(config.tracking, config.features, camera)
-        self.mapper = Mapper(config, camera)
+        self.mapper = Mapper(config, camera, self._known)
         self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
+        for keyframe in self.mapper.map.keyframes:
+            self.loops.learn(keyframe)
         self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
 
     def __call__(self, frame: RGBDFrame) -> Tracked:
@@ -99,7 +108,8 @@ class V3DSLAM:
             self._ready = True
         predicted = self.poses.predict(frame.stamp)
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(replace(frame, T_cw=predicted))
+            placed = self.poses.located or not self.mapper.map.keyframes  # a known map does not tell where in it
+            instances = self.segment(replace(frame, T_cw=predicted if placed else None))
         with self.clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with self.clock("features"):  # III-A: ORB
@@ -124,7 +134,9 @@ class V3DSLAM:
             estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
         with self.clock("mapping"):  # keyframes, landmarks, local bundle adjustment
             reference = self.localise.reference(estimate)
-            self.poses.record(frame.stamp, estimate, reference)
+            T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)
+            if T_new_old is not None:
+                self._move_world(T_new_old)
             keyframe = self.mapper(frame, static, estimate, reference)
             if estimate.status is not Status.LOST:
                 self.watch.remember(replace(view, T_cw=self.poses.T_cw))
@@ -135,7 +147,11 @@ class V3DSLAM:
             with self.clock("loop"):  # III-E: loop detection, pose graph
                 T_new_old = self.loops.close(keyframe, self.mapper.map)
                 if T_new_old is not None:
-                    self.judge.tracker.move_world(T_new_old)
-                    self.watch.move_world(T_new_old)
+                    self._move_world(T_new_old)
         status = self.poses.statuses[-1]
         return Tracked(**vars(scene), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)
+
+    def _move_world(self, T_new_old: Tensor) -> None:
+        """Carry what is remembered along when the world is corrected under it."""
+        self.judge.tracker.move_world(T_new_old)
+        self.watch.move_world(T_new_old)

@@ -17,14 +17,15 @@ class Mapper:
     Args:
         config: of the whole system.
         camera: of the frames.
+        known: map to go on with; None to begin a new one.
     """
 
-    def __init__(self, config: Config, camera: PinholeCamera) -> None:
+    def __init__(self, config: Config, camera: PinholeCamera, known: SparseMap | None = None) -> None:
         self._config = config
         self._camera = camera
         self._most_tracked = 0  # landmarks found by a frame since the last keyframe
         self._untracked_since: float | None = None
-        self.map = SparseMap(config.mapping, config.features, camera)
+        self.map = SparseMap(config.mapping, config.features, camera) if known is None else known
 
     def __call__(
         self, frame: RGBDFrame, static: Features, estimate: Estimate, reference: Keyframe | None
@@ -51,6 +52,8 @@ class Mapper:
 
     def _wants(self, frame: RGBDFrame, static: Features, estimate: Estimate) -> bool:
         config = self._config.mapping
+        if not config.enabled:
+            return False
         self._most_tracked = max(self._most_tracked, estimate.count)
         if estimate.status is not Status.TRACKED:
             return self._may_go_on(frame.stamp, static, estimate.status)
@@ -59,8 +62,13 @@ class Mapper:
         return weak or frame.index - self.map.keyframes[-1].frame >= config.max_gap
 
     def _may_go_on(self, stamp: float, static: Features, status: Status) -> bool:
-        """Without the map for some time, a camera maps on from where it is thought to be, once it sees enough."""
+        """Without the map for some time, a camera maps on from where it is thought to be, once it sees enough.
+
+        A map of an earlier run is gone on with from a place that is found in it, and from no other.
+        """
         config = self._config.mapping
+        if status is Status.LOST and self.map.keyframes and self.map.keyframes[-1].known:
+            return False
         if self._untracked_since is None:
             self._untracked_since = stamp
         patience = config.restart_after if status is Status.LOST else config.odometry_after
