@@ -184,7 +184,7 @@ class MaskConfig(Section):
     resolution errs by about two of its pixels."""
     reach: int = Field(32, ge=0)
     """Pixels by which it grows over surface that goes on without an edge: a hand at 3 m. The more it may, the more
-    of a table goes with whoever touches it."""
+    of a table goes with whoever touches it. 0 turns it off."""
     edge: float = Field(0.04, gt=0)
     """Depth that differs by more than this share of it from one pixel to the fourth next is an edge: a surface seen
     at 80 degrees differs by 0.03."""

@@ -57,6 +57,8 @@ class Outliner:
 
     def _going_on(self, track: Track, reached: Tensor) -> Tensor:
         """Where an object's pixels go on within reach, up to the next edge, bool, shape (H, W)."""
+        if self._config.reach == 0:
+            return track.own
         step = self._stride
         seed = track.own[::step, ::step]
         near = grown(track.mask[::step, ::step], self._config.reach // step)
