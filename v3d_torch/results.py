@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 import sys
 from contextlib import suppress
 from importlib.metadata import version
@@ -51,7 +52,7 @@ _DYNAMICS = pa.schema(
 
 
 def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
-    """Write everything that a run leaves behind.
+    """Write everything that a run leaves behind, ``metrics.json`` last: where it is, all the rest is.
 
     Args:
         folder: of this run; made when it is not there.
@@ -74,11 +75,11 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     if sequence.groundtruth is not None:
         with suppress(InputError):  # too few poses to score are still worth writing
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
-    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     with written_whole(folder / "dynamics.parquet") as path:
         pq.write_table(pa.Table.from_pylist(pipeline.run.dynamics, schema=_DYNAMICS), path)
     _write_ply(folder / "map.ply", *pipeline.dense.fuse())
     _draw(folder / "figures", pipeline, trajectory)
+    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
     return evaluation
 
 
@@ -117,6 +118,10 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
 def _peak_memory_mb() -> float | None:
     if sys.platform == "win32":
         return None
+    if (status := Path("/proc/self/status")).is_file():  # Linux: there getrusage counts the parent process in
+        found = re.search(r"^VmHWM:\s*(\d+) kB$", status.read_text(encoding="utf-8"), re.MULTILINE)
+        if found is not None:
+            return int(found[1]) / (1 << 10)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 

@@ -14,11 +14,12 @@ import torch
 from rich.console import Console
 
 from v3d_torch.config import Config, SegmentationConfig
-from v3d_torch.config_file import load_config
+from v3d_torch.config_file import find_config, load_config
 from v3d_torch.console import open_sequence, result_folder, track
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError, OutputError
-from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, Outcome, csv_text, markdown, screen_table
+from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, csv_text, markdown, screen_table
+from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.files import write_text
 from v3d_torch.segmentation import held_upright, make_source
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
@@ -63,7 +64,7 @@ def run_study(
     # A log or a pipe has no width: there the tables are not squeezed into 80 columns.
     console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
     configs = {
-        (variant, seed): load_config(None, [*overrides, *_changes(variant), f"seed={seed}"])
+        (variant, seed): load_config(_file(variant), [*overrides, f"seed={seed}"])
         for variant in variants
         for seed in range(seeds)
     }
@@ -95,10 +96,10 @@ def run_study(
         raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
 
 
-def _changes(variant: str) -> Sequence[str]:
+def _file(variant: str) -> Path:
     if variant not in VARIANTS:
         raise ConfigError(f"--variants {variant}: there is no such variant; there are {', '.join(VARIANTS)}")
-    return VARIANTS[variant]
+    return find_config(variant)
 
 
 def _as_held(config: Config) -> SegmentationConfig:
