@@ -66,7 +66,7 @@ def run_sequence(
     """
     console = Console(soft_wrap=True)
     config = load_config(find_config(config_name or FULL), overrides)
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         bar = _Bar(progress, "sequence")
         sequence = open_source(name, data_root=data_root, camera=camera, options=options, progress=bar)
     segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
@@ -83,8 +83,29 @@ def run_sequence(
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
     """`load_sequence`, with a bar where that takes a while."""
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         return load_sequence(name, data_root=data_root, camera=camera, progress=_Bar(progress, "sequence"))
+
+
+def open_sequences(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
+    """Open several by their names in tables, in the order given, before the first of them runs.
+
+    Raises:
+        InputError: one is wrong, or two have the same name.
+        DownloadError: one is not here and cannot be downloaded.
+    """
+    sequences: dict[str, RGBDSequence] = {}
+    for name in dict.fromkeys(names):
+        sequence = open_sequence(name, data_root, None, console)
+        if sequence.name in sequences:
+            raise InputError(f"{name}: another sequence is called {sequence.name} too; give each once, or them apart")
+        sequences[sequence.name] = sequence
+    return sequences
+
+
+def wide_console() -> Console:
+    """For tables: a log or a pipe has no width, there they are not squeezed into 80 columns."""
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
 def track(
@@ -113,14 +134,15 @@ def track(
         OutputError: when the results cannot be written.
     """
     total = len(sequence) if isinstance(sequence, Sized) else None
-    with _progress(console) as progress, interrupts_between_frames() as interrupted, log_to(folder / "run.log"):
+    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log_to(folder / "run.log"):
         show = _Verdicts(progress, total, interrupted)
         pipeline, evaluation = run_logged(sequence, segment, config, folder, show, save_masks=save_masks)
     pipeline.run.interrupted |= interrupted.is_set()  # also when the frames were done, and the results were written
     return pipeline, evaluation
 
 
-def _progress(console: Console) -> Progress:
+def progress_bars(console: Console) -> Progress:
+    """Bars with counts, the time left and a note; none where nobody watches."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -1,0 +1,135 @@
+"""Runs on the machines of a Ray cluster, each in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Generator, Sequence
+from itertools import islice
+from threading import Event
+from typing import Any
+
+import cv2
+
+from v3d_torch.errors import InputError
+from v3d_torch.jobs.executor import Advanced, Ended
+from v3d_torch.jobs.job import Job
+from v3d_torch.jobs.worker import run_job
+
+_LOOK = 0.2
+"""Time between two looks at what the runs have done, seconds."""
+
+
+class Cluster:
+    """An `Executor` on a Ray cluster. A run takes one core and has one thread.
+
+    The package has to be installed on all machines, and the folders of the results and of the sequences have to be
+    shared by them. A run whose process or machine dies is not run again.
+
+    Args:
+        address: as ``ray.init`` takes it: ``auto`` for the cluster that this machine belongs to, ``local`` for one of
+            its own on this machine, or the host and port of another's head.
+        workers: runs at a time; None takes as many as there are cores.
+
+    Raises:
+        InputError: Ray is not installed, or there is no such cluster.
+    """
+
+    def __init__(self, address: str, workers: int | None = None) -> None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing about a user's runs leaves their machines
+        try:
+            import ray
+        except ImportError as error:
+            raise InputError("--ray: Ray is not installed; pip install 'v3d-torch[ray]'") from error
+        try:
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            said = str(error).splitlines()[0]
+            raise InputError(
+                f"--ray {address}: there is no such cluster ({said}); start one with ray start --head, or give local"
+            ) from error
+        self._ray = ray
+        self.workers = workers
+
+    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[Advanced | Ended]:
+        """See `Executor`."""
+        ray = self._ray
+        board = ray.remote(num_cpus=0)(_Board).remote()
+        run = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_run)  # max_calls: the next job gets a new process
+        waiting = iter(range(len(jobs)))
+        pending: dict[Any, int] = {}
+        begun: set[int] = set()
+        told = False
+        try:
+            while True:
+                if not stop.is_set():
+                    free = None if self.workers is None else self.workers - len(pending)
+                    pending |= {run.remote(jobs[index], index, board): index for index in islice(waiting, free)}
+                elif not told:
+                    told = True
+                    begun |= ray.get(board.stop.remote())
+                    for reference in [reference for reference, index in pending.items() if index not in begun]:
+                        ray.cancel(reference)
+                if not pending:
+                    return
+                ended, _ = ray.wait(list(pending), timeout=_LOOK)
+                for index, frames in ray.get(board.news.remote()).items():
+                    begun.add(index)
+                    yield Advanced(jobs[index], frames)
+                for reference in ended:
+                    job = jobs[pending.pop(reference)]
+                    try:
+                        yield Ended(job, ray.get(reference))
+                    except ray.exceptions.TaskCancelledError:
+                        continue
+                    except ray.exceptions.RayError as error:
+                        yield Ended(job, f"its process or machine died ({str(error).splitlines()[0]})")
+        finally:
+            ray.shutdown()
+
+
+class _Board:
+    """Where the runs write how far they are, and read whether they should go on; an actor."""
+
+    def __init__(self) -> None:
+        self._frames: dict[int, int] = {}
+        self._begun: set[int] = set()
+        self._stopped = False
+
+    def report(self, index: int, frames: int) -> bool:
+        """Note the frames done of a job.
+
+        Returns:
+            Whether it should end.
+        """
+        self._frames[index] = frames
+        self._begun.add(index)
+        return self._stopped
+
+    def news(self) -> dict[int, int]:
+        """Frames done of the jobs that have reported since the last call."""
+        news, self._frames = self._frames, {}
+        return news
+
+    def stop(self) -> set[int]:
+        """Tell all jobs to end.
+
+        Returns:
+            Those that have begun.
+        """
+        self._stopped = True
+        return self._begun
+
+
+def _run(job: Job, index: int, board: Any) -> str | None:
+    """The whole life of a process."""
+    import ray
+
+    cv2.setNumThreads(1)  # the others follow OMP_NUM_THREADS, which Ray sets to the number of cores of a task
+
+    def report(frames: int) -> None:
+        if ray.get(board.report.remote(index, frames)):
+            raise KeyboardInterrupt
+
+    report(0)
+    return run_job(job, report)
