@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 
+from v3d_torch.console import interrupts_between_frames
 from v3d_torch.errors import InputError
 from v3d_torch.jobs.executor import Advanced, Ended
 from v3d_torch.jobs.job import Job
@@ -39,14 +40,15 @@ class Cluster:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing about a user's runs leaves their machines
         try:
             import ray
+            import ray.util.scheduling_strategies
         except ImportError as error:
             raise InputError("--ray: Ray is not installed; pip install 'v3d-torch[ray]'") from error
         try:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, RuntimeError, ValueError) as error:
-            said = str(error).splitlines()[0]
             raise InputError(
-                f"--ray {address}: there is no such cluster ({said}); start one with ray start --head, or give local"
+                f"--ray {address}: there is no such cluster ({_first_line(error)}); start one with ray start --head, or"
+                " give local"
             ) from error
         self._ray = ray
         self.workers = workers
@@ -54,11 +56,13 @@ class Cluster:
     def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[Advanced | Ended]:
         """See `Executor`."""
         ray = self._ray
-        board = ray.remote(num_cpus=0)(_Board).remote()
+        here = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+            ray.get_runtime_context().get_node_id(), soft=False
+        )
+        board = ray.remote(num_cpus=0, scheduling_strategy=here)(_Board).remote()  # no other machine's end is its end
         run = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_run)  # max_calls: the next job gets a new process
         waiting = iter(range(len(jobs)))
         pending: dict[Any, int] = {}
-        begun: set[int] = set()
         told = False
         try:
             while True:
@@ -67,69 +71,56 @@ class Cluster:
                     pending |= {run.remote(jobs[index], index, board): index for index in islice(waiting, free)}
                 elif not told:
                     told = True
-                    begun |= ray.get(board.stop.remote())
-                    for reference in [reference for reference, index in pending.items() if index not in begun]:
+                    for reference in pending:
                         ray.cancel(reference)
                 if not pending:
                     return
                 ended, _ = ray.wait(list(pending), timeout=_LOOK)
                 for index, frames in ray.get(board.news.remote()).items():
-                    begun.add(index)
                     yield Advanced(jobs[index], frames)
                 for reference in ended:
                     job = jobs[pending.pop(reference)]
                     try:
                         yield Ended(job, ray.get(reference))
-                    except ray.exceptions.TaskCancelledError:
+                    except ray.exceptions.TaskCancelledError:  # before it was started
                         continue
                     except ray.exceptions.RayError as error:
-                        yield Ended(job, f"its process or machine died ({str(error).splitlines()[0]})")
+                        yield Ended(job, f"its process or machine failed ({_first_line(error)})")
         finally:
             ray.shutdown()
 
 
+def _first_line(error: Exception) -> str:
+    """What Ray says of an error, without the pages that follow."""
+    said = str(getattr(error, "cause", None) or error).strip()
+    return said.splitlines()[0] if said else type(error).__name__
+
+
 class _Board:
-    """Where the runs write how far they are, and read whether they should go on; an actor."""
+    """Where the runs write how far they are; an actor."""
 
     def __init__(self) -> None:
         self._frames: dict[int, int] = {}
-        self._begun: set[int] = set()
-        self._stopped = False
 
-    def report(self, index: int, frames: int) -> bool:
-        """Note the frames done of a job.
-
-        Returns:
-            Whether it should end.
-        """
+    def report(self, index: int, frames: int) -> None:
+        """Note the frames done of a job."""
         self._frames[index] = frames
-        self._begun.add(index)
-        return self._stopped
 
     def news(self) -> dict[int, int]:
         """Frames done of the jobs that have reported since the last call."""
         news, self._frames = self._frames, {}
         return news
 
-    def stop(self) -> set[int]:
-        """Tell all jobs to end.
-
-        Returns:
-            Those that have begun.
-        """
-        self._stopped = True
-        return self._begun
-
 
 def _run(job: Job, index: int, board: Any) -> str | None:
     """The whole life of a process."""
-    import ray
+    with interrupts_between_frames() as cancelled:  # Ray cancels a task as Ctrl-C does
+        cv2.setNumThreads(1)  # the others follow OMP_NUM_THREADS, which Ray sets to the number of cores of a task
 
-    cv2.setNumThreads(1)  # the others follow OMP_NUM_THREADS, which Ray sets to the number of cores of a task
+        def report(frames: int) -> None:
+            board.report.remote(index, frames)  # nobody waits: a task that does gives its core to another one
+            if cancelled.is_set():
+                raise KeyboardInterrupt
 
-    def report(frames: int) -> None:
-        if ray.get(board.report.remote(index, frames)):
-            raise KeyboardInterrupt
-
-    report(0)
-    return run_job(job, report)
+        report(0)
+        return run_job(job, report)
