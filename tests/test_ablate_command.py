@@ -20,7 +20,6 @@ from v3d_torch import study
 from v3d_torch.ablate import app
 from v3d_torch.config import Config
 from v3d_torch.config_file import CONFIGS, load_config
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation.ablation import COLUMNS, VARIANTS, csv_text, markdown, screen_table, verdict
@@ -59,11 +58,8 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fifth of a second of the demo, with true masks, in which the walker is in the middle of the room."""
-    folder = tmp_path_factory.mktemp("sequences") / "moment"
-    write_sequence(folder, range(52, 52 + FRAMES))
-    return folder
+def sequence(moment: Path) -> Path:
+    return moment
 
 
 @pytest.fixture(scope="module")

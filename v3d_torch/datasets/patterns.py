@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from v3d_torch.datasets.locate import data_folder
-from v3d_torch.datasets.names import SEQUENCES, short_name
+from v3d_torch.datasets.names import PAPER_SEQUENCES, SEQUENCES, canonical_name, short_name
 from v3d_torch.datasets.sources import is_source
 from v3d_torch.errors import InputError
 
 _WILDCARDS = "*?["
 
 
-def matching_sequences(pattern: str, data_root: Path | None = None) -> list[str]:
-    """The sequences that a pattern speaks of, each as `load_sequence` takes it.
+def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -> list[str]:
+    """The sequences that names, paths and patterns speak of, each as `load_sequence` takes it.
 
     Wildcards are those of the shell, ``*``, ``?`` and ``[ ]``. They match paths, and the names of what is in
     ``data_root`` (see `data_folder`), as far as these hold a sequence; and names of the TUM RGB-D benchmark, short or
@@ -24,23 +25,31 @@ def matching_sequences(pattern: str, data_root: Path | None = None) -> list[str]
     sequences, which have no ground truth, are meant only where the pattern says ``validation``.
 
     Args:
-        pattern: a name or a path without wildcards is returned as it is.
+        patterns: in any number; what has no wildcards is taken as it is.
         data_root: where sequences are kept.
 
     Returns:
-        Each sequence once: paths, then what is in ``data_root``, each in alphabetical order, then names.
+        Each sequence once, in the order of the patterns. Of a pattern: paths, then what is in ``data_root``, each in
+        alphabetical order, then names of the benchmark, those of the paper's sequences first, in its order.
 
     Raises:
-        InputError: nothing matches.
+        InputError: a pattern matches nothing.
     """
+    found: dict[str, str] = {}
+    for pattern in patterns:
+        for name in _matching(pattern, data_folder(data_root)):
+            found.setdefault(canonical_name(name) or name, name)
+    return list(found.values())
+
+
+def _matching(pattern: str, root: Path) -> list[str]:
     path = Path(pattern).expanduser()
     if not any(wildcard in pattern for wildcard in _WILDCARDS) or path.exists():
         return [pattern]
-    root = data_folder(data_root)
     here = [str(found) for found in _stored(Path(path.anchor), path)]
     there = [] if path.is_absolute() else [str(found.relative_to(root)) for found in _stored(root, path)]
     names = [] if pattern[0] in _WILDCARDS else _names(pattern)
-    if found := list(dict.fromkeys([*here, *there, *names])):
+    if found := [*here, *there, *names]:
         return found
     raise InputError(
         f"{pattern}: matches no sequence, neither as a path, nor in {root}, nor among the names of the TUM benchmark"
@@ -57,7 +66,7 @@ def _names(pattern: str) -> list[str]:
     """Short names of the benchmark's sequences that a pattern matches in one of their spellings."""
     wanted = _plain(pattern)
     found = []
-    for full in SEQUENCES:
+    for full in dict.fromkeys([*PAPER_SEQUENCES, *SEQUENCES]):
         long = full.removeprefix("rgbd_dataset_")
         spellings = (full, long, long.replace("freiburg", "fr"), _plain(short_name(full)))
         if full.endswith("_validation") > ("validation" in wanted):

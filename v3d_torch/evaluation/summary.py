@@ -112,9 +112,10 @@ def screen_tables(outcomes: Sequence[Outcome]) -> list[Table]:
         shown = Table(title=f"{table.heading}, RMSE", box=box.SIMPLE_HEAD)
         shown.add_column("sequence", no_wrap=True)
         for method in table.methods:
-            shown.add_column(escape(method).replace(" (", "\n("), justify="right", no_wrap=True)
+            shown.add_column(escape(method).replace(" (", "\n("), justify="right", overflow="fold")
         for sequence, cells in table.rows.items():
-            texts = [escape(cell.text).replace(" ", "\n", 1) for cell in cells]  # the range below the median
+            # The range below the median, and the failures below that.
+            texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
             marked = [f"[bold green]{t}[/]" if cell.best else t for t, cell in zip(texts, cells, strict=True)]
             shown.add_row(escape(sequence), *marked)
         tables.append(shown)

@@ -42,7 +42,7 @@ def run_batch(
     console = wide_console()
     executor: Executor = Processes(workers or 1) if ray is None else Cluster(ray, workers)
     configs = read_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
-    names = list(dict.fromkeys(name for pattern in patterns for name in matching_sequences(pattern, data_root)))
+    names = matching_sequences(patterns, data_root)
     opened = open_sequences(names, data_root, console)
     sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
     make_sure_of_networks(configs)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 from collections.abc import Generator, Sequence
 from itertools import islice
 from threading import Event
@@ -44,8 +45,9 @@ class Cluster:
         except ImportError as error:
             raise InputError("--ray: Ray is not installed; pip install 'v3d-torch[ray]'") from error
         try:
+            _knock_at(address)
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, RuntimeError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise InputError(
                 f"--ray {address}: there is no such cluster ({_first_line(error)}); start one with ray start --head, or"
                 " give local"
@@ -88,6 +90,13 @@ class Cluster:
                         yield Ended(job, f"its process or machine failed ({_first_line(error)})")
         finally:
             ray.shutdown()
+
+
+def _knock_at(address: str) -> None:
+    """Raise OSError where nobody listens at a host and port: Ray itself would try for a quarter of an hour."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=5.0).close()
 
 
 def _first_line(error: Exception) -> str:
