@@ -129,6 +129,7 @@ def test_a_run_that_fails_costs_the_others_nothing_and_is_told_at_the_end(
     image = sorted((work / "data" / "broken" / "rgb").iterdir())[BROKEN_AT]
     lines = done.stdout.splitlines()
     failures = [f"broken, {config}, seed 0: failed: {image}" for config in ("baseline", "few")]
+    assert lines[-4] == "failed:"
     for failure, line in zip(failures, lines[-3:-1], strict=True):
         assert line.startswith(failure)
     assert lines[-1] == f"results: {work / 'out'}"
@@ -350,14 +351,16 @@ def test_tables_that_cannot_be_written_end_the_batch_after_the_runs_under_way(
 
 
 def test_bars_show_each_run_that_is_under_way(moment: Path, tmp_path: Path) -> None:
-    first, second, _ = jobs(moment, tmp_path, seeds=3)
+    all_jobs = jobs(moment, tmp_path, seeds=4)
+    first, second = all_jobs[1:3]
     screen = Console(force_terminal=True, width=100, file=StringIO())
     with progress_bars(screen) as progress:
-        bars = Bars(progress, total=3, done=0)
+        bars = Bars(progress, all_jobs, all_jobs[1:])
         for event in (Advanced(first, 0), Advanced(second, 0), Advanced(first, 5), Ended(second, None)):
             bars(event)
         shown = {task.description: (task.completed, task.total) for task in progress.tasks}
-    assert shown == {"all runs": (1, 3), "moment, baseline, seed 0": (5, 6)}
+        notes = [task.fields["note"] for task in progress.tasks]
+    assert shown == {"all runs": (6 + 5 + 6, 24), str(first): (5, 6)} and notes == ["2 of 4 runs", ""]
 
 
 # --- bad input

@@ -54,8 +54,8 @@ def run_batch(
     interrupted = _carry_out(record, executor, console)
     for table in screen_tables(record.outcomes):
         console.print(table)
-    for outcome in record.failed:
-        console.print(str(outcome), markup=False)
+    if record.failed:
+        console.print("failed:", *map(str, record.failed), sep="\n", markup=False)
     console.print(f"results: {folder}", markup=False)
     total, failed = len(record.jobs), len(record.failed)
     if interrupted and (failed or record.missing):
@@ -79,7 +79,7 @@ def _carry_out(record: Record, executor: Executor, console: Console) -> bool:
     """
     lost: OutputError | None = None
     with progress_bars(console) as progress, interrupts_between_frames() as stop:
-        bars = Bars(progress, len(record.jobs), len(record.outcomes))
+        bars = Bars(progress, record.jobs, record.missing)
         try:
             with closing(executor(record.missing, stop)) as events:
                 for event in events:
