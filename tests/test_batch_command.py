@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Generator, Sequence
 from io import StringIO
 from pathlib import Path
 from threading import Event
@@ -28,7 +29,7 @@ from v3d_torch.console import progress_bars
 from v3d_torch.jobs import batch as batch_module
 from v3d_torch.jobs.bars import Bars
 from v3d_torch.jobs.executor import Advanced, Ended
-from v3d_torch.jobs.job import on_one_thread
+from v3d_torch.jobs.job import Job, on_one_thread
 from v3d_torch.jobs.plan import read_configs
 from v3d_torch.jobs.processes import Processes
 from v3d_torch.jobs.table import FIGURES
@@ -264,32 +265,38 @@ def test_what_is_not_finished_is_run_again(
 # --- Ctrl-C, crashes
 
 
-@pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
-def test_ctrl_c_keeps_what_was_computed_and_resume_goes_on(moment: Path, tmp_path: Path) -> None:
-    """As in a terminal, where all processes of the command get the signal."""
-    sequence = repeated(moment, tmp_path / "long", frames=80)
-    out = tmp_path / "out"
-    arguments = ("--seqs", sequence, "--configs", "baseline", "--seeds", 2, "--out", out)
+def struck(arguments: Sequence[str | Path], when: Callable[[], bool]) -> subprocess.CompletedProcess[str]:
+    """The command, with Ctrl-C as in a terminal, where all processes of a command get the signal."""
     with subprocess.Popen(  # noqa: S603
-        command(*map(str, arguments)),
+        command(*arguments),
         env=environment(),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
     ) as process:
-        log = out / "long" / "baseline" / "seed0" / "run.log"
         deadline = time.monotonic() + 100
-        while not (log.is_file() and log.read_text().count(" frame ") >= 3) and time.monotonic() < deadline:
+        while not when() and time.monotonic() < deadline:
             time.sleep(0.01)
         os.killpg(process.pid, signal.SIGINT)
         stdout, stderr = process.communicate(timeout=100)
-    assert_one_sentence(process.returncode, stderr, "interrupted with 0 of 2 runs done", "--resume")
-    assert "Traceback" not in stdout and "long, baseline, seed 0: failed: interrupted after" in stdout
-    metrics = metrics_of(log.parent)
+    return subprocess.CompletedProcess(process.args, process.returncode, stdout, stderr)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
+def test_ctrl_c_keeps_what_was_computed_and_resume_goes_on(moment: Path, tmp_path: Path) -> None:
+    sequence = repeated(moment, tmp_path / "long", frames=80)
+    out = tmp_path / "out"
+    arguments = ("--seqs", sequence, "--configs", "baseline", "--seeds", "2", "--out", out)
+    folder = out / "long" / "baseline" / "seed0"
+    log = folder / "run.log"
+    done = struck(arguments, lambda: log.is_file() and log.read_text().count(" frame ") >= 3)
+    assert_one_sentence(done.returncode, done.stderr, "interrupted with 0 of 2 runs done", "--resume")
+    assert "Traceback" not in done.stdout and "long, baseline, seed 0: failed: interrupted after" in done.stdout
+    metrics = metrics_of(folder)
     assert 3 <= metrics["processed"] < 80
-    assert len((log.parent / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
-    assert files_in(log.parent) | {"figures/masks.png"} == FILES  # of the first frames none is for that figure
+    assert len((folder / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
+    assert files_in(folder) | {"figures/masks.png"} == FILES  # of the first frames none is for that figure
     assert not (out / "long" / "baseline" / "seed1").exists()
     assert len(pd.read_parquet(out / "runs.parquet")) == 1
 
@@ -297,6 +304,14 @@ def test_ctrl_c_keeps_what_was_computed_and_resume_goes_on(moment: Path, tmp_pat
     result = call(*arguments, "--resume")
     assert result.exit_code == 0, result.output
     assert pd.read_parquet(out / "runs.parquet")["processed"].tolist() == [4, 4]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
+def test_ctrl_c_while_the_first_process_starts(moment: Path, tmp_path: Path) -> None:
+    arguments = ("--seqs", moment, "--configs", "baseline", "--seeds", "2", "--out", tmp_path / "out")
+    done = struck(arguments, (tmp_path / "out" / "summary.csv").exists)
+    assert_one_sentence(done.returncode, done.stderr, "interrupted with 0 of 2 runs done")
+    assert not (tmp_path / "out" / "moment" / "baseline" / "seed1").exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGSEGV to other processes")
@@ -334,20 +349,21 @@ def test_ctrl_c_twice_kills_what_is_under_way(moment: Path, tmp_path: Path, monk
 def test_tables_that_cannot_be_written_end_the_batch_after_the_runs_under_way(
     moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A folder takes the place of the table when the first run begins."""
+    """A folder takes the place of the table while runs are under way."""
+    ended: list[str] = []
 
-    class Obstructing(Bars):
-        def __call__(self, event: Advanced | Ended) -> None:
-            table = tmp_path / "runs.parquet"
-            if table.is_file():
-                table.unlink()
-                table.mkdir()
+    def execute(planned: Sequence[Job], stop: Event) -> Generator[Ended]:
+        (tmp_path / "runs.parquet").unlink()
+        (tmp_path / "runs.parquet").mkdir()
+        yield Ended(planned[0], "first")
+        assert stop.is_set()
+        ended.append("second")
+        yield Ended(planned[1], "second")
 
-    monkeypatch.setattr(batch_module, "Bars", Obstructing)
+    monkeypatch.setattr(batch_module, "Processes", lambda workers: execute)
     result = call("--seqs", moment, "--configs", "baseline", "--seeds", 2, "--out", tmp_path)
     assert_one_sentence(result.exit_code, result.stderr, tmp_path / "runs.parquet", "cannot be written")
-    assert metrics_of(tmp_path / "moment" / "baseline" / "seed0")["failure"] is None
-    assert not (tmp_path / "moment" / "baseline" / "seed1").exists()
+    assert ended == ["second"]
 
 
 def test_bars_show_each_run_that_is_under_way(moment: Path, tmp_path: Path) -> None:

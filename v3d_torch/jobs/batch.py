@@ -40,9 +40,9 @@ def run_batch(
     if resume and out is None:
         raise InputError("--resume: say with --out in which folder to go on")
     console = wide_console()
-    executor: Executor = Processes(workers or 1) if ray is None else Cluster(ray, workers)
     configs = read_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
     names = matching_sequences(patterns, data_root)
+    executor: Executor = Processes(workers or 1) if ray is None else Cluster(ray, workers)
     opened = open_sequences(names, data_root, console)
     sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
     make_sure_of_networks(configs)

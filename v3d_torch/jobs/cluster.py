@@ -79,7 +79,8 @@ class Cluster:
                     return
                 ended, _ = ray.wait(list(pending), timeout=_LOOK)
                 for index, frames in ray.get(board.news.remote()).items():
-                    yield Advanced(jobs[index], frames)
+                    if index in pending.values():  # a note may come after its job's end
+                        yield Advanced(jobs[index], frames)
                 for reference in ended:
                     job = jobs[pending.pop(reference)]
                     try:
@@ -88,6 +89,10 @@ class Cluster:
                         continue
                     except ray.exceptions.RayError as error:
                         yield Ended(job, f"its process or machine failed ({_first_line(error)})")
+        except ray.exceptions.RayError as error:
+            raise InputError(
+                f"the Ray cluster was lost ({_first_line(error)}); the same command with --resume goes on"
+            ) from error
         finally:
             ray.shutdown()
 

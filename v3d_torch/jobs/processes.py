@@ -5,6 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import signal
+import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -64,7 +65,7 @@ class Processes:
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
         ours, theirs = _SPAWN.Pipe()
         process = _SPAWN.Process(target=_work, args=(job, theirs), name=str(job))
-        with _environment(THREADS if self.workers > 1 else {}):
+        with _environment(THREADS if self.workers > 1 else {}), _deaf():
             process.start()
         theirs.close()  # so that the end of the process is the end of the pipe
         return ours, process
@@ -88,14 +89,16 @@ def _event(job: Job, process: BaseProcess, connection: Connection) -> Advanced |
 
 def _how_it_died(process: BaseProcess) -> str:
     code = process.exitcode or 0
-    if code < 0:
-        return f"its process was killed by {signal.Signals(-code).name}"
-    return f"its process ended with exit code {code}"
+    if code >= 0:
+        return f"its process ended with exit code {code}"
+    name = signal.Signals(-code).name
+    hint = ", as the system does when memory runs out" if name == "SIGKILL" else ""
+    return f"its process was killed by {name}{hint}"
 
 
 def _work(job: Job, connection: Connection) -> None:
     """The whole life of a process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first one tells the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # where `_deaf` does nothing
     _speak_into(job.folder / "run.log")
 
     def report(frames: int) -> None:
@@ -125,10 +128,30 @@ def _speak_into(path: Path) -> None:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    before = dict(os.environ)
+    """Set variables for the processes that are started in the block."""
+    before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
         yield
     finally:
-        os.environ.clear()
-        os.environ.update(before)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Keep Ctrl-C, which reaches all processes of a terminal, from those started in the block: they are told to stop.
+
+    One that comes within the block takes effect after it.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
