@@ -22,6 +22,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.jobs.cluster import Cluster
 from v3d_torch.jobs.executor import Ended
 from v3d_torch.jobs.job import Job
+from v3d_torch.jobs.worker import run_job
 
 if TYPE_CHECKING:
     from ray.cluster_utils import Cluster as Nodes
@@ -47,16 +48,16 @@ def nodes() -> Iterator[Nodes]:
 
 
 def test_a_batch_on_a_cluster_gives_what_it_gives_here(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
-    """The same command, the same files."""
-    arguments = ["--seqs", str(moment), "--configs", "baseline"]
-    for where, more in (("there", ["--seeds", "2", "--ray", nodes.address]), ("here", [])):
-        result = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / where), *more])
-        assert result.exit_code == 0, result.output
+    arguments = ["--seqs", str(moment), "--configs", "baseline", "--seeds", "2", "--out", str(tmp_path / "there")]
+    result = CliRunner().invoke(app, [*arguments, "--ray", nodes.address])
+    assert result.exit_code == 0, result.output
     table = pd.read_parquet(tmp_path / "there" / "runs.parquet")
     assert table["seed"].tolist() == [0, 1] and (table["tracked"] == 6).all()
-    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
-        there, here = (tmp_path / where / "moment" / "baseline" / "seed0" / name for where in ("there", "here"))
-        assert there.read_bytes() == here.read_bytes(), name
+    (job,) = jobs(moment, tmp_path / "here", seeds=1)
+    assert run_job(job, lambda frames: None) is None
+    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "config.yaml"):
+        there = tmp_path / "there" / "moment" / "baseline" / "seed0" / name
+        assert there.read_bytes() == (job.folder / name).read_bytes(), name
 
 
 def pid_of(job: Job) -> int:
