@@ -13,6 +13,32 @@ from pydantic import ValidationError
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import ConfigError
 
+FULL = "full"
+"""The whole system, as it is by default."""
+
+_FOLDER = Path(__file__).parent / "configs"
+CONFIGS: Mapping[str, Path] = {
+    FULL: _FOLDER / "default.yaml",
+    **{path.stem: path for path in sorted(_FOLDER.rglob("*.yaml"))},
+}
+"""The configurations that come with the package, by name: the default (`FULL`), the paper's and the ablations'."""
+
+
+def find_config(name: str | Path) -> Path:
+    """The file of a configuration.
+
+    Args:
+        name: a key of `CONFIGS`, such as ``paper``, or the path of a YAML file.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    if str(name) in CONFIGS:
+        return CONFIGS[str(name)]
+    if (path := Path(name).expanduser()).is_file():
+        return path
+    raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
+
 
 def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     """Defaults, then a YAML file, then ``section.key=value`` overrides.
@@ -24,12 +50,20 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Conf
     Raises:
         ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
     """
-    tree: dict[str, Any] = {}
-    if path is not None:
-        tree = _read_yaml(path)
+    tree = _read_yaml(path) if path is not None else {}
+    config = _validated(tree, f"{path}")
     for override in overrides:
         _apply_override(tree, override)
-    source = f"{path}" if path is not None else "--set"
+        config = _validated(tree, "--set")
+    return config
+
+
+def dump_config(config: Config) -> str:
+    """The resolved configuration as YAML that `load_config` reads back."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _validated(tree: Mapping[str, Any], source: str) -> Config:
     _refuse_unknown_keys(tree, Config, source)
     try:
         return Config.model_validate(tree)
@@ -37,11 +71,6 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Conf
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise ConfigError(f"{source}: {key}: {first['msg'].lower()}, got {first['input']!r}") from error
-
-
-def dump_config(config: Config) -> str:
-    """The resolved configuration as YAML that `load_config` reads back."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

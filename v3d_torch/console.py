@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import sys
@@ -15,31 +14,26 @@ from pathlib import Path
 from threading import Event
 from types import FrameType
 
-import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from v3d_torch.config import Config
-from v3d_torch.config_file import load_config
+from v3d_torch.config_file import FULL, find_config, load_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
 from v3d_torch.errors import ConfigError, InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
 from v3d_torch.files import refuse_unwritable
+from v3d_torch.logged import log_to, run_logged, what_moves
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.storage import StoredMap, load_map, save_map
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.results import write_results
 from v3d_torch.segmentation import make_segmenter
-from v3d_torch.segmentation.coco import class_name
-from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
 from v3d_torch.viz.viewer import NULL_VIEWER, Viewer, make_viewer
-
-_LOG = logging.getLogger("v3d_torch")
 
 
 @contextmanager
@@ -61,7 +55,7 @@ def run_sequence(
     data_root: Path | None,
     camera: str | None,
     options: SourceOptions,
-    config_path: Path | None,
+    config_name: str | None,
     overrides: Sequence[str],
     masks: Path | None,
     weights: Path | None,
@@ -78,12 +72,12 @@ def run_sequence(
         V3DError: on bad input, or when the sequence ended early (the results up to there are written).
     """
     console = Console(soft_wrap=True)
-    config = load_config(config_path, overrides)
+    config = load_config(find_config(config_name or FULL), overrides)
     if map_out is not None:
         refuse_unwritable(map_out)
     if map_in is None and not config.mapping.enabled:
         raise ConfigError("mapping.enabled=false: there is no map to find the camera in; give one with --load-map")
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         bar = _Bar(progress, "sequence")
         sequence = open_source(name, data_root=data_root, camera=camera, options=options, progress=bar)
     known = None if map_in is None else load_map(map_in, sequence.camera, config)
@@ -108,8 +102,29 @@ def run_sequence(
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
     """`load_sequence`, with a bar where that takes a while."""
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         return load_sequence(name, data_root=data_root, camera=camera, progress=_Bar(progress, "sequence"))
+
+
+def open_sequences(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
+    """Open several by their names in tables, in the order given, before the first of them runs.
+
+    Raises:
+        InputError: one is wrong, or two have the same name.
+        DownloadError: one is not here and cannot be downloaded.
+    """
+    sequences: dict[str, RGBDSequence] = {}
+    for name in dict.fromkeys(names):
+        sequence = open_sequence(name, data_root, None, console)
+        if sequence.name in sequences:
+            raise InputError(f"{name}: another sequence is called {sequence.name} too; give each once, or them apart")
+        sequences[sequence.name] = sequence
+    return sequences
+
+
+def wide_console() -> Console:
+    """For tables: a log or a pipe has no width, there they are not squeezed into 80 columns."""
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
 def track(
@@ -141,23 +156,18 @@ def track(
     Raises:
         OutputError: when the results cannot be written.
     """
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    slam = V3DSLAM(sequence.camera, segment, config, None if known is None else known.map)
-    masks = folder / "masks" if save_masks else None
-    pipeline = Pipeline(sequence, slam, masks, viewer, None if known is None else known.views)
-    with _log_to(folder / "run.log"):
-        total = len(sequence) if isinstance(sequence, Sized) else None
-        _LOG.info("%s: %s frames", sequence.name, "any number of" if total is None else total)
-        with _progress(console) as progress, interrupts_between_frames() as interrupted:
-            run = pipeline(_Verdicts(progress, total, interrupted))
-        evaluation = write_results(folder, pipeline)
-        if run.failure:
-            _LOG.error(run.failure)
+    total = len(sequence) if isinstance(sequence, Sized) else None
+    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log_to(folder / "run.log"):
+        show = _Verdicts(progress, total, interrupted)
+        pipeline, evaluation = run_logged(
+            sequence, segment, config, folder, show, save_masks=save_masks, viewer=viewer, known=known
+        )
+    pipeline.run.interrupted |= interrupted.is_set()  # also when the frames were done, and the results were written
     return pipeline, evaluation
 
 
-def _progress(console: Console) -> Progress:
+def progress_bars(console: Console) -> Progress:
+    """Bars with counts, the time left and a note; none where nobody watches."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -195,10 +205,8 @@ class _Verdicts:
     def __call__(self, frame: RGBDFrame, scene: Scene, status: Status) -> None:
         self._frames += 1
         rate = self._frames / (time.perf_counter() - self._start)
-        verdicts = Counter(f"{class_name(judged.label)} {judged.verdict.value}" for judged in scene.objects)
-        objects = ", ".join(f"{count} {what}" for what, count in sorted(verdicts.items()) if "static" not in what)
-        self._progress.update(self._task, advance=1, note=f"{rate:.1f} frames/s  {status.value}  {objects}")
-        _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, status.value, objects or "nothing moves")
+        note = f"{rate:.1f} frames/s  {status.value}  {what_moves(scene)}"
+        self._progress.update(self._task, advance=1, note=note)
         if self._interrupted.is_set():
             raise KeyboardInterrupt
 
@@ -233,23 +241,6 @@ def result_folder(out: Path | None, name: str) -> Path:
     except OSError as error:
         raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from error
     return folder
-
-
-@contextmanager
-def _log_to(path: Path) -> Iterator[None]:
-    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    _LOG.addHandler(handler)
-    _LOG.setLevel(logging.INFO)
-    _LOG.propagate = False
-    try:
-        yield
-    except Exception:
-        _LOG.exception("the run broke")
-        raise
-    finally:
-        _LOG.removeHandler(handler)
-        handler.close()
 
 
 def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:

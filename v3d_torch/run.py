@@ -32,7 +32,8 @@ def main(
         float | None, typer.Option(min=0.01, help="Frames a second, where images or videos do not say their times.")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="YAML file over the defaults, such as configs/paper.yaml.")
+        str | None,
+        typer.Option(help="paper, baseline or another of the package, or a YAML file over the defaults."),
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="A value, such as objects.voting.distance_threshold=0.05.")
@@ -72,7 +73,7 @@ def main(
             data_root=data_root,
             camera=camera,
             options=SourceOptions(rgb_topic, depth_topic, info_topic, fps),
-            config_path=config,
+            config_name=config,
             overrides=overrides,
             masks=masks,
             weights=weights,

@@ -86,6 +86,11 @@ SOURCES = (
 """In the order in which they are tried: what could be taken for another, less special kind comes before it."""
 
 
+def is_source(path: Path) -> bool:
+    """Whether a path holds anything of a known kind; opening it tells whether it is in order."""
+    return any(source.holds(path) for source in SOURCES)
+
+
 def open_path(path: Path, camera: CameraChoice, options: SourceOptions, progress: Progress | None) -> RGBDStream:
     """Open what a path holds.
 
