@@ -15,7 +15,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import MaskConfig
 from v3d_torch.objects.background import Arrivals, DepthView
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.silhouette import Silhouette
 from v3d_torch.objects.track import Track
 
 
@@ -48,11 +48,12 @@ class Outliner:
         T_cw = self._view.T_cw
         cloud = track.cloud_at(self._view.stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
         tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
-        _, reached = silhouette(cloud, depth, self._camera, self._spacing, config.reach, tolerance)
+        silhouette = Silhouette(cloud, self._camera, self._spacing)
+        _, reached = silhouette(depth, config.reach, tolerance)
         going_on = self._going_on(track, reached) & reached
         if track.missed:  # a mask that is predicted by its depth is as it is
             return track.mask | going_on
-        _, explained = silhouette(cloud, depth, self._camera, self._spacing, config.margin, tolerance)
+        _, explained = silhouette(depth, config.margin, tolerance)
         return track.own | going_on | (grown(track.mask, config.margin) & (explained | (depth[0] <= 0)))
 
     def _going_on(self, track: Track, reached: Tensor) -> Tensor:

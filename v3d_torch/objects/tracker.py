@@ -10,7 +10,7 @@ from v3d_torch.config import IdentityConfig
 from v3d_torch.lie import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.silhouette import Silhouette
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.types import Instances
 
@@ -124,7 +124,7 @@ class InstanceTracker(torch.nn.Module):
         """Pixels where an object should be: its last cloud, moved on, where the depth agrees."""
         T_cw = invert(T_wc)
         cloud = track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
-        near, explained = silhouette(cloud, depth, self._camera, self._voxel_size, 0, self._DEPTH_GATE)
+        near, explained = Silhouette(cloud, self._camera, self._voxel_size)(depth, 0, self._DEPTH_GATE)
         return near & (explained | (depth[0] <= 0))
 
 
