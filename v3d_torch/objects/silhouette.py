@@ -6,6 +6,9 @@ The object's cloud, cleaned of what does not belong to it, says which depths are
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import torch
@@ -13,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.objects.regions import enlarged
 
 _CELL = 4
 """Side of the cells in which the depths of a cloud are gathered, pixels: those of the network's masks."""
@@ -24,23 +28,43 @@ _NEAREST = 0.1
 """Points nearer than this, or behind the camera, have no place in the image, metres."""
 
 
+def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float) -> list[Silhouette]:
+    """Clouds as they lie in an image, all at once.
+
+    Args:
+        clouds: camera frame, metres, each of shape :math:`(P, 3)`.
+        camera: that takes the image.
+        spacing: of the points, metres: gaps of this size are closed.
+    """
+    if not clouds:
+        return []
+    points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
+    pixels, inside = camera.locate(points, _NEAREST)
+    # Pixel centres lie at integers: a cell begins half a pixel before its first.
+    cells = np.floor((pixels.numpy() + 0.5) / _CELL).astype(np.int64)
+    z, seen = points[:, 2].numpy().astype(np.float32), inside.numpy()
+    ends = np.cumsum([len(cloud) for cloud in clouds]).tolist()
+    drawn = []
+    for begin, end in pairwise([0, *ends]):
+        own = seen[begin:end]
+        drawn.append(Silhouette(cells[begin:end][own], z[begin:end][own], camera, spacing))
+    return drawn
+
+
 class Silhouette:
     """A cloud as it lies in an image.
 
     Args:
-        cloud: camera frame, metres, shape :math:`(P, 3)`.
+        cells: (column, row) of the cell of each point, int64, shape :math:`(P, 2)`.
+        z: depth of each, metres, float32, shape :math:`(P,)`.
         camera: that takes the image.
-        spacing: of the points, metres: gaps of this size are closed.
+        spacing: of the points, metres.
     """
 
-    def __init__(self, cloud: Tensor, camera: PinholeCamera, spacing: float) -> None:
+    def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
         self._size = camera.height, camera.width
-        pixels, inside = camera.locate(cloud.to(torch.float64), _NEAREST)
-        seen = inside.numpy()
-        self._z = cloud[:, 2].to(torch.float32).numpy()[seen]
-        # Pixel centres lie at integers: a cell begins half a pixel before its first.
-        self._cells = np.floor((pixels.numpy()[seen] + 0.5) / _CELL).astype(np.int64)
-        self._gap = spacing * camera.fx / float(np.median(self._z)) if len(self._z) else 0.0
+        self._cells, self._z = cells, z
+        self._gap = spacing * camera.fx / float(np.median(z)) if len(z) else 0.0
 
     def __call__(self, depth: Tensor, margin: int, tolerance: float) -> tuple[Tensor, Tensor]:
         """Pixels near the points, and those of them that the points' depths explain.
@@ -71,12 +95,9 @@ class Silhouette:
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         nearest = cv2.erode(front.reshape(rows, columns), around, borderValue=_NONE)
         farthest = cv2.dilate(back.reshape(rows, columns), around, borderValue=-_NONE)
-        near[here] = _enlarged(nearest < _NONE, near[here].shape)
-        low, high = (_enlarged(z, near[here].shape) for z in (nearest - tolerance, farthest + tolerance))
-        explained[here] = (depth[0][here] > low) & (depth[0][here] < high)
+        size = near[here].shape
+        near[here] = enlarged(nearest < _NONE, _CELL, size)
+        low, high = (enlarged(z, _CELL, size).numpy() for z in (nearest - tolerance, farthest + tolerance))
+        z = depth[0].numpy()[here]  # NumPy compares in a third of torch's time
+        explained[here] = torch.from_numpy((z > low) & (z < high))
         return near, explained
-
-
-def _enlarged(cells: NDArray[np.generic], size: torch.Size) -> Tensor:
-    """Each cell as its pixels, the last ones cut to the size."""
-    return torch.from_numpy(cells.repeat(_CELL, axis=0).repeat(_CELL, axis=1)[: size[0], : size[1]])

@@ -117,7 +117,8 @@ def _near(centre: Tensor, radius: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     Places are sorted into the cells of a grid: those of neighbouring cells of a row stand side by side.
     """
     if not len(centre) or not len(uv):
-        return torch.zeros(2, 0, dtype=torch.int64).unbind()
+        none = torch.zeros(0, dtype=torch.int64)
+        return none, none
     origin = uv.amin(dim=0)
     last_column, last_row = _cell(uv.amax(dim=0), origin).tolist()
     column, row = _cell(uv, origin).unbind(dim=1)
