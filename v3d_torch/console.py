@@ -22,17 +22,21 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from v3d_torch.config import Config
-from v3d_torch.config_file import load_config
+from v3d_torch.config_file import dump_config, load_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
+from v3d_torch.earlier_results import clear_results
 from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
+from v3d_torch.files import write_text
+from v3d_torch.log_file import LogFile
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.results import write_results
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import class_name
+from v3d_torch.shortfall import shortfall
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
 
@@ -45,11 +49,16 @@ def exit_on_error() -> Iterator[None]:
     try:
         yield
     except V3DError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {_printable(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("error: interrupted before the results were written", file=sys.stderr)
         sys.exit(2)
+
+
+def _printable(error: V3DError) -> str:
+    """The message on one line: names and lines of files are part of it, and may hold what a terminal obeys."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(error))
 
 
 def run_sequence(
@@ -77,14 +86,20 @@ def run_sequence(
         sequence = open_source(name, data_root=data_root, camera=camera, options=options, progress=bar)
     segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
     folder = result_folder(out, sequence.name)
+    clear_results(folder)
+    write_text(folder / "config.yaml", dump_config(config))  # where this cannot be written, an hour's results cannot
     pipeline, evaluation = track(sequence, segment, config, folder, console, save_masks=save_masks)
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
         console.print(table)
+    for note in evaluation.notes if evaluation is not None else ():
+        console.print(f"note: {note}", markup=False)
     console.print(f"results: {folder}", markup=False)  # brackets in the name are no markup
     if (failure := pipeline.run.failure) is not None:
         done = len(pipeline.slam.poses.statuses)
-        raise InputError(f"{failure}; the results of the {done} frames before are in {folder}")
+        raise InputError(f"{failure} (the results of the {done} frames before are in {folder})")
+    if (doubt := shortfall(pipeline, evaluation)) is not None:
+        raise InputError(f"{doubt} (the results are in {folder})")
 
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
@@ -212,8 +227,7 @@ def result_folder(out: Path | None, name: str) -> Path:
 
 @contextmanager
 def _log_to(path: Path) -> Iterator[None]:
-    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler = LogFile(path)
     _LOG.addHandler(handler)
     _LOG.setLevel(logging.INFO)
     _LOG.propagate = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sized
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
-from v3d_torch.errors import V3DError
+from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
 from v3d_torch.mapping.dense import DenseMap
@@ -20,6 +21,8 @@ from v3d_torch.objects.dynamics import Judged, Scene
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
+
+_LOG = logging.getLogger(__name__)
 
 FrameCallback = Callable[[RGBDFrame, Scene, Status], None]
 
@@ -44,6 +47,7 @@ class Run:
         seconds: wall time of the frames.
         failure: why the run ended before the sequence did; None when it did not.
         interrupted: whether the user ended it.
+        unscored: why masks were not evaluated although there are true ones.
     """
 
     dynamics: list[dict[str, object]] = field(default_factory=list)
@@ -52,6 +56,7 @@ class Run:
     seconds: float = 0.0
     failure: str | None = None
     interrupted: bool = False
+    unscored: str | None = None
 
 
 class Pipeline:
@@ -100,6 +105,10 @@ class Pipeline:
                     on_frame(frame, scene, self.slam.poses.statuses[-1])
         except V3DError as error:
             self.run.failure = str(error)
+        except Exception as error:  # what was computed is worth keeping when the program is at fault, too
+            _LOG.exception("the run broke")
+            why = (str(error).splitlines() or [""])[0]
+            self.run.failure = f"the program failed with {type(error).__name__}: {why}; report it with the run.log"
         except KeyboardInterrupt:
             self.run.interrupted = True
             if isinstance(self.sequence, Sized):
@@ -134,7 +143,12 @@ class Pipeline:
             snapshots.append(Snapshot(frame.stamp, frame.image, scene.objects))
 
     def _evaluate_masks(self, frame: RGBDFrame, scene: Scene) -> None:
-        truth = self.sequence.who_moves(frame.index) if isinstance(self.sequence, KnowsWhoMoves) else None
+        truth = None
+        if isinstance(self.sequence, KnowsWhoMoves) and self.run.unscored is None:
+            try:
+                truth = self.sequence.who_moves(frame.index)
+            except InputError as error:  # the truth is for the scores only
+                self.run.unscored = str(error)
         if truth is not None:
             objects = {judged.id: judged.mask for judged in scene.objects}
             self.run.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static, objects)

@@ -64,9 +64,9 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
         OutputError: when the folder cannot be written or the disk is full.
     """
     slam, sequence = pipeline.slam, pipeline.sequence
-    write_text(folder / "config.yaml", dump_config(slam.config))
     trajectory = slam.poses.trajectory()
-    write_trajectory(folder / "trajectory.txt", trajectory)
+    write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
+    write_text(folder / "config.yaml", dump_config(slam.config))
     keyframes = slam.mapper.map.keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(slam.mapper.map.T_cw)))

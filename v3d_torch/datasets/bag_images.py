@@ -64,6 +64,8 @@ def depth_from(message: Any, depth_scale: float, source: str) -> Tensor:
 def _rows(message: Any, pixel: np.dtype[Any], source: str) -> NDArray[Any]:
     """Pixels (H, W) or (H, W, C) without what pads the rows."""
     used = message.width * pixel.itemsize
+    if not used * message.height:
+        raise InputError(f"{source}: an image has no pixels; record it again")
     if used > message.step or len(message.data) < message.step * message.height:
         size = f"{message.width}x{message.height}"
         raise InputError(f"{source}: an image has less data than its {size} pixels need; record it again")

@@ -43,7 +43,7 @@ class OpenLORISSequence(PairedImages):
             folder,
             pairs,
             choose_camera(camera, folder, own),
-            _camera_poses(read_trajectory(truth), folder / "trans_matrix.yaml") if truth.is_file() else None,
+            lambda: _camera_poses(truth, folder / "trans_matrix.yaml") if truth.is_file() else None,
         )
 
 
@@ -68,8 +68,9 @@ def _read_camera(path: Path) -> PinholeCamera:
     return checked_camera(fields | {"distortion": distortion + [0.0] * (5 - len(distortion))}, str(path))
 
 
-def _camera_poses(base: Trajectory, calibration: Path) -> Trajectory:
-    """Poses of the robot's base to poses of its colour camera."""
+def _camera_poses(truth: Path, calibration: Path) -> Trajectory:
+    """Poses of the robot's base, in a file, to poses of its colour camera."""
+    base = read_trajectory(truth)
     return Trajectory(base.stamps, base.T_wc @ _between(_BASE, _COLOUR, calibration))
 
 

@@ -1,0 +1,94 @@
+"""Any bytes at the doors: parsed, or refused with one sentence; never another error, a hang, or memory without end."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from parsers import PARSERS, SEEDS, outcome
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.errors import V3DError
+from v3d_torch.types import Trajectory
+
+CRASHES = sorted((Path(__file__).parent / "crashes").glob("*/*"))
+"""Inputs that once led to another error, by parser."""
+
+SEARCH = settings(
+    max_examples=60, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+
+
+@st.composite
+def mutated(draw: st.DrawFn, seeds: list[bytes]) -> bytes:
+    """What a parser takes, with some bytes cut, put in or written over."""
+    content = draw(st.sampled_from(seeds))
+    for _ in range(draw(st.integers(0, 4))):
+        start = draw(st.integers(0, len(content)))
+        length = draw(st.sampled_from([0, 1, 1, 2, 4, 16, len(content)]))
+        new = draw(st.one_of(st.binary(max_size=8), st.sampled_from(WORDS)))
+        content = content[:start] + new + content[start + length :]
+    return content
+
+
+WORDS = [
+    b"nan",
+    b"-inf",
+    b"1e999",
+    b"0",
+    b"-1",
+    b"\n",
+    b",",
+    b" ",
+    b"\0",
+    b"\xff\xff\xff\xff",
+    b"\x7f\xff",
+    b"&a ",
+    b"*a",
+    b"!!",
+]
+"""What parsers stumble over."""
+
+
+def assert_sound(result: object) -> None:
+    """What has been taken for an input makes sense."""
+    if isinstance(result, V3DError):
+        assert len(str(result).strip().splitlines()) == 1 or "\n" not in str(result)
+    elif isinstance(result, Trajectory):
+        assert torch.isfinite(result.T_wc).all() and torch.isfinite(result.stamps).all()
+        assert (result.stamps.diff() > 0).all()
+        R = result.T_wc[:, :3, :3]
+        torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), rtol=0, atol=0.02)
+    elif isinstance(result, PinholeCamera):
+        assert math.isfinite(result.cx + result.cy + sum(result.distortion))
+        assert min(result.fx, result.fy, result.depth_scale, result.width, result.height) >= 1
+    elif isinstance(result, torch.Tensor):
+        assert result.ndim == 3 and (result.dtype == torch.uint8 or bool((result >= 0).all()))
+
+
+@pytest.mark.parametrize("parser", PARSERS)
+def test_what_a_parser_takes_to_begin_with(parser: str, tmp_path: Path) -> None:
+    taken = [
+        outcome(parser, seed, tmp_path / "x") if (tmp_path / "x").mkdir(exist_ok=True) is None else None
+        for seed in SEEDS[parser]
+    ]
+    assert any(not isinstance(result, V3DError) for result in taken)
+
+
+@pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("parser", PARSERS)
+@SEARCH
+@given(data=st.data())
+def test_any_bytes(parser: str, data: st.DataObject, tmp_path: Path) -> None:
+    content = data.draw(st.one_of(mutated(SEEDS[parser]), st.binary(max_size=300)))
+    assert_sound(outcome(parser, content, tmp_path))
+
+
+@pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("path", CRASHES, ids=lambda path: f"{path.parent.name}: {path.name}")
+def test_what_once_broke_a_parser(path: Path, tmp_path: Path) -> None:
+    assert_sound(outcome(path.parent.name, path.read_bytes(), tmp_path))
