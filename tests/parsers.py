@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import struct
 import tarfile
+import tempfile
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from bags import DEPTH, INFO, RGB, Kind, Messages
 from PIL import Image
 
 from v3d_torch.config_file import load_config
+from v3d_torch.datasets import openloris
+from v3d_torch.datasets.bag import BagSequence
 from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.encodings import COLOURS
@@ -63,6 +67,11 @@ def compressed(content: bytes) -> SimpleNamespace:
     return SimpleNamespace(format=form, data=np.frombuffer(content[1:], np.uint8))
 
 
+def frames_of(bag: Path) -> object:
+    """Every frame of a bag, of which the index or a message may be broken."""
+    return list(BagSequence(bag))
+
+
 def unpack(path: Path) -> object:
     folder = path.with_name("unpacked")
     return extract_tar(path, folder, max_bytes=1 << 20)
@@ -87,8 +96,28 @@ PARSERS: dict[str, Parser] = {
     "depth message": lambda content, folder: depth_from(message(content), 1000.0, "topic"),
     "compressed colour message": lambda content, folder: colour_from(compressed(content), "topic"),
     "compressed depth message": lambda content, folder: depth_from(compressed(content), 1000.0, "topic"),
+    "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
+    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
+    "ROS 1 bag": from_file("take.bag", frames_of),
+    "ROS 2 bag": from_file("take.db3", frames_of),
+    "mcap": from_file("take.mcap", frames_of),
     "archive": from_file("archive.tgz", unpack),
 }
+
+
+def _bag(kind: Kind) -> bytes:
+    """A frame of 8x6 pixels."""
+    to = Messages(kind)
+    matrix = [8.0, 0, 3.5, 0, 8.0, 2.5, 0, 0, 1]
+    pixels = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
+    messages = [
+        (INFO, 1.0, to.info(8, 6, matrix, [], [*matrix[:3], 0, *matrix[3:6], 0, *matrix[6:], 0])),
+        (RGB, 1.0, to.image(1.0, "mono8", pixels.astype(np.uint8))),
+        (DEPTH, 1.0, to.image(1.0, "16UC1", pixels)),
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        path = to.write(Path(folder) / "take", messages)
+        return (path if kind == "bag" else next(path.glob(f"*.{kind}"))).read_bytes()
 
 
 def _tar(mode: str) -> bytes:
@@ -125,6 +154,27 @@ _JPEGS = [_image("jpeg", mode) for mode in ("RGB", "L", "CMYK")]
 _TIFFS = [_image("tiff", mode) for mode in ("RGB", "I;16", "F")]
 _OTHERS = [_image("bmp", "RGB"), _image("ppm", "RGB"), _image("webp", "RGB")]
 _RASTERS = [*_PNGS, *_JPEGS, *_TIFFS, *_OTHERS]
+_SENSORS = b"""%YAML:1.0
+d400_color_optical_frame:
+   width: 8
+   height: 6
+   intrinsics: !!opencv-matrix
+      rows: 1
+      cols: 4
+      dt: d
+      data: [ 8.5, 3.5, 8.5, 2.5 ]
+"""
+_LINKS = b"""%YAML:1.0
+trans_matrix:
+   -
+      parent_frame: base_link
+      child_frame: d400_color_optical_frame
+      matrix: !!opencv-matrix
+         rows: 4
+         cols: 4
+         dt: d
+         data: [ 0., 0., 1., 0.3, -1., 0., 0., 0.05, 0., -1., 0., 0.4, 0., 0., 0., 1. ]
+"""
 _YAML = b"seed: 3\nobjects:\n  voting: {distance_threshold: 0.1, baselines: [0.0, .inf]}\n"
 
 SEEDS: dict[str, list[bytes]] = {
@@ -147,6 +197,11 @@ SEEDS: dict[str, list[bytes]] = {
     "compressed colour message": [b"\0" + image for image in _RASTERS],
     "compressed depth message": [bytes([i]) + struct.pack("<iff", 0, 1.0, 0.0) + _PNGS[-1] for i in (2, 3)]
     + [b"\1" + _PNGS[-1]],
+    "sensors.yaml": [_SENSORS],
+    "trans_matrix.yaml": [_LINKS],
+    "ROS 1 bag": [_bag("bag")],
+    "ROS 2 bag": [_bag("db3")],
+    "mcap": [_bag("mcap")],
     "archive": [_tar(mode) for mode in ("w", "w:gz", "w:bz2", "w:xz")],
 }
 """Bytes that a parser takes, to begin with."""

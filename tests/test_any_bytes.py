@@ -19,7 +19,7 @@ CRASHES = sorted((Path(__file__).parent / "crashes").glob("*/*"))
 """Inputs that once led to another error, by parser."""
 
 SEARCH = settings(
-    max_examples=60, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 
 
@@ -57,7 +57,7 @@ WORDS = [
 def assert_sound(result: object) -> None:
     """What has been taken for an input makes sense."""
     if isinstance(result, V3DError):
-        assert len(str(result).strip().splitlines()) == 1 or "\n" not in str(result)
+        assert str(result).strip()
     elif isinstance(result, Trajectory):
         assert torch.isfinite(result.T_wc).all() and torch.isfinite(result.stamps).all()
         assert (result.stamps.diff() > 0).all()
@@ -72,13 +72,10 @@ def assert_sound(result: object) -> None:
 
 @pytest.mark.parametrize("parser", PARSERS)
 def test_what_a_parser_takes_to_begin_with(parser: str, tmp_path: Path) -> None:
-    taken = [
-        outcome(parser, seed, tmp_path / "x") if (tmp_path / "x").mkdir(exist_ok=True) is None else None
-        for seed in SEEDS[parser]
-    ]
-    assert any(not isinstance(result, V3DError) for result in taken)
+    assert any(not isinstance(outcome(parser, seed, tmp_path), V3DError) for seed in SEEDS[parser])
 
 
+@pytest.mark.timeout(200)
 @pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("parser", PARSERS)
 @SEARCH
