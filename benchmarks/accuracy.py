@@ -33,11 +33,10 @@ from v3d_torch.evaluation.tables import paper_scores, paper_sequence
 from v3d_torch.files import write_text
 from v3d_torch.mapping.recorder import Status
 
-CHECKOUT = Path(__file__).resolve().parents[1]
 CONFIGURATIONS = {
     "full": [],
     "baseline": ["--segmenter", "none"],
-    "paper": ["--config", str(CHECKOUT / "configs" / "paper.yaml")],
+    "paper": ["--config", "paper"],
 }
 LIBRARIES = ("torch", "kornia", "onnxruntime")
 

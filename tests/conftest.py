@@ -8,7 +8,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from v3d_torch.datasets.demo.sequence import write_sequence
+
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fifth of a second of the demo, six frames with true masks, in which the walker is in the middle of the room."""
+    folder = tmp_path_factory.mktemp("sequences") / "moment"
+    write_sequence(folder, range(52, 58))
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -19,15 +19,14 @@ from typer.testing import CliRunner, Result
 from v3d_torch import study
 from v3d_torch.ablate import app
 from v3d_torch.config import Config
-from v3d_torch.config_file import load_config
-from v3d_torch.datasets.demo.sequence import write_sequence
+from v3d_torch.config_file import CONFIGS, load_config
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import OutputError
-from v3d_torch.evaluation.ablation import COLUMNS, VARIANTS, Outcome, csv_text, markdown, screen_table, verdict
+from v3d_torch.evaluation.ablation import COLUMNS, VARIANTS, csv_text, markdown, screen_table, verdict
+from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.study import SegmentOnce
 from v3d_torch.types import Instances, RGBDFrame
 
-CONFIGS = Path(__file__).parents[1] / "configs"
 FRAMES = 6
 NETWORK = ("--set", "segmentation.threads=1")
 
@@ -59,11 +58,8 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fifth of a second of the demo, with true masks, in which the walker is in the middle of the room."""
-    folder = tmp_path_factory.mktemp("sequences") / "moment"
-    write_sequence(folder, range(52, 52 + FRAMES))
-    return folder
+def sequence(moment: Path) -> Path:
+    return moment
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +86,11 @@ def test_all_variants_stand_in_one_table(done: tuple[Path, str]) -> None:
 
 
 def test_every_run_has_its_results_and_the_configuration_of_its_variant(done: tuple[Path, str]) -> None:
-    for variant, overrides in VARIANTS.items():
+    for variant in VARIANTS:
         folder = done[0] / "moment" / variant / "seed0"
         for name in ("trajectory.txt", "metrics.json", "dynamics.parquet", "run.log", "figures/trajectory.png"):
             assert (folder / name).is_file()
-        assert load_config(folder / "config.yaml") == load_config(overrides=[*overrides, NETWORK[1]])
+        assert load_config(folder / "config.yaml") == load_config(CONFIGS[variant], [NETWORK[1]])
 
 
 def test_the_file_of_figures_has_those_of_the_runs(done: tuple[Path, str]) -> None:
@@ -115,7 +111,7 @@ def test_the_network_runs_once_and_the_results_are_those_of_the_run_command(
     done: tuple[Path, str], sequence: Path, tmp_path: Path
 ) -> None:
     """``paper`` comes fifth: its instances are from the run of ``no_voting``."""
-    arguments = ("--seq", sequence, "--config", CONFIGS / "paper.yaml", "--out", tmp_path, *NETWORK)
+    arguments = ("--seq", sequence, "--config", CONFIGS["paper"], "--out", tmp_path, *NETWORK)
     process = shell("run", *arguments)
     assert process.returncode == 0, process.stderr
     ours = done[0] / "moment" / "paper" / "seed0"
@@ -127,14 +123,9 @@ def test_the_network_runs_once_and_the_results_are_those_of_the_run_command(
     assert seconds[0] < 0.5 * seconds[1]
 
 
-def test_variants_are_the_same_as_the_files_in_configs() -> None:
-    files = {path.stem: path for path in (CONFIGS / "ablations").iterdir()}
-    files |= {"paper": CONFIGS / "paper.yaml", "full": CONFIGS / "default.yaml"}
-    assert set(files) == set(VARIANTS)
-    configs = {variant: load_config(overrides=overrides) for variant, overrides in VARIANTS.items()}
-    for variant, config in configs.items():
-        assert config == load_config(files[variant]), variant
-    assert len({config.model_dump_json() for config in configs.values()}) == len(VARIANTS)
+def test_every_ablation_of_the_package_is_a_variant_and_no_two_are_the_same() -> None:
+    assert set(VARIANTS) | {"default"} == set(CONFIGS)
+    assert len({load_config(CONFIGS[variant]).model_dump_json() for variant in VARIANTS}) == len(VARIANTS)
 
 
 def test_help_is_light_and_names_the_variants() -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+import v3d_torch
 from v3d_torch.config import Config
-from v3d_torch.config_file import dump_config, load_config
+from v3d_torch.config_file import CONFIGS, dump_config, find_config, load_config
 from v3d_torch.errors import ConfigError
 
 
@@ -74,8 +75,31 @@ def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
     assert load_config(file) == Config()
 
 
-def test_every_shipped_configuration_loads() -> None:
-    files = sorted((Path(__file__).parents[1] / "configs").rglob("*.yaml"))
-    assert files
-    for file in files:
+def test_every_configuration_of_the_package_loads_by_its_name() -> None:
+    assert {"full", "default", "paper", "baseline", "no_voting"} <= set(CONFIGS)
+    for name, file in CONFIGS.items():
+        assert file.is_relative_to(Path(v3d_torch.__file__).parent)  # so that a wheel has it
+        assert find_config(name) == file
         load_config(file)
+    assert load_config(find_config("full")) == Config()
+    assert load_config(find_config("baseline")).segmentation.source == "none"
+
+
+def test_a_configuration_is_found_by_path_and_an_unknown_one_is_answered_with_the_names(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("seed: 3\n")
+    assert load_config(find_config(mine)).seed == 3
+    with pytest.raises(ConfigError, match=r"papper: is neither.*paper") as raised:
+        find_config("papper")
+    assert "no_voting" in str(raised.value)
+
+
+def test_a_mistake_is_laid_to_whom_it_belongs(tmp_path: Path) -> None:
+    file = tmp_path / "good.yaml"
+    file.write_text("seed: 3\n")
+    for override in ("sed=2", "seed=-1"):
+        with pytest.raises(ConfigError, match=r"^--set"):
+            load_config(file, [override])
+    file.write_text("seed: -1\n")
+    with pytest.raises(ConfigError, match=r"good\.yaml: seed"):
+        load_config(file, ["threads=2"])

@@ -19,7 +19,7 @@ from corpus.case import Case, Place, Right, Says
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from v3d_torch import run
+from v3d_torch import report, run
 
 CASES = [
     pytest.param(category, case, id=f"{category}: {case.name}")
@@ -149,10 +149,11 @@ def test_results_of_an_earlier_run_are_replaced_and_other_files_stay(place: Plac
 
 
 def test_nothing_that_a_run_writes_is_left_for_the_next(place: Place) -> None:
-    """Whoever adds a file to the results adds it to what `clear_results` removes."""
-    from v3d_torch.earlier_results import clear_results
+    """Whoever adds a file to the results adds it to what `prepare_folder` removes."""
+    from v3d_torch.earlier_results import prepare_folder
 
-    assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks"]).exit_code == 0
-    assert len(list(place.out.iterdir())) > 5
-    clear_results(place.out)
-    assert list(place.out.iterdir()) == []
+    assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks", "--mesh"]).exit_code == 0
+    assert CliRunner().invoke(report.app, [str(place.out)]).exit_code == 0
+    assert len(list(place.out.iterdir())) > 10
+    prepare_folder(place.out)
+    assert [path.name for path in place.out.iterdir()] == ["run.log"]

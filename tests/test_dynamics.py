@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -230,6 +231,8 @@ def test_a_walker_among_what_stands_is_dynamic_and_nothing_else_is(
     assert first(frames, 4, Verdict.DYNAMIC) <= 0.4 + 1e-6
     assert frames[-1][4].verdict is Verdict.DYNAMIC
     assert frames[-1][4].votes >= 2
+    ballots = {ballot for frame in frames for ballot in frame.scene.ballots}
+    assert any(elected == 4 for _, elected in ballots) and 4 not in {voter for voter, _ in ballots}
     assert {4} == {judged.id for frame in frames for judged in frame.scene.objects if judged.label == PERSON}
     assert of_class(frames, CHAIR) == of_class(frames, TV) == {Verdict.STATIC}
 
@@ -515,7 +518,7 @@ def test_the_margin_bounds_how_far_his_own_depth_is_followed() -> None:
         walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)),
         seconds=0.1,
         grown=-6,
-        overrides=("objects.mask.margin=2", "objects.mask.seam=0"),
+        overrides=("objects.mask.margin=2", "objects.mask.reach=0", "objects.mask.seam=0"),
     )[-1]
     own, away = frame.owner == 2, away_from(frame[3].mask)
     assert frame.scene.static[own & (away >= 3)].all()
@@ -632,6 +635,7 @@ class Literal:
         self._judge = ObjectDynamics(config, CAMERA)
         self._watch = BackgroundWatch(config.background, CAMERA)
         self._frame = -1
+        self.ballots: list[tuple[int, int]] = []
 
     def __call__(self, centroids: Tensor, T_wc: Tensor = HERE) -> dict[int, Judged]:
         self._frame += 1
@@ -647,6 +651,7 @@ class Literal:
         view = DepthView(self._frame / 30, torch.full((1, CAMERA.height, CAMERA.width), WALL), invert(T_wc))
         scene = self._judge(instances, clouds, view, self._watch(view), NO_WITNESSES)
         self._watch.remember(view)
+        self.ballots = scene.ballots
         return {judged.id: judged for judged in scene.objects}
 
 
@@ -661,10 +666,13 @@ def test_literal_rules_equal_algorithm_1_by_hand() -> None:
     moved[0, 1] = 0.1
     judged = show(moved)
     assert {number: judged[number].votes for number in judged} == {1: 2, 2: 0, 3: 1, 4: 1}
+    assert show.ballots == [(1, 3), (1, 4), (3, 1), (4, 1)]  # who voted, for whom
+    for number, place in enumerate(moved, start=1):
+        torch.testing.assert_close(judged[number].cloud.mean(dim=0), place, rtol=0.0, atol=1e-5)
     assert [judged[number].verdict is Verdict.DYNAMIC for number in (1, 2, 3, 4)] == [True, False, False, False]
     # Consecutive frames only, and a verdict for its frame only: in the next, where all stand, nobody moves.
     judged = show(moved)
-    assert {judged[number].votes for number in judged} == {0}
+    assert {judged[number].votes for number in judged} == {0} and show.ballots == []
     assert {judged[number].verdict for number in judged} == {Verdict.STATIC}
 
 
@@ -766,10 +774,12 @@ def test_equal_stamps_are_taken_in() -> None:
 def test_same_bytes_again() -> None:
     things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1)))
     first_run, second_run = (play(*things, seconds=0.5, camera=handheld) for _ in range(2))
+    no_tensors: dict[str, Any] = dict.fromkeys(("mask", "centroid", "cloud"))
     for a, b in zip(first_run, second_run, strict=True):
         assert torch.equal(a.scene.static, b.scene.static)
         for one, other in zip(a.scene.objects, b.scene.objects, strict=True):
             assert one.centroid.numpy().tobytes() == other.centroid.numpy().tobytes()
-            assert replace(one, mask=None, centroid=None) == replace(other, mask=None, centroid=None) or (  # type: ignore[arg-type]
+            assert one.cloud.numpy().tobytes() == other.cloud.numpy().tobytes()
+            assert replace(one, **no_tensors) == replace(other, **no_tensors) or (
                 math.isnan(one.chamfer) and math.isnan(other.chamfer) and one.verdict is other.verdict
             )

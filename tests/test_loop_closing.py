@@ -85,17 +85,24 @@ class Walker:
         self.true: list[Tensor] = []
         self.corrections: list[Tensor | None] = []
         self._seen: list[Tensor] = []  # the points behind each keyframe's features
+        self._since = 0  # first keyframe of which landmarks are remembered
 
-    def step(self, room: Room, T_wc: Tensor, *, adrift: bool = False) -> Keyframe:
-        """Go to a pose, by a motion that is wrong by the drift, and make a keyframe there."""
+    def step(self, room: Room, T_wc: Tensor, *, adrift: bool = False, guess: Tensor | None = None) -> Keyframe:
+        """Go to a pose, by a motion that is wrong by the drift, and make a keyframe there.
+
+        A guess that is wrong instead joins the pose of a camera that was lost; it has no landmark in view any more.
+        """
+        if guess is not None:
+            self._since = len(self.true)
         if self.true:
-            motion = invert(self.true[-1]) @ T_wc @ se3_exp(DRIFT)
+            motion = invert(self.true[-1]) @ T_wc @ se3_exp(DRIFT if guess is None else guess)
             T_cw = invert(invert(self.map.keyframes[-1].T_cw) @ motion)
         else:
             T_cw = invert(T_wc)
         features, which = room.look(T_wc, seed=len(self.true))
         known = torch.full((len(room.points),), -1)
-        for points, recent in list(zip(self._seen, self.map.keyframes, strict=True))[-3:]:
+        since = max(self._since, len(self._seen) - 3)
+        for points, recent in list(zip(self._seen, self.map.keyframes, strict=True))[since:]:
             known[points] = torch.maximum(known[points], recent.landmarks)
         keyframe = self.map.insert(len(self.true), len(self.true) / 3, T_cw, features, known[which])
         keyframe.adrift = adrift
@@ -265,6 +272,23 @@ def test_what_was_adrift_is_joined_by_the_loop() -> None:
     while walker.corrections[-1] is None:
         walker.step(room, on_the_way(len(walker.true)), adrift=True)
     assert not any(keyframe.adrift for keyframe in walker.map.keyframes)
+
+
+def test_the_loop_puts_a_wrong_guess_right_and_bends_nothing_for_it() -> None:
+    """A camera that was lost is guessed half a metre from where it is: the loop alone says how the parts lie."""
+    walker, room = Walker(), Room(seed=1)
+    guess = torch.tensor([0.4, 0, 0.3, 0, 0.35, 0], dtype=torch.float64)
+    for k in range(2 * LAP):
+        walker.step(room, on_the_way(k), adrift=k >= 12, guess=guess if k == 12 else None)
+        if walker.corrections[-1] is not None:
+            break
+        if k == 11:
+            before = walker.errors()
+        if k == 12:
+            assert walker.errors()[12] > 0.4
+    assert walker.closer.count == 1
+    torch.testing.assert_close(walker.errors()[:12], before, rtol=0, atol=1e-3)
+    assert walker.errors()[12:].max() < 0.1  # drift from the loop back to keyframe 12
 
 
 def test_deterministic(closed: Walker) -> None:

@@ -297,7 +297,8 @@ def square(frame: RGBDFrame) -> Instances:
 def run(folder: Path, out: Path) -> dict[str, object]:
     """Metrics of a run over the wall, in which the network finds the square."""
     sequence = TUMSequence(folder)
-    config = load_config(overrides=["objects.mask.margin=0", "objects.mask.seam=0", "objects.clouds.stride=1"])
+    exact = [f"objects.mask.{growth}=0" for growth in ("margin", "reach", "seam")]
+    config = load_config(overrides=[*exact, "objects.clouds.stride=1"])
     pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, square, config), out / "masks")
     pipeline()
     write_results(out, pipeline)

@@ -135,7 +135,7 @@ def test_lost_frames_at_the_ends_stay_where_they_were_predicted() -> None:
     stamps = [k / 10 for k in range(6)]
     poses = walk(stamps, lost=(0, 4, 5))
     T_wc = poses.trajectory().T_wc
-    torch.testing.assert_close(T_wc[0], EYE)
+    torch.testing.assert_close(T_wc[0], T_wc[1], rtol=0, atol=1e-9)  # of which no motion was known
     torch.testing.assert_close(T_wc[4], invert(se3_exp(TWIST * 0.4)), rtol=0, atol=1e-9)
     torch.testing.assert_close(T_wc[5], poses.trajectory().T_wc[5])
     assert len(T_wc) == 6
@@ -145,6 +145,79 @@ def test_a_camera_that_is_never_found_still_has_a_pose_for_every_frame() -> None
     trajectory = walk([0.0, 0.1, 0.2], lost=(0, 1, 2)).trajectory()
     assert trajectory.stamps.tolist() == [0.0, 0.1, 0.2]
     torch.testing.assert_close(trajectory.T_wc, EYE.expand(3, 4, 4))
+
+
+# --- lost frames whose motions are known
+
+
+HIDDEN = se3_exp(torch.tensor([3.0, -1.0, 2.0, 0.5, 1.0, -0.7], dtype=torch.float64))
+"""Where the world is that a camera does not know at first."""
+STEP = se3_exp(TWIST / 10)
+
+
+def begin_lost(count: int, unknown: tuple[int, ...] = (), tied_to: Keyframe | None = None) -> PoseRecorder:
+    """Lost frames of a camera whose motions are known but for some, in a world of its own."""
+    poses = PoseRecorder()
+    for index in range(count):
+        T_cp = None if index == 0 or index in unknown else STEP
+        T_cw = poses.predict(index / 10) if T_cp is None else T_cp @ poses.T_cw
+        assert poses.record(index / 10, estimate(T_cw, Status.LOST), tied_to, T_cp) is None
+    return poses
+
+
+def true_pose(index: int) -> Tensor:
+    """``T_cw`` in the world that is found."""
+    return torch.linalg.matrix_power(STEP, index) @ HIDDEN
+
+
+def test_frames_before_the_first_that_is_found_are_put_where_their_motions_say() -> None:
+    poses = begin_lost(5)
+    assert not poses.located
+    found = keyframe(true_pose(5))
+    T_new_old = poses.record(0.5, estimate(true_pose(5), landmarks=(1,)), found, STEP)
+    assert poses.located and T_new_old is not None
+    torch.testing.assert_close(T_new_old, invert(HIDDEN), rtol=0, atol=1e-9)
+    assert poses.statuses == [*5 * [Status.ODOMETRY], Status.TRACKED]
+    expected = invert(torch.stack([true_pose(index) for index in range(6)]))
+    torch.testing.assert_close(poses.trajectory().T_wc, expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(poses.predict(0.6), true_pose(6), rtol=0, atol=1e-9)  # at the speed it had
+    # From now on they follow the keyframe that the camera was found by.
+    found.T_cw = found.T_cw @ invert(STEP)
+    torch.testing.assert_close(poses.trajectory().T_wc, STEP @ expected, rtol=0, atol=1e-9)
+
+
+def test_before_a_motion_that_is_not_known_frames_stay_lost() -> None:
+    """Where they are is a guess then, but in the world that was found, and they keep their motions among each other."""
+    poses = begin_lost(8, unknown=(3,))
+    poses.record(0.8, estimate(true_pose(8)), keyframe(true_pose(8)), STEP)
+    assert poses.statuses == [*3 * [Status.LOST], *5 * [Status.ODOMETRY], Status.TRACKED]
+    T_cw = invert(poses.trajectory().T_wc)
+    expected = torch.stack([true_pose(index) for index in range(8)])
+    torch.testing.assert_close(T_cw[3:8], expected[3:], rtol=0, atol=1e-9)
+    torch.testing.assert_close(T_cw[1] @ invert(T_cw[0]), STEP, rtol=0, atol=1e-9)
+    assert (invert(T_cw)[2, :3, 3] - invert(T_cw)[3, :3, 3]).norm() < 0.1
+
+
+def test_a_camera_lost_on_the_way_comes_back_by_its_motions() -> None:
+    """The world is not moved then, and what no motion joins to the frame that is found is interpolated."""
+    poses = PoseRecorder()
+    own = keyframe(true_pose(0))
+    for index in range(3):
+        poses.record(index / 10, estimate(true_pose(index)), own, STEP)
+    for index in range(3, 8):
+        T_cp = None if index in (3, 5) else STEP
+        T_cw = poses.T_cw if T_cp is None else T_cp @ poses.T_cw
+        poses.record(index / 10, estimate(T_cw, Status.LOST), own, T_cp)
+    assert poses.record(0.8, estimate(true_pose(8)), own, STEP) is None
+    assert poses.statuses == [*3 * [Status.TRACKED], *2 * [Status.LOST], *3 * [Status.ODOMETRY], Status.TRACKED]
+    expected = invert(torch.stack([true_pose(index) for index in range(9)]))
+    torch.testing.assert_close(poses.trajectory().T_wc, expected, rtol=0, atol=1e-9)
+
+
+def test_found_in_a_part_adrift_they_are_adrift() -> None:
+    poses = begin_lost(3)
+    poses.record(0.3, estimate(true_pose(3)), keyframe(true_pose(3), adrift=True), STEP)
+    assert poses.statuses == 4 * [Status.ADRIFT]
 
 
 # --- keyframes move

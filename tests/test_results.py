@@ -13,19 +13,16 @@ import plyfile
 import pyarrow.parquet as pq
 import pytest
 import torch
-from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import Config, DenseMapConfig
+from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError, OutputError
-from v3d_torch.files import one_process_makes, write_png, write_text, written_whole
-from v3d_torch.lie import invert, se3_exp
-from v3d_torch.mapping.dense import DenseMap
-from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.evaluation import evaluate
+from v3d_torch.files import one_process_makes, refuse_unwritable, write_png, write_text, written_whole
+from v3d_torch.lie import se3_exp
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Scene
-from v3d_torch.odometry.orb import Features
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.results import write_results
 from v3d_torch.slam import V3DSLAM
@@ -121,6 +118,17 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
+def test_what_could_not_be_written_later_is_refused_now(tmp_path: Path) -> None:
+    refuse_unwritable(tmp_path / "new" / "room.map")
+    assert (tmp_path / "new").is_dir() and not any((tmp_path / "new").iterdir())
+    (tmp_path / "file").write_text("old")
+    refuse_unwritable(tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "old"
+    for path in (tmp_path, tmp_path / "file" / "room.map"):
+        with pytest.raises(OutputError, match="cannot be written"):
+            refuse_unwritable(path)
+
+
 def test_convention_colours_of_a_png_are_red_green_blue(tmp_path: Path) -> None:
     colour = np.random.default_rng(1).integers(0, 256, (5, 7, 3), dtype=np.uint8)
     write_png(tmp_path / "colour.png", colour)
@@ -148,75 +156,6 @@ def test_of_many_processes_one_makes_the_folder(tmp_path: Path) -> None:
     assert (tmp_path / "count").read_text() == "x"
 
 
-# --- the dense map
-
-
-def keyframe(T_cw: Tensor) -> Keyframe:
-    none = torch.zeros(0, dtype=torch.int64)
-    empty = Features(torch.zeros(0, 2), torch.zeros(0, 2).long(), none.double(), none, torch.zeros(0, 32).byte())
-    return Keyframe(0, 0, 0.0, T_cw, empty, none)
-
-
-def dense(**settings: float) -> DenseMap:
-    return DenseMap(DenseMapConfig(**settings), CAMERA)  # type: ignore[arg-type]
-
-
-def test_dense_map_equals_plain_voxel_means() -> None:
-    generator = torch.Generator().manual_seed(3)
-    fused = dense(stride=4, voxel_size=0.05, max_depth=3.0)
-    voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for _ in range(2):
-        T_cw = se3_exp(0.02 * torch.randn(6, generator=generator, dtype=torch.float64))
-        depth = 1.5 + 2 * torch.rand(1, 240, 320, generator=generator)
-        depth[0, :20] = 0.0
-        image = torch.randint(0, 256, (3, 240, 320), generator=generator, dtype=torch.uint8)
-        static = torch.rand(240, 320, generator=generator) > 0.3
-        fused.add(keyframe(T_cw), image, depth, static)
-        v, u = np.mgrid[0:240:4, 0:320:4]
-        z = depth[0].numpy()[v, u].astype(np.float64)
-        keep = static.numpy()[v, u] & (z > 0) & (z <= 3.0)
-        u, v, z = u[keep], v[keep], z[keep]
-        rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(z)], axis=1)
-        points = (rays * z[:, None]).astype(np.float32).astype(np.float64)
-        T_wc = np.linalg.inv(T_cw.numpy())
-        points = points @ T_wc[:3, :3].T + T_wc[:3, 3]
-        colours = image.numpy()[:, v, u].T
-        for point, colour in zip(points, colours, strict=True):
-            voxels.setdefault(tuple(np.floor(point / 0.05).astype(int)), []).append(np.r_[point, colour])
-    points, colours = fused.fuse()
-    # Rounding puts a few points on the other side of a voxel's face.
-    assert abs(len(points) - len(voxels)) <= 3
-    expected = np.array([np.mean(rows, axis=0) for rows in voxels.values()])
-    distance = torch.cdist(points.double(), torch.from_numpy(expected[:, :3]))
-    nearest, row = distance.min(dim=1)
-    assert (nearest < 1e-4).double().mean() > 0.999
-    close = (colours.double() - torch.from_numpy(expected[:, 3:])[row]).abs().max(dim=1).values < 0.51
-    assert close.double().mean() > 0.999
-
-
-def test_the_dense_map_follows_its_keyframes() -> None:
-    own = keyframe(torch.eye(4, dtype=torch.float64))
-    fused = dense(voxel_size=1e-3)
-    ones = torch.ones(240, 320, dtype=torch.bool)
-    fused.add(own, torch.zeros(3, 240, 320, dtype=torch.uint8), torch.full((1, 240, 320), WALL), ones)
-    before, _ = fused.fuse()
-    torch.testing.assert_close(before[:, 2], torch.full_like(before[:, 2], WALL))
-    own.T_cw = invert(se3_exp(torch.tensor([0.0, 0, 0.5, 0, 0, 0], dtype=torch.float64)))
-    after, _ = fused.fuse()
-    torch.testing.assert_close(after[:, 2], torch.full_like(after[:, 2], WALL + 0.5))
-    assert len(after) == len(before) == 60 * 80
-
-
-def test_an_empty_dense_map_has_no_points() -> None:
-    points, colours = dense().fuse()
-    assert points.shape == colours.shape == (0, 3)
-    fused = dense()
-    nothing = torch.zeros(240, 320, dtype=torch.bool)
-    image = torch.zeros(3, 240, 320, dtype=torch.uint8)
-    fused.add(keyframe(torch.eye(4, dtype=torch.float64)), image, torch.ones(1, 240, 320), nothing)
-    assert len(fused.fuse()[0]) == 0
-
-
 # --- the pipeline
 
 
@@ -241,7 +180,7 @@ def test_every_frame_is_reported_and_every_object_noted() -> None:
     assert [row["frame"] for row in done.dynamics] == list(range(FRAMES))
     assert {row["class"] for row in done.dynamics} == {"person"}
     assert done.dynamics[-1]["z"] == pytest.approx(WALL, abs=0.02)
-    assert [shot.stamp for shot in done.snapshots] == sorted(shot.stamp for shot in done.snapshots)
+    assert (stamps := [shot.frame.stamp for shot in done.snapshots]) == sorted(stamps)
     assert len(done.snapshots) == 6
     assert set(flow.slam.clock.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
     assert sum(flow.slam.clock.seconds.values()) <= done.seconds
@@ -293,8 +232,9 @@ def test_masks_that_cannot_be_written_end_the_run_with_a_sentence(tmp_path: Path
 def test_all_files_of_the_contract_are_there(results: Path) -> None:
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
     assert names == {
-        *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "map.ply"),
-        *("figures/trajectory.png", "figures/masks.png"),
+        *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json"),
+        *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+        *("figures/trajectory.png", "figures/masks.png", "figures/clusters.png"),  # one object alone has no vote
     }
 
 
@@ -330,6 +270,28 @@ def test_metrics_have_their_stable_keys(results: Path, run: Pipeline) -> None:
     assert sum(metrics["seconds_per_stage"].values()) <= metrics["seconds"]
 
 
+def test_frames_are_a_table_of_how_each_was_found_and_how_long_it_took(results: Path, run: Pipeline) -> None:
+    table = pq.read_table(results / "frames.parquet").to_pandas()
+    assert table["frame"].tolist() == list(range(FRAMES))
+    assert np.allclose(table["stamp"], run.sequence.stamps.numpy())
+    assert set(table["status"]) == {"tracked"}
+    assert table["frame"][table["keyframe"]].tolist() == [one.frame for one in run.slam.mapper.map.keyframes]
+    metrics = json.loads((results / "metrics.json").read_text())
+    for stage, total in metrics["seconds_per_stage"].items():
+        assert (table[f"seconds_{stage}"] >= 0).all()
+        assert table[f"seconds_{stage}"].sum() == pytest.approx(total, abs=2e-3)  # the end was looked for once more
+    assert (table["seconds_loop"] > 0).tolist() == table["keyframe"].tolist()
+
+
+def test_ground_truth_is_kept_beside_the_trajectory(results: Path, run: Pipeline) -> None:
+    written, truth = read_trajectory(results / "groundtruth.txt"), run.sequence.groundtruth
+    assert truth is not None
+    torch.testing.assert_close(written.T_wc, truth.T_wc, rtol=0, atol=1e-8)
+    again = evaluate(written, read_trajectory(results / "trajectory.txt"))
+    metrics = json.loads((results / "metrics.json").read_text())
+    assert again.ate.rmse == pytest.approx(metrics["ate"]["rmse"], abs=1e-7)
+
+
 def test_dynamics_are_a_table_that_pandas_reads(results: Path, run: Pipeline) -> None:
     table = pq.read_table(results / "dynamics.parquet").to_pandas()
     assert list(table.columns) == [
@@ -358,8 +320,33 @@ def test_the_map_is_the_wall_in_its_colours(results: Path) -> None:
         assert same > 0.5 > 0.3 > abs(other)
 
 
+def test_the_map_has_normals_towards_the_camera(results: Path) -> None:
+    vertices = plyfile.PlyData.read(results / "map.ply")["vertex"]
+    assert np.asarray(vertices["nz"]).max() < -0.9
+
+
+def test_the_way_shows_every_frame_and_keyframe(results: Path, run: Pipeline) -> None:
+    way = plyfile.PlyData.read(results / "trajectory.ply")
+    keyframes = len(run.slam.mapper.map.keyframes)
+    assert (way["vertex"].count, way["face"].count) == (FRAMES + 6 * keyframes, 5 * keyframes)
+    assert np.allclose(way["vertex"]["x"][:FRAMES], run.slam.poses.trajectory().T_wc[:, 0, 3])
+
+
+def test_a_mesh_is_written_on_demand(run: Pipeline, results: Path, tmp_path: Path) -> None:
+    assert not (results / "mesh.ply").exists()
+    config, meshed = run.slam.config, load_config(overrides=["dense_map.mesh.enabled=true"])
+    try:
+        run.slam.config = meshed
+        write_results(tmp_path, run)
+    finally:
+        run.slam.config = config
+    mesh = plyfile.PlyData.read(tmp_path / "mesh.ply")
+    assert np.abs(np.asarray(mesh["vertex"]["z"]) - WALL).max() < 0.02
+    assert mesh["face"].count > 1000 and mesh["vertex"]["red"].std() > 10
+
+
 def test_figures_are_pictures(results: Path) -> None:
-    for name in ("trajectory.png", "masks.png"):
+    for name in ("trajectory.png", "masks.png", "clusters.png"):
         image = cv2.imread(str(results / "figures" / name))
         assert image is not None and min(image.shape[:2]) >= 200 and max(image.shape[:2]) <= 4000
         assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
@@ -374,11 +361,12 @@ def test_without_ground_truth_there_are_no_scores(run: Pipeline, tmp_path: Path)
     assert "rmse" not in (metrics.get("ate") or {})
     assert metrics["frames"] == FRAMES
     assert (tmp_path / "figures" / "trajectory.png").is_file()
+    assert not (tmp_path / "groundtruth.txt").exists()
 
 
 def test_results_that_cannot_be_written_are_named(run: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"file/config\.yaml: cannot be written"):
+    with pytest.raises(OutputError, match=r"file/trajectory\.txt: cannot be written"):
         write_results(tmp_path / "file", run)
 
 

@@ -23,10 +23,13 @@ from v3d_torch.datasets.demo.sequence import FRAMES, RATE, write_sequence
 from v3d_torch.trajectory import read_trajectory
 
 FILES = {
-    *("trajectory.txt", "keyframes.txt", "config.yaml", "metrics.json", "dynamics.parquet", "map.ply", "run.log"),
+    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),
+    *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png"),
 }
-"""What every run leaves behind."""
+"""What every run leaves behind where there is ground truth."""
+OBJECTS = {"figures/voting.png", "figures/clusters.png"}
+"""And where objects were seen and voted."""
 
 WALKER_FROM, WALKER_Y = -1.75, 2.0
 STANDER = (-0.91, 3.05)
@@ -101,7 +104,7 @@ def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
 
 
 def test_a_run_leaves_all_its_files(first: Path, sequence: Path) -> None:
-    assert {name for name in files_in(first) if not name.startswith("masks/")} == FILES
+    assert {name for name in files_in(first) if not name.startswith("masks/")} == FILES | OBJECTS
     trajectory = read_trajectory(first / "trajectory.txt")
     listed = [float(line.split()[0]) for line in (sequence / "associations.txt").read_text().splitlines()]
     assert trajectory.stamps.tolist() == listed
@@ -279,7 +282,20 @@ def test_help_is_instant_and_names_every_option() -> None:
         [sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, env=environment(), check=True
     )
     assert time.monotonic() - start < 3
-    for option in ("seq", "data-root", "camera", "config", "set", "segmenter", "masks", "weights", "seed", "out"):
+    for option in (
+        "seq",
+        "data-root",
+        "camera",
+        "config",
+        "set",
+        "segmenter",
+        "masks",
+        "weights",
+        "seed",
+        "out",
+        "viz",
+        "rerun",
+    ):
         assert f"--{option}" in done.stdout
     probe = "import sys, v3d_torch.run; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
@@ -315,10 +331,10 @@ def near(people: pd.DataFrame, x: pd.Series | float, y: float, within: float) ->
 
 def test_demo_every_file_every_frame(demo: tuple[Path, str]) -> None:
     out, stdout = demo
-    assert files_in(out) == FILES
+    assert files_in(out) == FILES | OBJECTS
     assert len((out / "trajectory.txt").read_text().splitlines()) == FRAMES == 120
     assert "ATE rmse" in stdout
-    for name in ("figures/trajectory.png", "figures/masks.png"):
+    for name in ("figures/trajectory.png", "figures/masks.png", *OBJECTS):
         image = cv2.imread(str(out / name))
         assert image is not None and min(image.shape[:2]) >= 300 and max(image.shape[:2]) <= 4000
 

@@ -4,6 +4,11 @@ from .config_file import load_config
 from .datasets import load_sequence, open_source
 from .depth import DepthSmoother, smooth_depth
 from .errors import V3DError
+from .mapping.dense import PointMap, fuse_points
+from .mapping.mesh import Mesh, fuse_mesh
+from .mapping.normals import surface_normals
+from .mapping.storage import StoredMap, load_map, save_map
+from .mapping.views import StaticViews
 from .objects.assignment import match_instances
 from .objects.chamfer import ChamferDistance, chamfer_distance
 from .objects.clusters import LargestClusters, largest_clusters
@@ -12,7 +17,7 @@ from .objects.intra_motion import Deformation, IntraObjectMotion, intra_object_m
 from .objects.tracker import InstanceTracker
 from .objects.voting import HoughVoting, Votes, hough_vote
 from .objects.voxel import VoxelPool, Voxels, voxel_pool
-from .slam import V3DSLAM
+from .slam import V3DSLAM, Tracked
 from .types import Instances, RGBDFrame
 
 __all__ = [
@@ -28,8 +33,13 @@ __all__ = [
     "Instances",
     "IntraObjectMotion",
     "LargestClusters",
+    "Mesh",
     "PinholeCamera",
+    "PointMap",
     "RGBDFrame",
+    "StaticViews",
+    "StoredMap",
+    "Tracked",
     "V3DError",
     "Votes",
     "VoxelPool",
@@ -37,13 +47,18 @@ __all__ = [
     "back_project",
     "chamfer_distance",
     "dbscan",
+    "fuse_mesh",
+    "fuse_points",
     "hough_vote",
     "intra_object_motion",
     "largest_clusters",
     "load_config",
+    "load_map",
     "load_sequence",
     "match_instances",
     "open_source",
+    "save_map",
     "smooth_depth",
+    "surface_normals",
     "voxel_pool",
 ]

@@ -182,6 +182,14 @@ class MaskConfig(Section):
     margin: int = Field(8, ge=0, le=100)
     """Pixels by which it grows where the depth is the object's own, or missing: a network mask at a quarter of the
     resolution errs by about two of its pixels."""
+    reach: int = Field(32, ge=0, le=1000)
+    """Pixels by which it grows over surface that goes on without an edge: a hand at 3 m. The more it may, the more
+    of a table goes with whoever touches it. 0 turns it off."""
+    edge: float = Field(0.04, gt=0)
+    """Depth that differs by more than this share of it from one pixel to the fourth next is an edge: a surface seen
+    at 80 degrees differs by 0.03."""
+    least_part: float = Field(0.4, ge=0, le=1)
+    """It does not grow over a surface of which it would be a smaller part than this: the floor, a table."""
     tolerance: float = Field(0.05, gt=0)
     """Depth within this of the points around it is the object's own, metres; its error, with z^2, comes on top."""
     tolerance_growth: float = Field(0.01, ge=0)
@@ -238,6 +246,41 @@ class MotionConfig(Section):
     """Nor turns it faster, rad/s: a full turn in a second."""
 
 
+class DenseConfig(Section):
+    """Camera motion from all pixels, where features fail."""
+
+    halvings: tuple[int, ...] = (4, 2, 1)
+    """How often the image is halved on each level, coarse to fine. A turn of 60 pixels from frame to frame is 4 on the
+    coarsest. Full resolution takes half as long again, gains 0.1 mm on the demo and nothing on real images."""
+    points: int = Field(5000, gt=0)
+    """About so many pixels of a level take part, one of each cell: bounds the time. On the demo, twice as many gain
+    0.03 mm."""
+    iterations: int = Field(10, gt=0)
+    """Most Levenberg-Marquardt steps on a level."""
+    max_depth: float = Field(8.0, gt=0)
+    """Depth beyond is taken for none, metres, as for features."""
+    edge: float = Field(0.05, gt=0)
+    """Neighbours whose depth differs by more than this share lie on two surfaces, as in the depth's re-estimation."""
+    occlusion: float = Field(0.1, gt=0)
+    """Where inverse depth differs by more than this share, something else is seen: it tells nothing of the motion."""
+    freedom: float = Field(5.0, gt=0)
+    """Degrees of freedom of the t-distribution (Kerl et al., ICRA 2013, who found it from residuals)."""
+    inverse_depth_sigma: float = Field(0.003, gt=0)
+    """Least standard deviation of inverse depth, 1/m: twice the sensor's (Khoshelham and Elberink, Sensors 2012)."""
+    coarse_inverse_depth_sigma: float = Field(0.02, gt=0)
+    """The same above the finest level, so that brightness leads there: depth is taken at another time than colour, and
+    in a fast turn tells of another motion, which is an optimum of its own."""
+    min_overlap: float = Field(0.3, gt=0, le=1)
+    """Share of the reference's points that the current view must see."""
+    min_inlier_share: float = Field(0.75, gt=0, le=1)
+    """Share of those points, of the ones with depth, whose depth must agree."""
+    min_correlation: float = Field(0.9, gt=0, le=1)
+    """Least correlation of both views' brightness; unlike a residual it does not depend on light."""
+    min_observability: float = Field(1e-3, gt=0, le=1)
+    """Smallest over greatest eigenvalue of the information, translation measured in median depths: below, some motion
+    is not seen, as along a wall without texture. Of 693 pairs of neighbouring frames of TUM's fr1_rpy, 2 lie below."""
+
+
 class TrackingConfig(Section):
     """Frames against the local map."""
 
@@ -262,16 +305,19 @@ class TrackingConfig(Section):
 class MappingConfig(Section):
     """Keyframes and landmarks."""
 
+    enabled: bool = True
+    """Off: the camera is localised in a map that was loaded, and the map stays as it is."""
     max_gap: int = Field(20, gt=0)
     """At the latest after so many frames there is a new keyframe, frames."""
     min_tracked_ratio: float = Field(0.7, gt=0, le=1)
     """A frame that finds fewer landmarks than this share of its reference keyframe's becomes a keyframe."""
     min_tracked: int = Field(100, gt=0)
     """So does one that finds fewer landmarks than this."""
+    odometry_after: float = Field(0.5, ge=0)
+    """A camera that finds nothing of the map for so long, and knows its motion, maps on by that, seconds. Motions add
+    up their errors; most often the map is found again first."""
     restart_after: float = Field(1.0, gt=0)
     """A camera lost for so long maps on from where it is guessed to be, seconds; its poses are flagged as adrift."""
-    max_landmark_depth: float = Field(4.0, gt=0)
-    """New landmarks lie nearer, metres: beyond, a single depth is worth little."""
     landmarks_per_keyframe: int = Field(1000, gt=0)
     """Landmarks that a keyframe sees at most, old and new (ORB-SLAM2's number of features)."""
     bundle_keyframes: int = Field(8, ge=0)
@@ -280,15 +326,28 @@ class MappingConfig(Section):
     """Levenberg-Marquardt steps of a local bundle adjustment."""
 
 
-class DenseMapConfig(Section):
-    """The coloured map of what stands still."""
+class MeshConfig(Section):
+    """The triangle mesh of what stands still."""
 
-    stride: int = Field(4, gt=0, le=100)
-    """Every n-th pixel of a keyframe goes into the map."""
+    enabled: bool = False
+    """Whether there is one: it takes 5 s for the 99 keyframes of TUM's fr1/rpy."""
+    voxel_size: float = Field(0.02, gt=0)
+    """Side of a voxel, metres: the pixels kept lie 1.5 cm apart at 4 m, and depth errs by 2 cm there. Half of it takes
+    four times as long."""
+    truncation: float = Field(0.08, gt=0)
+    """Surfaces are taken to be so thick, metres: three times the error of depth at 4 m, and of poses."""
+
+
+class DenseMapConfig(Section):
+    """The coloured map of what stands still, and its mesh."""
+
+    stride: int = Field(2, gt=0, le=100)
+    """Every n-th pixel of a keyframe goes into the map, by row and by column: 8 mm apart at 2 m, less than a voxel."""
     max_depth: float = Field(4.0, gt=0)
     """Farther pixels stay out, metres: their noise would blur the map."""
     voxel_size: float = Field(0.01, gt=0)
     """Side of a voxel, metres: about the depth noise at 2 m."""
+    mesh: MeshConfig = MeshConfig()
 
 
 class LoopConfig(Section):
@@ -316,6 +375,7 @@ class Config(Section):
     objects: ObjectsConfig = ObjectsConfig()
     features: FeaturesConfig = FeaturesConfig()
     motion: MotionConfig = MotionConfig()
+    dense: DenseConfig = DenseConfig()
     tracking: TrackingConfig = TrackingConfig()
     mapping: MappingConfig = MappingConfig()
     loop: LoopConfig = LoopConfig()

@@ -20,6 +20,32 @@ from v3d_torch.validation import first_error
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Between which a number lies that is neither 0 nor infinite."""
 
+FULL = "full"
+"""The whole system, as it is by default."""
+
+_FOLDER = Path(__file__).parent / "configs"
+CONFIGS: Mapping[str, Path] = {
+    FULL: _FOLDER / "default.yaml",
+    **{path.stem: path for path in sorted(_FOLDER.rglob("*.yaml"))},
+}
+"""The configurations that come with the package, by name: the default (`FULL`), the paper's and the ablations'."""
+
+
+def find_config(name: str | Path) -> Path:
+    """The file of a configuration.
+
+    Args:
+        name: a key of `CONFIGS`, such as ``paper``, or the path of a YAML file.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    if str(name) in CONFIGS:
+        return CONFIGS[str(name)]
+    if (path := Path(name).expanduser()).is_file():
+        return path
+    raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
+
 
 def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
     """Defaults, then a YAML file, then ``section.key=value`` overrides.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import sys
@@ -15,32 +14,29 @@ from pathlib import Path
 from threading import Event
 from types import FrameType
 
-import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from v3d_torch.config import Config
-from v3d_torch.config_file import dump_config, load_config
+from v3d_torch.config_file import FULL, find_config, load_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
-from v3d_torch.earlier_results import clear_results
-from v3d_torch.errors import InputError, OutputError, V3DError
+from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.earlier_results import prepare_folder
+from v3d_torch.errors import ConfigError, InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
-from v3d_torch.files import write_text
-from v3d_torch.log_file import LogFile
+from v3d_torch.files import refuse_unwritable
+from v3d_torch.logged import log_to, run_logged, what_moves
 from v3d_torch.mapping.recorder import Status
+from v3d_torch.mapping.storage import StoredMap, load_map, save_map
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.results import write_results
 from v3d_torch.segmentation import make_segmenter
-from v3d_torch.segmentation.coco import class_name
 from v3d_torch.shortfall import shortfall
-from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
-
-_LOG = logging.getLogger("v3d_torch")
+from v3d_torch.viz.viewer import NULL_VIEWER, Viewer, make_viewer
 
 
 @contextmanager
@@ -67,12 +63,16 @@ def run_sequence(
     data_root: Path | None,
     camera: str | None,
     options: SourceOptions,
-    config_path: Path | None,
+    config_name: str | None,
     overrides: Sequence[str],
     masks: Path | None,
     weights: Path | None,
     out: Path | None,
     save_masks: bool,
+    viz: str | None,
+    rerun_file: Path | None,
+    map_in: Path | None,
+    map_out: Path | None,
 ) -> None:
     """Run one sequence with everything shown and written; see ``python -m v3d_torch.run --help``.
 
@@ -80,15 +80,25 @@ def run_sequence(
         V3DError: on bad input, or when the sequence ended early (the results up to there are written).
     """
     console = Console(soft_wrap=True)
-    config = load_config(config_path, overrides)
-    with _progress(console) as progress:
+    config = load_config(find_config(config_name or FULL), overrides)
+    if map_out is not None:
+        refuse_unwritable(map_out)
+    if map_in is None and not config.mapping.enabled:
+        raise ConfigError("mapping.enabled=false: there is no map to find the camera in; give one with --load-map")
+    with progress_bars(console) as progress:
         bar = _Bar(progress, "sequence")
         sequence = open_source(name, data_root=data_root, camera=camera, options=options, progress=bar)
+    known = None if map_in is None else load_map(map_in, sequence.camera, config)
     segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
+    viewer = make_viewer(viz, rerun_file, sequence)
     folder = result_folder(out, sequence.name)
-    clear_results(folder)
-    write_text(folder / "config.yaml", dump_config(config))  # where this cannot be written, an hour's results cannot
-    pipeline, evaluation = track(sequence, segment, config, folder, console, save_masks=save_masks)
+    if masks is not None and masks.resolve() == (folder / "masks").resolve():
+        raise OutputError(f"{masks}: would be written to while it is read; choose another folder with --out")
+    pipeline, evaluation = track(
+        sequence, segment, config, folder, console, save_masks=save_masks, viewer=viewer, known=known
+    )
+    if map_out is not None:
+        save_map(map_out, pipeline.slam.mapper.map, pipeline.views)
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
         console.print(table)
@@ -98,14 +108,39 @@ def run_sequence(
     if (failure := pipeline.run.failure) is not None:
         done = len(pipeline.slam.poses.statuses)
         raise InputError(f"{failure} (the results of the {done} frames before are in {folder})")
+    if known is not None and not pipeline.slam.poses.located:
+        raise InputError(f"{map_in}: no frame of {name} shows a place of this map; its results are in {folder}")
     if (doubt := shortfall(pipeline, evaluation)) is not None:
         raise InputError(f"{doubt} (the results are in {folder})")
 
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
     """`load_sequence`, with a bar where that takes a while."""
-    with _progress(console) as progress:
+    with progress_bars(console) as progress:
         return load_sequence(name, data_root=data_root, camera=camera, progress=_Bar(progress, "sequence"))
+
+
+def open_sequences(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
+    """Open several by their names in tables, in the order given, before the first of them runs.
+
+    Raises:
+        InputError: one is wrong, or two have the same name.
+        DownloadError: one is not here and cannot be downloaded.
+    """
+    sequences: dict[str, RGBDSequence] = {}
+    for name in dict.fromkeys(names):
+        sequence = open_sequence(name, data_root, None, console)
+        if isinstance(sequence, StoredFrames) and sequence.groundtruth_error is not None:
+            raise sequence.groundtruth_error  # runs that are compared are compared by their scores
+        if sequence.name in sequences:
+            raise InputError(f"{name}: another sequence is called {sequence.name} too; give each once, or them apart")
+        sequences[sequence.name] = sequence
+    return sequences
+
+
+def wide_console() -> Console:
+    """For tables: a log or a pipe has no width, there they are not squeezed into 80 columns."""
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
 def track(
@@ -116,6 +151,8 @@ def track(
     console: Console,
     *,
     save_masks: bool = False,
+    viewer: Viewer = NULL_VIEWER,
+    known: StoredMap | None = None,
 ) -> tuple[Pipeline, Evaluation | None]:
     """Run a sequence through a new system, show a bar, and write the log and all results.
 
@@ -126,6 +163,8 @@ def track(
         folder: for the results, there already.
         console: for the bar.
         save_masks: whether to write what is left out of tracking.
+        viewer: looks on.
+        known: map to find the camera in.
 
     Returns:
         What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
@@ -133,21 +172,19 @@ def track(
     Raises:
         OutputError: when the results cannot be written.
     """
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
-    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), folder / "masks" if save_masks else None)
-    with _log_to(folder / "run.log"):
-        total = len(sequence) if isinstance(sequence, Sized) else None
-        _LOG.info("%s: %s frames", sequence.name, "any number of" if total is None else total)
-        with _progress(console) as progress, interrupts_between_frames() as interrupted:
-            run = pipeline(_Verdicts(progress, total, interrupted))
-        evaluation = write_results(folder, pipeline)
-        if run.failure:
-            _LOG.error(run.failure)
+    total = len(sequence) if isinstance(sequence, Sized) else None
+    prepare_folder(folder)
+    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log_to(folder / "run.log"):
+        show = _Verdicts(progress, total, interrupted)
+        pipeline, evaluation = run_logged(
+            sequence, segment, config, folder, show, save_masks=save_masks, viewer=viewer, known=known
+        )
+    pipeline.run.interrupted |= interrupted.is_set()  # also when the frames were done, and the results were written
     return pipeline, evaluation
 
 
-def _progress(console: Console) -> Progress:
+def progress_bars(console: Console) -> Progress:
+    """Bars with counts, the time left and a note; none where nobody watches."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -185,10 +222,8 @@ class _Verdicts:
     def __call__(self, frame: RGBDFrame, scene: Scene, status: Status) -> None:
         self._frames += 1
         rate = self._frames / (time.perf_counter() - self._start)
-        verdicts = Counter(f"{class_name(judged.label)} {judged.verdict.value}" for judged in scene.objects)
-        objects = ", ".join(f"{count} {what}" for what, count in sorted(verdicts.items()) if "static" not in what)
-        self._progress.update(self._task, advance=1, note=f"{rate:.1f} frames/s  {status.value}  {objects}")
-        _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, status.value, objects or "nothing moves")
+        note = f"{rate:.1f} frames/s  {status.value}  {what_moves(scene)}"
+        self._progress.update(self._task, advance=1, note=note)
         if self._interrupted.is_set():
             raise KeyboardInterrupt
 
@@ -225,22 +260,6 @@ def result_folder(out: Path | None, name: str) -> Path:
     return folder
 
 
-@contextmanager
-def _log_to(path: Path) -> Iterator[None]:
-    handler = LogFile(path)
-    _LOG.addHandler(handler)
-    _LOG.setLevel(logging.INFO)
-    _LOG.propagate = False
-    try:
-        yield
-    except Exception:
-        _LOG.exception("the run broke")
-        raise
-    finally:
-        _LOG.removeHandler(handler)
-        handler.close()
-
-
 def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     slam, run = pipeline.slam, pipeline.run
     statuses = Counter(slam.poses.statuses)
@@ -248,7 +267,10 @@ def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
     table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frames}")
     table.add_row("found", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
-    table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes)}, {slam.loops.count}")
+    earlier = sum(keyframe.known for keyframe in slam.mapper.map.keyframes)
+    table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes) - earlier}, {slam.loops.count}")
+    if earlier:
+        table.add_row("known map", f"{earlier} keyframes")
     table.add_row("objects judged", ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none")
     table.add_row("frames a second", f"{len(slam.poses.statuses) / run.seconds:.1f}" if run.seconds else "-")
     if evaluation is not None:

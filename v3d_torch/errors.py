@@ -21,5 +21,9 @@ class WeightsError(V3DError):
     """Network weights cannot be found, do not match their checksum or are not what their name says."""
 
 
+class ViewerError(V3DError):
+    """A viewer cannot be shown: its library is missing, or there is no screen."""
+
+
 class OutputError(V3DError):
     """A result cannot be written: no permission, disk full."""

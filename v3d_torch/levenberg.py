@@ -27,6 +27,32 @@ def huber(squared: Tensor, limit: Tensor | float) -> tuple[Tensor, Tensor]:
     return torch.where(weights < 1, 2 * weights * squared - limit, squared), weights
 
 
+def student_t(squared: Tensor, freedom: float) -> tuple[Tensor, Tensor]:
+    """The t-distribution as a robust kernel: its long tails expect outliers (Kerl et al., ICRA 2013).
+
+    Args:
+        squared: squared errors s in sigmas, any shape.
+        freedom: degrees of freedom.
+
+    Returns:
+        costs rho(s), twice the negative log-likelihood, and weights d rho / d s, both as ``squared``.
+    """
+    return (freedom + 1) * torch.log1p(squared / freedom), (freedom + 1) / (freedom + squared)
+
+
+def student_t_scale(squared: Tensor, freedom: float) -> Tensor:
+    """The sigma with which a t-distribution fits errors best, by fixed-point iteration (Kerl et al., ICRA 2013).
+
+    Args:
+        squared: squared errors, shape :math:`(M,)`, at least one.
+        freedom: degrees of freedom.
+    """
+    variance = squared.mean()
+    for _ in range(10):
+        variance = (student_t(squared / variance.clamp(min=1e-12), freedom)[1] * squared).mean()
+    return variance.sqrt()
+
+
 @dataclass(frozen=True)
 class Minimum(Generic[State, System]):
     """What `levenberg_marquardt` found.

@@ -15,12 +15,13 @@ from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
-from v3d_torch.mapping.dense import DenseMap
 from v3d_torch.mapping.recorder import Status
-from v3d_torch.objects.dynamics import Judged, Scene
+from v3d_torch.mapping.views import StaticViews
+from v3d_torch.objects.dynamics import Judged, Scene, Verdict
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
+from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
 
 _LOG = logging.getLogger(__name__)
 
@@ -29,11 +30,11 @@ FrameCallback = Callable[[RGBDFrame, Scene, Status], None]
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A frame kept for the figure of masks."""
+    """A frame kept for the figures: its images, its pose as it was then, and what was said of it."""
 
-    stamp: float
-    image: Tensor
-    objects: list[Judged]
+    frame: RGBDFrame
+    T_cw: Tensor
+    scene: Scene
 
 
 @dataclass
@@ -41,8 +42,10 @@ class Run:
     """What a run leaves behind beside the trajectory.
 
     Attributes:
+        frames: a row per frame: its index and stamp, and the seconds of each stage.
         dynamics: a row per frame and object, as it goes into the table of the results.
         snapshots: frames for the figure of masks.
+        liveliest: the frame with the most votes for what is dynamic, of those with as many the one with most objects.
         mask_evaluation: of the frames whose true masks are known.
         seconds: wall time of the frames.
         failure: why the run ended before the sequence did; None when it did not.
@@ -50,8 +53,10 @@ class Run:
         unscored: why masks were not evaluated although there are true ones.
     """
 
+    frames: list[dict[str, float]] = field(default_factory=list)
     dynamics: list[dict[str, object]] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
+    liveliest: Snapshot | None = None
     mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)
     seconds: float = 0.0
     failure: str | None = None
@@ -66,16 +71,26 @@ class Pipeline:
         sequence: frames to take in, stored or as they come.
         slam: the system, new.
         masks: folder for an image per frame of what was left out of tracking; None for none.
+        viewer: looks on.
+        views: of the keyframes of a known map; None for none.
     """
 
     _SNAPSHOTS = 6
 
-    def __init__(self, sequence: RGBDStream, slam: V3DSLAM, masks: Path | None = None) -> None:
+    def __init__(
+        self,
+        sequence: RGBDStream,
+        slam: V3DSLAM,
+        masks: Path | None = None,
+        viewer: Viewer = NULL_VIEWER,
+        views: StaticViews | None = None,
+    ) -> None:
         self.sequence = sequence
         self.slam = slam
-        self.dense = DenseMap(slam.config.dense_map, sequence.camera)
+        self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.run = Run()
         self._masks = masks
+        self._viewer = viewer
         self._step = 1
 
     @property
@@ -100,7 +115,10 @@ class Pipeline:
                 if frame is None:
                     break
                 scene = self.slam(frame)
+                seconds = self.slam.clock.lap()
+                self.run.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
                 self._note(frame, scene)
+                self._viewer.show(frame, scene, self.slam, seconds)
                 if on_frame is not None:
                     on_frame(frame, scene, self.slam.poses.statuses[-1])
         except V3DError as error:
@@ -115,6 +133,10 @@ class Pipeline:
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
                 self.run.failure = f"interrupted after {done} of {total} frames"
         self.run.seconds = time.perf_counter() - start
+        try:
+            self._viewer.finish(self.slam)
+        except V3DError as error:
+            self.run.failure = self.run.failure or str(error)
         return self.run
 
     def _note(self, frame: RGBDFrame, scene: Scene) -> None:
@@ -125,22 +147,25 @@ class Pipeline:
             write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
         keyframes = self.slam.mapper.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.dense.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
-        self._keep_for_figure(frame, scene)
+            self.views.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
+        self._keep_for_figures(Snapshot(frame, self.slam.poses.T_cw, scene))
 
-    def _keep_for_figure(self, frame: RGBDFrame, scene: Scene) -> None:
-        """Keep every so manieth frame; of a stream, whose length is not known, ever fewer."""
+    def _keep_for_figures(self, shot: Snapshot) -> None:
+        """Keep every so manieth frame; of a stream, whose length is not known, ever fewer. And the liveliest."""
+        best = self.run.liveliest
+        if best is None or _liveliness(shot.scene) > _liveliness(best.scene):
+            self.run.liveliest = shot
         snapshots = self.run.snapshots
         if isinstance(self.sequence, Sized):
             step = max(len(self.sequence) // self._SNAPSHOTS, 1)
-            wanted = frame.index % step == step // 2 and len(snapshots) < self._SNAPSHOTS
+            wanted = shot.frame.index % step == step // 2 and len(snapshots) < self._SNAPSHOTS
         else:
             if len(snapshots) == 2 * self._SNAPSHOTS:
                 del snapshots[1::2]
                 self._step *= 2
-            wanted = frame.index % self._step == 0
+            wanted = shot.frame.index % self._step == 0
         if wanted:
-            snapshots.append(Snapshot(frame.stamp, frame.image, scene.objects))
+            snapshots.append(shot)
 
     def _evaluate_masks(self, frame: RGBDFrame, scene: Scene) -> None:
         truth = None
@@ -152,6 +177,11 @@ class Pipeline:
         if truth is not None:
             objects = {judged.id: judged.mask for judged in scene.objects}
             self.run.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static, objects)
+
+
+def _liveliness(scene: Scene) -> tuple[int, int]:
+    dynamic = {judged.id for judged in scene.objects if judged.verdict is Verdict.DYNAMIC}
+    return sum(elected in dynamic for _, elected in scene.ballots), len(scene.objects)
 
 
 def _row(frame: RGBDFrame, judged: Judged) -> dict[str, object]:

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 import sys
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-import plyfile
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from torch import Tensor
 
 from v3d_torch.config_file import dump_config
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
+from v3d_torch.mapping.dense import fuse_points
+from v3d_torch.mapping.mesh import fuse_mesh
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.segmentation.coco import class_name
+from v3d_torch.ply import write_ply
 from v3d_torch.trajectory import write_trajectory
 from v3d_torch.types import Trajectory
-from v3d_torch.viz.figures import mask_strip, trajectory_figure
+from v3d_torch.viz.frustums import camera_path
+from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
     import resource
@@ -51,7 +52,7 @@ _DYNAMICS = pa.schema(
 
 
 def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
-    """Write everything that a run leaves behind.
+    """Write everything that a run leaves behind, ``metrics.json`` last: where it is, all the rest is.
 
     Args:
         folder: of this run; made when it is not there.
@@ -67,19 +68,41 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
     write_text(folder / "config.yaml", dump_config(slam.config))
-    keyframes = slam.mapper.map.keyframes
-    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(slam.mapper.map.T_cw)))
+    own = torch.tensor([not keyframe.known for keyframe in slam.mapper.map.keyframes], dtype=torch.bool)
+    stamps = torch.tensor([keyframe.stamp for keyframe in slam.mapper.map.keyframes], dtype=torch.float64)
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps[own], invert(slam.mapper.map.T_cw[own])))
     evaluation = None
     if sequence.groundtruth is not None:
+        write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
         with suppress(InputError):  # too few poses to score are still worth writing
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
+    _write_table(folder / "frames.parquet", *_frames(pipeline))
+    _write_table(folder / "dynamics.parquet", pipeline.run.dynamics, _DYNAMICS)
+    _write_maps(folder, pipeline, trajectory)
+    draw_run(folder / "figures", pipeline, trajectory)
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
-    with written_whole(folder / "dynamics.parquet") as path:
-        pq.write_table(pa.Table.from_pylist(pipeline.run.dynamics, schema=_DYNAMICS), path)
-    _write_ply(folder / "map.ply", *pipeline.dense.fuse())
-    _draw(folder / "figures", pipeline, trajectory)
     return evaluation
+
+
+def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
+    """How each frame was found, whether the map kept it, and the seconds of each stage; 0 where one did not run."""
+    slam, rows = pipeline.slam, pipeline.run.frames
+    stages = list(slam.clock.seconds)
+    columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
+    kept = {keyframe.frame for keyframe in slam.mapper.map.keyframes}
+    table: list[dict[str, object]] = [
+        {
+            **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in kept},
+            **{f"seconds_{stage}": row.get(stage, 0.0) for stage in stages},
+        }
+        for row, status in zip(rows, slam.poses.statuses, strict=False)  # interrupted within a frame: one row less
+    ]
+    return table, pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
+
+
+def _write_table(path: Path, rows: list[dict[str, object]], schema: pa.Schema) -> None:
+    with written_whole(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
 
 
 def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, object]:
@@ -96,7 +119,8 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],
-        "keyframes": len(slam.mapper.map.keyframes),
+        "keyframes": sum(not keyframe.known for keyframe in slam.mapper.map.keyframes),
+        "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.keyframes),
         "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
         "loops": slam.loops.count,
         "failure": run.failure,
@@ -117,29 +141,22 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
 def _peak_memory_mb() -> float | None:
     if sys.platform == "win32":
         return None
+    if (status := Path("/proc/self/status")).is_file():  # Linux: there getrusage counts the parent process in
+        found = re.search(r"^VmHWM:\s*(\d+) kB$", status.read_text(encoding="utf-8"), re.MULTILINE)
+        if found is not None:
+            return int(found[1]) / (1 << 10)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def _write_ply(path: Path, points: Tensor, colours: Tensor) -> None:
-    vertices = np.empty(
-        len(points), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    )
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = points[:, column].numpy()
-    for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = colours[:, column].numpy()
-    with written_whole(path) as temporary:
-        plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(temporary)
-
-
-def _draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
-    groundtruth = pipeline.sequence.groundtruth
-    trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", title=pipeline.sequence.name)
-    snapshots = pipeline.run.snapshots
-    if snapshots:
-        overlays = [
-            [(judged.mask, f"{class_name(judged.label)} {judged.id}", judged.verdict.value) for judged in shot.objects]
-            for shot in snapshots
-        ]
-        mask_strip([shot.image for shot in snapshots], overlays, folder / "masks.png")
+def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
+    slam, views = pipeline.slam, pipeline.views
+    cloud = fuse_points(views, slam.config)
+    write_ply(folder / "map.ply", cloud.points, cloud.colours, normals=cloud.normals)
+    if slam.config.dense_map.mesh.enabled:
+        mesh = fuse_mesh(views, slam.config.dense_map)
+        write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    frames = [keyframe.frame for keyframe in slam.mapper.map.keyframes]
+    statuses = [status.value for status in slam.poses.statuses]
+    path = camera_path(trajectory, statuses, invert(slam.mapper.map.T_cw), frames, pipeline.sequence.camera)
+    write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

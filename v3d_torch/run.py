@@ -32,7 +32,8 @@ def main(
         float | None, typer.Option(help="Frames a second, where images or videos do not say their times.")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="YAML file over the defaults, such as configs/paper.yaml.")
+        str | None,
+        typer.Option(help="paper, baseline or another of the package, or a YAML file over the defaults."),
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="A value, such as objects.voting.distance_threshold=0.05.")
@@ -44,6 +45,16 @@ def main(
     seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
+    viz: Annotated[str | None, typer.Option(help="Look on while it runs, with: rerun.")] = None,
+    rerun: Annotated[Path | None, typer.Option(help="File (.rrd) to record for rerun, to look at it later.")] = None,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the room, too.")] = False,
+    map_out: Annotated[
+        Path | None, typer.Option("--save-map", metavar="FILE", help="Write the map, for later runs.")
+    ] = None,
+    map_in: Annotated[
+        Path | None, typer.Option("--load-map", metavar="FILE", help="Find the camera in a map, and go on with it.")
+    ] = None,
+    localise: Annotated[bool, typer.Option("--localise", help="With --load-map: leave the map as it is.")] = False,
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
@@ -54,18 +65,24 @@ def main(
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
+    overrides += ["dense_map.mesh.enabled=true"] if mesh else []
+    overrides += ["mapping.enabled=false"] if localise else []
     with exit_on_error():
         run_sequence(
             seq,
             data_root=data_root,
             camera=camera,
             options=SourceOptions(rgb_topic, depth_topic, info_topic, fps),
-            config_path=config,
+            config_name=config,
             overrides=overrides,
             masks=masks,
             weights=weights,
             out=out,
             save_masks=save_masks,
+            viz=viz,
+            rerun_file=rerun,
+            map_in=map_in,
+            map_out=map_out,
         )
 
 

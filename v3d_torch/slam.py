@@ -5,80 +5,120 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 
-import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
-from v3d_torch.lie import rigid
+from v3d_torch.errors import ConfigError
+from v3d_torch.lie import invert, rigid
+from v3d_torch.localise import Localiser
 from v3d_torch.loop.closing import LoopCloser
-from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.mapper import Mapper
-from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
+from v3d_torch.mapping.recorder import PoseRecorder, Status
 from v3d_torch.objects.background import BackgroundWatch
 from v3d_torch.objects.dynamics import ObjectDynamics, Scene
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.objects.witnesses import Witnesses
-from v3d_torch.odometry.motion import Motion, MotionEstimator
-from v3d_torch.odometry.orb import ORB, Features
+from v3d_torch.odometry.motion import MotionEstimator
+from v3d_torch.odometry.odometry import Odometry, View
+from v3d_torch.odometry.orb import ORB
 from v3d_torch.odometry.tracker import MapTracker
+from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
 from v3d_torch.types import RGBDFrame, Segmenter
 
 
-@dataclass(frozen=True)
-class View:
-    """What the last frame saw standing still: features, and the id of the landmark behind each, -1 for none."""
+@dataclass(frozen=True, kw_only=True)
+class Tracked(Scene):
+    """What is known of a frame when it has been taken in. Later corrections of its pose are in `V3DSLAM.poses`.
+
+    Attributes:
+        stamp: seconds.
+        T_wc: camera to world, float64, shape :math:`(4, 4)`; the world is the first frame's camera.
+        status: how the pose was found.
+    """
 
     stamp: float
-    features: Features
-    landmarks: Tensor
+    T_wc: Tensor
+    status: Status
 
 
 class V3DSLAM:
     """Tracks an RGB-D camera and maps what stands still.
 
+    Every stage is an attribute, and any callable of the same signature can take its place.
+
     Args:
-        camera: intrinsics.
-        segment: gives the instances of a frame.
+        camera: intrinsics; None takes those of the first frame.
+        segment: gives the instances of a frame; None takes what the configuration names.
         config: of all stages.
+        known: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
+
+    Raises:
+        WeightsError: the network's weights are not to be had.
     """
 
-    def __init__(self, camera: PinholeCamera, segment: Segmenter, config: Config | None = None) -> None:
-        self.config = config = config or Config()
-        self.segment = segment
+    def __init__(
+        self,
+        camera: PinholeCamera | None = None,
+        segment: Segmenter | None = None,
+        config: Config | None = None,
+        known: SparseMap | None = None,
+    ) -> None:
+        self.config = config or Config()
+        self.segment = segment or make_segmenter(self.config.segmentation)
+        self.poses = PoseRecorder()
+        self.clock = StageClock()
+        self._last: View | None = None
+        self._known = known
+        self._ready = camera is not None
+        if camera is not None:
+            self._set_up(camera)
+
+    def _set_up(self, camera: PinholeCamera) -> None:
+        config = self.config
         self.smooth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge)
         self.detect = ORB(config.features, camera)
         self.lift = CloudLifter(config.objects.clouds, camera)
-        self.motion = MotionEstimator(config.motion, config.features, camera, config.seed)
+        self.match = MotionEstimator(config.motion, config.features, camera, config.seed)
+        self.move = Odometry(config, camera, self.match)
         self.watch = BackgroundWatch(config.objects.background, camera)
         self.propose = partial(unnamed_instances, camera=camera, min_area=config.objects.background.min_area)
         self.judge = ObjectDynamics(config.objects, camera)
         self.track = MapTracker(config.tracking, config.features, camera)
-        self.mapper = Mapper(config, camera)
-        self.loops = LoopCloser(config.loop, self.motion, self.track, config.tracking.local_keyframes)
-        self.poses = PoseRecorder()
-        self.clock = StageClock()
-        self._last: View | None = None
+        self.mapper = Mapper(config, camera, self._known)
+        self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
+        for keyframe in self.mapper.map.keyframes:
+            self.loops.learn(keyframe)
+        self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
 
-    def __call__(self, frame: RGBDFrame) -> Scene:
-        """Take in the next frame; its pose is then in ``poses``.
+    def __call__(self, frame: RGBDFrame) -> Tracked:
+        """Take in the next frame.
 
-        Returns:
-            What the object stage says of the frame.
+        Raises:
+            ConfigError: nobody said which camera took the first frame.
         """
+        if not self._ready:
+            if frame.camera is None:
+                raise ConfigError("the camera is not known: give it to V3DSLAM, or frames that carry it")
+            self._set_up(frame.camera)
+            self._ready = True
         predicted = self.poses.predict(frame.stamp)
         with self.clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(replace(frame, T_cw=predicted))
+            placed = self.poses.located or not self.mapper.map.keyframes  # a known map does not tell where in it
+            instances = self.segment(replace(frame, T_cw=predicted if placed else None))
         with self.clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with self.clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
-            motion = self._move(frame.stamp, features)
-            T_cw = predicted if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
+            seen = View(frame, depth, features)
+            last, T_lw = self._last, self.poses.T_cw
+            motion = None if last is None else self.move(last, seen, predicted @ invert(T_lw))
+            T_cw = predicted if motion is None else rigid(motion.T_ba @ T_lw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             view = self.watch.look(frame.stamp, depth, T_cw)
             arrivals = self.watch(view, trusted=motion is not None)
@@ -87,64 +127,31 @@ class V3DSLAM:
         with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
-            scene = self.judge(instances, clouds, view, arrivals, self._witnesses(motion, features))
+            scene = self.judge(instances, clouds, view, arrivals, Witnesses(features.pixel, seen.matched(motion)))
             keep = features.on(scene.static)
-            static = features[keep]
         with self.clock("tracking"):  # III-E: the pose in the local map
-            carried = self._carry(motion, len(features))[keep]
-            estimate = self._localise(static, T_cw, carried, moved=motion is not None)
+            static, carried = features[keep], seen.carried(motion, last)[keep]
+            estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
         with self.clock("mapping"):  # keyframes, landmarks, local bundle adjustment
-            reference = self._reference(estimate)
-            self.poses.record(frame.stamp, estimate, reference)
+            reference = self.localise.reference(estimate)
+            T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)
+            if T_new_old is not None:
+                self._move_world(T_new_old)
             keyframe = self.mapper(frame, static, estimate, reference)
             if estimate.status is not Status.LOST:
                 self.watch.remember(replace(view, T_cw=self.poses.T_cw))
-            self._last = View(frame.stamp, static, estimate.landmarks if keyframe is None else keyframe.landmarks)
+            landmarks = estimate.landmarks if keyframe is None else keyframe.landmarks
+            self._last = View(frame, depth, static, scene.static, landmarks)
         if keyframe is not None:
             self.poses.anchor(keyframe)
             with self.clock("loop"):  # III-E: loop detection, pose graph
                 T_new_old = self.loops.close(keyframe, self.mapper.map)
                 if T_new_old is not None:
-                    self.judge.tracker.move_world(T_new_old)
-                    self.watch.move_world(T_new_old)
-        return scene
+                    self._move_world(T_new_old)
+        status = self.poses.statuses[-1]
+        return Tracked(**vars(scene), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)
 
-    def _move(self, stamp: float, features: Features) -> Motion | None:
-        if self._last is None:
-            return None
-        return self.motion(self._last.features, features, elapsed=stamp - self._last.stamp)
-
-    def _witnesses(self, motion: Motion | None, features: Features) -> Witnesses:
-        """Which features fit the motion since the last frame; none where nobody knows it."""
-        fits = torch.zeros(len(features), dtype=torch.bool)
-        if motion is not None:
-            fits[motion.pairs[:, 1]] = True
-        return Witnesses(features.pixel, fits)
-
-    def _carry(self, motion: Motion | None, count: int) -> Tensor:
-        """Ids of the landmarks that the motion's matches carry over from the last frame, -1 for none, (count,)."""
-        landmarks = torch.full((count,), -1, dtype=torch.int64)
-        if motion is not None and self._last is not None:
-            landmarks[motion.pairs[:, 1]] = self._last.landmarks[motion.pairs[:, 0]]
-        return landmarks
-
-    def _localise(self, static: Features, T_cw: Tensor, carried: Tensor, *, moved: bool) -> Estimate:
-        """Pose in the local map, else in a place seen before, else by the motion alone, else lost."""
-        if self.mapper.map.keyframes:
-            local = self.mapper.map.local(self.poses.landmarks, self.config.tracking.local_keyframes)
-            tracking = self.track(static, T_cw, local, carried)
-            if tracking is None:
-                place = self.loops.recognise(static, self.mapper.map)
-                tracking = place.tracking if place is not None else None
-            if tracking is not None:
-                self.mapper.map.record(tracking)
-                return Estimate(Status.TRACKED, tracking.T_cw, tracking.landmarks)
-        known = moved and self.poses.status in (Status.TRACKED, Status.ODOMETRY)
-        nothing = torch.full((len(static),), -1, dtype=torch.int64)
-        return Estimate(Status.ODOMETRY if known else Status.LOST, T_cw, nothing)
-
-    def _reference(self, estimate: Estimate) -> Keyframe | None:
-        """The keyframe that shares most with the frame, else the last one."""
-        keyframes = self.mapper.map.keyframes
-        best = self.mapper.map.covisible(estimate.landmarks[estimate.landmarks >= 0], 1)
-        return keyframes[int(best[0])] if len(best) else (keyframes[-1] if keyframes else None)
+    def _move_world(self, T_new_old: Tensor) -> None:
+        """Carry what is remembered along when the world is corrected under it."""
+        self.judge.tracker.move_world(T_new_old)
+        self.watch.move_world(T_new_old)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -14,11 +13,12 @@ import torch
 from rich.console import Console
 
 from v3d_torch.config import Config, SegmentationConfig
-from v3d_torch.config_file import load_config
-from v3d_torch.console import open_sequence, result_folder, track
+from v3d_torch.config_file import find_config, load_config
+from v3d_torch.console import open_sequences, result_folder, track, wide_console
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError, OutputError
-from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, Outcome, csv_text, markdown, screen_table
+from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, csv_text, markdown, screen_table
+from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.files import write_text
 from v3d_torch.segmentation import held_upright, make_source
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
@@ -60,14 +60,13 @@ def run_study(
     Raises:
         V3DError: on bad input, or when the study was interrupted or a run failed; what the others gave is written.
     """
-    # A log or a pipe has no width: there the tables are not squeezed into 80 columns.
-    console = Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
+    console = wide_console()
     configs = {
-        (variant, seed): load_config(None, [*overrides, *_changes(variant), f"seed={seed}"])
+        (variant, seed): load_config(_file(variant), [*overrides, f"seed={seed}"])
         for variant in variants
         for seed in range(seeds)
     }
-    sequences = _open(names, data_root, console)
+    sequences = open_sequences(names, data_root, console)
     network = cache(make_source)
     for config in configs.values():
         network(_as_held(config))  # what cannot be had is said before the first run, not after hours
@@ -95,26 +94,15 @@ def run_study(
         raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
 
 
-def _changes(variant: str) -> Sequence[str]:
+def _file(variant: str) -> Path:
     if variant not in VARIANTS:
         raise ConfigError(f"--variants {variant}: there is no such variant; there are {', '.join(VARIANTS)}")
-    return VARIANTS[variant]
+    return find_config(variant)
 
 
 def _as_held(config: Config) -> SegmentationConfig:
     """What the network itself is told: images are turned, where they are, before it sees them."""
     return config.segmentation.model_copy(update={"upright": False})
-
-
-def _open(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
-    """All sequences by name, before the first of them runs."""
-    sequences: dict[str, RGBDSequence] = {}
-    for name in dict.fromkeys(names):
-        sequence = open_sequence(name, data_root, None, console)
-        if sequence.name in sequences:
-            raise InputError(f"--seq {name}: another sequence is called {sequence.name} too, give them apart")
-        sequences[sequence.name] = sequence
-    return sequences
 
 
 def _run(

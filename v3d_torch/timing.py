@@ -17,6 +17,7 @@ class StageClock:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
+        self._lap: dict[str, float] = defaultdict(float)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -25,4 +26,11 @@ class StageClock:
         try:
             yield
         finally:
-            self.seconds[stage] += time.perf_counter() - start
+            elapsed = time.perf_counter() - start
+            self.seconds[stage] += elapsed
+            self._lap[stage] += elapsed
+
+    def lap(self) -> dict[str, float]:
+        """Seconds by stage since this was last asked: of a frame, when asked after each."""
+        lap, self._lap = dict(self._lap), defaultdict(float)
+        return lap

@@ -10,8 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,7 @@ class RGBDFrame:
         image: colour, uint8 RGB, shape :math:`(3, H, W)`, as the camera delivers it (distorted).
         depth: metres, float32, shape :math:`(1, H, W)`, pixel by pixel on the colour image; 0 = no measurement.
         T_cw: world to camera where the camera is expected to be, float64, shape :math:`(4, 4)`; None before it is.
+        camera: that took both; None where who takes the frame in knows it.
     """
 
     index: int
@@ -31,6 +37,44 @@ class RGBDFrame:
     image: Tensor
     depth: Tensor
     T_cw: Tensor | None = None
+    camera: PinholeCamera | None = None
+
+    @staticmethod
+    def of(
+        index: int,
+        stamp: float,
+        image: NDArray[np.uint8] | Tensor,
+        depth: NDArray[np.generic] | Tensor,
+        camera: PinholeCamera | None = None,
+    ) -> RGBDFrame:
+        """A frame from images as cameras, simulators and image libraries give them.
+
+        Args:
+            index: position in the sequence, from 0.
+            stamp: seconds.
+            image: colour, uint8 RGB, shape :math:`(H, W, 3)`.
+            depth: pixel by pixel on it, shape :math:`(H, W)`: metres where it is a floating-point image, else the
+                camera's units; 0 or not a number = no measurement.
+            camera: that took both; gives the units of depth, millimetres where there is none.
+
+        Raises:
+            InputError: an image has another shape or type.
+        """
+        colour, measured = torch.as_tensor(image), torch.as_tensor(np.asarray(depth).astype(np.float32))
+        if colour.dtype != torch.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
+            raise InputError(
+                f"frame {index}: the colour image is {colour.dtype} of shape {tuple(colour.shape)}; give uint8 RGB"
+                " of shape (H, W, 3)"
+            )
+        if measured.shape != colour.shape[:2]:
+            raise InputError(
+                f"frame {index}: the depth image has shape {tuple(measured.shape)}, the colour image"
+                f" {tuple(colour.shape)}; give depth of shape (H, W), registered to the colour image"
+            )
+        if not np.issubdtype(np.asarray(depth).dtype, np.floating):
+            measured = measured / (camera.depth_scale if camera is not None else 1000)
+        measured = measured.where(measured.isfinite() & (measured > 0), 0.0)
+        return RGBDFrame(index, stamp, colour.permute(2, 0, 1).contiguous(), measured[None], camera=camera)
 
 
 @dataclass(frozen=True)

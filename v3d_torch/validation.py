@@ -10,6 +10,6 @@ from pydantic import ValidationError
 def first_error(error: ValidationError) -> str:
     """The first of the values that a model refuses: its key, the rule and the value, cut where it is long."""
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
+    key = ".".join(str(part) for part in first["loc"]) or "the whole"
     rule = "write the keys of this section below it" if first["type"] == "model_type" else first["msg"].lower()
     return f"{key}: {rule}, got {reprlib.repr(first['input'])}"

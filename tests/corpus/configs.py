@@ -22,14 +22,12 @@ CASES = [
     Case(
         "not there",
         options("--config", "{root}/none.yaml"),
-        Says(
-            "{root}/none.yaml: cannot be read (No such file or directory); check that it is a file and who may read it"
-        ),
+        Says("{root}/none.yaml: is neither a configuration nor a YAML file; there are full, ..."),
     ),
     Case(
         "a folder",
         options("--config", "{seq}"),
-        Says("{seq}: cannot be read (Is a directory); check that it is a file and who may read it"),
+        Says("{seq}: is neither a configuration nor a YAML file; there are full, ..."),
     ),
     Case(
         "an image",
@@ -42,7 +40,7 @@ CASES = [
     Case(
         "a device without end",
         options("--config", "/dev/zero"),
-        Says("/dev/zero: is larger than 100 MB; a configuration is a YAML file"),
+        Says("/dev/zero: is neither a configuration nor a YAML file; there are full, ..."),
     ),
     Case(
         "UTF-16",

@@ -112,19 +112,25 @@ CASES = [
     Case(
         "the folder of the sequence",
         same_as_the_sequence,
-        Says("{seq}: holds something that no run has left; choose a new folder with --out"),
+        Says("{seq}/groundtruth.txt: is there and was left by no run; choose another folder with --out"),
     ),
     Case(
-        "a folder with something else",
-        lambda p: (p.out.mkdir(), (p.out / "thesis.tex").write_text(""))[0],
-        Says("{out}: holds something that no run has left; choose a new folder with --out"),
+        "a folder with a map of somebody else's",
+        write("../out/map.ply", "of somebody else"),
+        Says("{out}/map.ply: is there and was left by no run; choose another folder with --out"),
+    ),
+    Case("a folder with something else", write("../out/thesis.tex", ""), Right()),
+    Case(
+        "masks that are read from where they would be written",
+        all_of(write("../out/masks/1.png", ""), options("--segmenter", "masks", "--masks", "{out}/masks")),
+        Says("{out}/masks: would be written to while it is read; choose another folder with --out"),
     ),
     Case("an empty folder", lambda place: place.out.mkdir(), Right()),
     Case("results of an earlier run", all_of(results_of_an_earlier_run, SAVE), Right()),
     Case(
         "a folder that may not be written",
         closed(lambda place: place.out),
-        Says("{out}/config.yaml: cannot be written (Permission denied); free the disk or choose another folder"),
+        Says("{out}/run.log: cannot be written (Permission denied); choose another folder with --out"),
         lambda place: without_root_rights(),
     ),
     Case(

@@ -33,8 +33,7 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
         if (path := Path(name).expanduser()).exists():
             return path
     full_name = canonical_name(name)
-    shared = os.environ.get("V3D_DATA")
-    search = data_root or (Path(shared) if shared else cache_dir())
+    search = data_folder(data_root)
     for root in (search, cache_dir()):
         if found := _find(root, name, full_name):
             return found
@@ -47,6 +46,12 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
         return _download(full_name, data_root or cache_dir(), progress)
     except DownloadError as error:
         raise DownloadError(f"{short_name(full_name)} is not in {search}: {error}; get that file {put}") from error
+
+
+def data_folder(data_root: Path | None) -> Path:
+    """Where sequences are kept: ``data_root`` if given, else ``$V3D_DATA``, else the cache."""
+    shared = os.environ.get("V3D_DATA")
+    return data_root or (Path(shared) if shared else cache_dir())
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:

@@ -102,7 +102,8 @@ class RealSenseStream:
         # The memory of both images is librealsense's, which uses it again: what is made of it is a copy.
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOURS[encoding][0])
         units = np.asanyarray(depth.get_data())
-        return RGBDFrame(index, stamp, to_rgb(encoding, pixels), metres(units, units_per_metre))
+        image, measured = to_rgb(encoding, pixels), metres(units, units_per_metre)
+        return RGBDFrame(index, stamp, image, measured, camera=self.camera)
 
 
 def open_camera(name: str, camera: CameraChoice = None, *, fps: float | None = None) -> RealSenseStream:

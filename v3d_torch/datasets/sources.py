@@ -98,6 +98,11 @@ _UNKNOWN = (
 )
 
 
+def is_source(path: Path) -> bool:
+    """Whether a path holds anything of a known kind; opening it tells whether it is in order."""
+    return any(source.holds(path) for source in SOURCES)
+
+
 def open_path(path: Path, camera: CameraChoice, options: SourceOptions, progress: Progress | None) -> RGBDStream:
     """Open what a path holds.
 

@@ -62,7 +62,7 @@ class StoredFrames(ABC):
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, there is none with index {index}")
         image, depth = self._read(index)
-        return RGBDFrame(index=index, stamp=float(self.stamps[index]), image=image, depth=depth)
+        return RGBDFrame(index=index, stamp=float(self.stamps[index]), image=image, depth=depth, camera=self.camera)
 
     def check_first_frame(self, source: object) -> None:
         """Decode the first frame, so that what is wrong with every frame is said before anything else is done.

@@ -4,36 +4,19 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from io import StringIO
 from statistics import median
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.evaluation.cells import row, spread
+from v3d_torch.config_file import FULL
+from v3d_torch.evaluation.cells import Cell, row, shown_lowest, spread
+from v3d_torch.evaluation.outcome import Outcome, values_of
 
-FULL = "full"
-
-VARIANTS: Mapping[str, tuple[str, ...]] = {
-    "baseline": ("segmentation.source=none",),
-    "no_voting": ("objects.voting.enabled=false",),
-    "no_chamfer": ("objects.chamfer.enabled=false",),
-    "no_bridging": ("objects.identity.max_gap=0",),
-    "no_unnamed": ("objects.background.min_area=.inf",),
-    "as_held": ("segmentation.upright=false",),
-    "paper": (
-        "segmentation.upright=false",
-        "objects.voting.baselines=[0.0]",
-        "objects.background.enabled=false",
-        "objects.chamfer.baseline=0.0",
-        "objects.mask.confirm_still=0.0",
-        "objects.mask.hold_dynamic=0.0",
-    ),
-    FULL: (),
-}
-"""What each variant sets otherwise than the defaults. The checkout has the same as files, for ``run --config``."""
+VARIANTS = ("baseline", "no_voting", "no_chamfer", "no_bridging", "no_unnamed", "as_held", "paper", FULL)
+"""Names of the configurations that are compared (`v3d_torch.config_file.CONFIGS`), the whole system last."""
 
 LEGEND = (
     "Median and [range] over the seeds. ATE and RPE (over 1 s): RMSE; SD: of the ATE. Moving out, static out: share of"
@@ -66,39 +49,6 @@ COLUMNS: Mapping[str, Column] = {
     "masks.people_found": Column("found", ".0%", False),
 }
 """By the figure's place in ``metrics.json``."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What one run gave.
-
-    Attributes:
-        sequence: name.
-        variant: a key of `VARIANTS`.
-        seed: of the run.
-        metrics: as in its ``metrics.json``; empty where it failed.
-        failure: the sentence that it failed with; None where it did not.
-    """
-
-    sequence: str
-    variant: str
-    seed: int
-    metrics: Mapping[str, Any]
-    failure: str | None = None
-
-    def figure(self, place: str) -> float | None:
-        """The value at ``place``, such as ``ate.rmse``; None where it was not measured."""
-        value: Any = self.metrics
-        for key in place.split("."):
-            value = (value or {}).get(key)
-        return value
-
-    def __str__(self) -> str:
-        """One line for whoever waits."""
-        ate = self.figure("ate.rmse")
-        score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth to score it"
-        result = score if self.failure is None else f"failed: {self.failure}"
-        return f"{self.sequence}, {self.variant}, seed {self.seed}: {result}"
 
 
 def screen_table(outcomes: Sequence[Outcome]) -> Table:
@@ -142,7 +92,7 @@ def csv_text(outcomes: Sequence[Outcome]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["sequence", "variant", "seed", *COLUMNS, "failure"])
     for run in outcomes:
-        writer.writerow([run.sequence, run.variant, run.seed, *(run.figure(place) for place in COLUMNS), run.failure])
+        writer.writerow([run.sequence, run.config, run.seed, *(run.figure(place) for place in COLUMNS), run.failure])
     return text.getvalue()
 
 
@@ -166,34 +116,28 @@ def verdict(outcomes: Sequence[Outcome]) -> str:
     return f"The full system is worse than {best}: their ranges over the seeds do not overlap."
 
 
-class _Cell(NamedTuple):
-    text: str
-    best: bool
-
-
-def _summary(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[_Cell]]]:
+def _summary(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[Cell]]]:
     """Headings and a row of cells for each variant; figures that no run has are left out."""
     headings: list[str] = []
-    rows: dict[str, list[_Cell]] = {outcome.variant: [] for outcome in outcomes}
+    rows: dict[str, list[Cell]] = {outcome.config: [] for outcome in outcomes}
     for place, column in COLUMNS.items():
         measured = dict(_by_variant(outcomes, place))
         medians = {variant: median(values) for variant, values in measured.items() if values}
         if medians:
             headings.append(column.heading)
-            lowest = format(min(medians.values()), column.form)
+            lowest = shown_lowest(medians.values(), column.form)
             for variant, values in measured.items():
                 best = column.is_error and bool(values) and format(medians[variant], column.form) == lowest
-                rows[variant].append(_Cell(spread(values, column.form), best))
-    failed = {variant: sum(run.failure is not None for run in outcomes if run.variant == variant) for variant in rows}
+                rows[variant].append(Cell(spread(values, column.form), best))
+    failed = {variant: sum(run.failure is not None for run in outcomes if run.config == variant) for variant in rows}
     if any(failed.values()):
         headings.append("failed")
         for variant, count in failed.items():
-            rows[variant].append(_Cell(str(count), best=False))
+            rows[variant].append(Cell(str(count), best=False))
     return headings, rows
 
 
 def _by_variant(outcomes: Sequence[Outcome], place: str) -> Iterator[tuple[str, list[float]]]:
     """Variant and the values of a figure over the seeds, without those not measured."""
-    for variant in dict.fromkeys(outcome.variant for outcome in outcomes):
-        values = [outcome.figure(place) for outcome in outcomes if outcome.variant == variant]
-        yield variant, [value for value in values if value is not None]
+    for variant in dict.fromkeys(outcome.config for outcome in outcomes):
+        yield variant, values_of([outcome for outcome in outcomes if outcome.config == variant], place)

@@ -30,6 +30,21 @@ class RPE:
     delta: float
 
 
+@dataclass(frozen=True)
+class Drift:
+    """Error of each motion over a fixed time.
+
+    Attributes:
+        first: index of the pose of the estimate where the motion begins, increasing, int64, shape :math:`(P,)`.
+        trans: metres, shape :math:`(P,)`.
+        rot: degrees, shape :math:`(P,)`.
+    """
+
+    first: Tensor
+    trans: Tensor
+    rot: Tensor
+
+
 def relative_pose_error(
     groundtruth: Trajectory, estimate: Trajectory, matches: Matches, delta: float = 1.0
 ) -> RPE | None:
@@ -44,17 +59,22 @@ def relative_pose_error(
     Returns:
         None when no two matched poses are so far apart.
     """
+    errors = drift(groundtruth, estimate, matches, delta)
+    pairs = len(errors.first)
+    return RPE(Statistics.of(errors.trans), Statistics.of(errors.rot), pairs, delta) if pairs else None
+
+
+def drift(groundtruth: Trajectory, estimate: Trajectory, matches: Matches, delta: float = 1.0) -> Drift:
+    """The single errors that `relative_pose_error` summarises; its arguments."""
     truth = torch.full((len(estimate),), -1, dtype=torch.int64)
     truth[matches.estimate] = matches.groundtruth
     first, second = pairs_apart(estimate.stamps, delta)
     known = (truth[first] >= 0) & (truth[second] >= 0)
     first, second = first[known], second[known]
-    if not len(first):
-        return None
     trans, rot = relative_errors(
         groundtruth.T_wc[truth[first]], groundtruth.T_wc[truth[second]], estimate.T_wc[first], estimate.T_wc[second]
     )
-    return RPE(Statistics.of(trans), Statistics.of(rot), pairs=len(first), delta=delta)
+    return Drift(first, trans, rot)
 
 
 def pairs_apart(stamps: Tensor, delta: float) -> tuple[Tensor, Tensor]:

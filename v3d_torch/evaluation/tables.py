@@ -22,7 +22,8 @@ class Score(NamedTuple):
     sd: float | None
 
 
-_HEADINGS = {"ate": "ATE, m", "rpe_trans": "RPE, m/s", "rpe_rot": "RPE, deg/s"}
+HEADINGS = {"ate": "ATE, m", "rpe_trans": "RPE, m/s", "rpe_rot": "RPE, deg/s"}
+"""Each metric of the paper's tables, with its unit."""
 
 
 @cache
@@ -70,7 +71,7 @@ def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
     if short is None:
         return None
     scores = paper_scores()
-    rows = {method: [scores[metric][short][method] for metric in _HEADINGS] for method in scores["ate"][short]}
+    rows = {method: [scores[metric][short][method] for metric in HEADINGS] for method in scores["ate"][short]}
     rows["this result"] = _scores(evaluation)
     best = [
         min(score.rmse for score in column if score.rmse is not None) for column in zip(*rows.values(), strict=True)
@@ -78,7 +79,7 @@ def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
 
     table = Table(title=f"{short}: the paper's tables and this result")
     table.add_column("method")
-    for heading in _HEADINGS.values():
+    for heading in HEADINGS.values():
         table.add_column(f"{heading} RMSE", justify="right")
         table.add_column("SD", justify="right")
     for method, row in rows.items():

@@ -12,7 +12,7 @@ from v3d_torch.config import LoopConfig
 from v3d_torch.lie import invert
 from v3d_torch.loop.places import PlaceIndex
 from v3d_torch.loop.pose_graph import optimise_pose_graph
-from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.local_map import Keyframe, Loop, SparseMap
 from v3d_torch.odometry.motion import MotionEstimator
 from v3d_torch.odometry.orb import Features
 from v3d_torch.odometry.tracker import MapTracker, Tracking
@@ -49,12 +49,12 @@ class LoopCloser:
         self._tracker = tracker
         self._local_keyframes = local_keyframes
         self._index = PlaceIndex()
-        self._loops: list[tuple[int, int, Tensor]] = []
-
-    @property
-    def count(self) -> int:
+        self.count = 0
         """Loops closed so far."""
-        return len(self._loops)
+
+    def learn(self, keyframe: Keyframe) -> None:
+        """Make a keyframe a place that can be recognised."""
+        self._index.add(keyframe.index, keyframe.features.descriptors)
 
     def recognise(self, features: Features, sparse_map: SparseMap, exclude: Iterable[int] = ()) -> Place | None:
         """Recognise where ``features`` were seen before, outside of the excluded keyframes.
@@ -69,8 +69,7 @@ class LoopCloser:
                 continue
             known = keyframe.landmarks[keyframe.landmarks >= 0]
             local = sparse_map.local(known, self._local_keyframes)
-            carried = torch.full((len(features),), -1, dtype=torch.int64)
-            carried[motion.pairs[:, 1]] = keyframe.landmarks[motion.pairs[:, 0]]
+            carried = motion.carry(keyframe.landmarks, len(features))
             tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, carried)
             if tracking is not None and tracking.count >= self._config.min_inliers:
                 return Place(keyframe, tracking)
@@ -85,12 +84,13 @@ class LoopCloser:
             The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`; None without a loop.
         """
         place = self._find(keyframe, sparse_map) if self._config.enabled else None
-        self._index.add(keyframe.index, keyframe.features.descriptors)
+        self.learn(keyframe)
         if place is None:
             return None
         # T_ij is the pose of camera j in camera i: old keyframe i, new keyframe j, as the place says it.
         T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
-        self._loops.append((place.keyframe.index, keyframe.index, T_ij))
+        sparse_map.loops.append(Loop(place.keyframe.index, keyframe.index, T_ij))
+        self.count += 1
         T_cw_before = keyframe.T_cw
         self._correct(sparse_map)
         sparse_map.fuse(keyframe, place.tracking.landmarks)
@@ -100,7 +100,7 @@ class LoopCloser:
 
     def _find(self, keyframe: Keyframe, sparse_map: SparseMap) -> Place | None:
         """A place seen before that neither time nor the map connects with the keyframe; none soon after another."""
-        if self._loops and keyframe.index - self._loops[-1][1] < self._config.min_gap:
+        if sparse_map.loops and keyframe.index - sparse_map.loops[-1].j < self._config.min_gap:
             return None
         near = sparse_map.shared(keyframe.landmarks[keyframe.landmarks >= 0]).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_gap, keyframe.index + 1)
@@ -110,10 +110,10 @@ class LoopCloser:
         T_cw = sparse_map.T_cw
         edges = sparse_map.covisibility(self._COVISIBLE)
         measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
-        loops = torch.tensor([[i, j] for i, j, _ in self._loops])
+        loops = torch.tensor([[loop.i, loop.j] for loop in sparse_map.loops])
         solved = optimise_pose_graph(
             invert(T_cw),
             torch.cat([edges, loops]),
-            torch.cat([measured, torch.stack([T_ij for _, _, T_ij in self._loops])]),
+            torch.cat([measured, torch.stack([loop.T_ij for loop in sparse_map.loops])]),
         )
         sparse_map.move_keyframes(invert(solved.T_wc))

@@ -2,64 +2,90 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from v3d_torch.camera import BackProjector, PinholeCamera
-from v3d_torch.config import DenseMapConfig
-from v3d_torch.lie import invert
-from v3d_torch.mapping.local_map import Keyframe
+from v3d_torch.camera import back_project
+from v3d_torch.config import Config
+from v3d_torch.depth import smooth_depth
+from v3d_torch.mapping.free_space import looked_through
+from v3d_torch.mapping.normals import surface_normals
+from v3d_torch.mapping.views import StaticView, StaticViews
+from v3d_torch.objects.voxel import voxel_pool
+
+_BATCH = 1_000_000
+"""Points that wait to be taken into the map: hundreds of MB less than all at once, and as fast."""
 
 
-class DenseMap:
-    """Collects the static pixels of keyframes.
+@dataclass(frozen=True)
+class PointMap:
+    """Coloured points with normals.
 
-    Args:
-        config: resolution and range.
-        camera: back-projects the depth.
+    Attributes:
+        points: world frame, metres, float32, shape :math:`(N, 3)`.
+        colours: RGB, uint8, shape :math:`(N, 3)`.
+        normals: unit vectors out of the surface, float32, shape :math:`(N, 3)`.
     """
 
-    def __init__(self, config: DenseMapConfig, camera: PinholeCamera) -> None:
-        self._config = config
-        self._project = BackProjector(camera)
-        self._views: list[tuple[Keyframe, Tensor, Tensor]] = []
+    points: Tensor
+    colours: Tensor
+    normals: Tensor
 
-    def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor) -> None:
-        """Remember what a keyframe saw.
+    def __len__(self) -> int:
+        return self.points.shape[0]
 
-        Args:
-            keyframe: whose pose will place the points.
-            image: uint8 RGB, shape :math:`(3, H, W)`.
-            depth: metres, shape :math:`(1, H, W)`.
-            static: pixels that stand still, bool, shape :math:`(H, W)`.
-        """
-        step = self._config.stride
-        z = depth[0, ::step, ::step]
-        keep = static[::step, ::step] & (z > 0) & (z <= self._config.max_depth)
-        points = self._project(depth[None])[0, ::step, ::step][keep]
-        self._views.append((keyframe, points, image[:, ::step, ::step].permute(1, 2, 0)[keep]))
 
-    def fuse(self) -> tuple[Tensor, Tensor]:
-        """All views in the world, one point per voxel: the mean of place and colour.
+@torch.no_grad()
+def fuse_points(views: StaticViews, config: Config) -> PointMap:
+    """All views in the world, one point per voxel: the mean of place, colour and normal.
 
-        Returns:
-            Points, metres, float32, :math:`(N, 3)`, and their colours, uint8 RGB, :math:`(N, 3)`.
-        """
-        sums, counts = torch.zeros(0, 6, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-        for keyframe, seen, colour in self._views:
-            T_wk = invert(keyframe.T_cw)
-            points = seen.to(torch.float64) @ T_wk[:3, :3].T + T_wk[:3, 3]
-            # Taking the views in one by one keeps the memory at the size of the map.
-            sums = torch.cat([sums, torch.cat([points, colour.to(torch.float64)], dim=1)])
-            counts = torch.cat([counts, torch.ones(len(points), dtype=torch.float64)])
-            _, voxel = torch.unique(self._keys(sums[:, :3] / counts[:, None]), return_inverse=True)
-            size = int(voxel.max()) + 1 if len(voxel) else 0
-            sums = torch.zeros(size, 6, dtype=torch.float64).index_add_(0, voxel, sums)
-            counts = torch.zeros(size, dtype=torch.float64).index_add_(0, voxel, counts)
-        means = sums / counts[:, None]
-        return means[:, :3].to(torch.float32), means[:, 3:].round().to(torch.uint8)
+    What has no normal lies on the edge of a surface and stays out: depth there is a mean of what is before and behind.
+    So does what as many views look through as see it: people whom a mask missed are there in a few views only.
 
-    def _keys(self, points: Tensor) -> Tensor:
-        """A number per voxel; 21 bits for each axis reach 10 km to either side at 1 cm."""
-        x, y, z = ((points / self._config.voxel_size).floor().to(torch.int64) + (1 << 20)).unbind(dim=1)
-        return (x << 42) + (y << 21) + z
+    Args:
+        views: of keyframes.
+        config: of the dense map, and of what counts as looked through.
+    """
+    size = config.dense_map.voxel_size
+    sums, counts = torch.zeros(0, 9, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
+    waiting: list[Tensor] = []
+    for view in views:
+        waiting.append(_rows(view, views, config))
+        if sum(map(len, waiting)) > max(_BATCH, len(sums)):  # a map that grows is gone through ever more seldom
+            sums, counts, waiting = *_take_in(sums, counts, waiting, size), []
+    sums, counts = _take_in(sums, counts, waiting, size)
+    means = sums / counts[:, None]
+    means = means[~looked_through(means[:, :3], views, config.objects.background)]
+    return PointMap(
+        points=means[:, :3].to(torch.float32),
+        colours=means[:, 3:6].round().to(torch.uint8),
+        normals=normalize(means[:, 6:], dim=1).to(torch.float32),
+    )
+
+
+def _rows(view: StaticView, views: StaticViews, config: Config) -> Tensor:
+    """What a view adds to the map: place, colour and normal of its points, float64, shape (N, 9)."""
+    depth = view.depth[None, None]
+    smooth = smooth_depth(depth, config.depth.kernel_size, config.depth.sigma, config.depth.edge)
+    normals = surface_normals(back_project(smooth, views.rays))[0]
+    keep = (normals != 0).any(dim=-1) & (depth[0, 0] <= config.dense_map.max_depth)
+    points = back_project(depth, views.rays)[0][keep].to(torch.float64)
+    R_wc, t_wc = view.T_wc[:3, :3], view.T_wc[:3, 3]
+    colours = view.colour.permute(1, 2, 0)[keep].to(torch.float64)
+    return torch.cat([points @ R_wc.T + t_wc, colours, normals[keep].to(torch.float64) @ R_wc.T], dim=1)
+
+
+def _take_in(sums: Tensor, counts: Tensor, waiting: list[Tensor], size: float) -> tuple[Tensor, Tensor]:
+    """Sums and numbers of points per voxel, with those that wait."""
+    sums = torch.cat([sums, *waiting])
+    counts = torch.cat([counts, torch.ones(len(sums) - len(counts), dtype=counts.dtype)])
+    places = (sums[:, :3] / counts[:, None])[None]
+    voxels = voxel_pool(places, torch.ones(places.shape[:2], dtype=torch.bool), size)
+    occupied = voxels.counts.shape[1]
+    return (
+        sums.new_zeros(occupied, 9).index_add_(0, voxels.owner[0], sums),
+        counts.new_zeros(occupied).index_add_(0, voxels.owner[0], counts),
+    )

@@ -23,7 +23,7 @@ class Keyframe:
 
     Attributes:
         index: number of the keyframe, from 0.
-        frame: index of its frame in the sequence.
+        frame: index of its frame in the sequence; -1 for a keyframe of an earlier run.
         stamp: seconds.
         T_cw: world to camera, float64, shape :math:`(4, 4)`; the back end moves it.
         features: on pixels that stood still.
@@ -39,6 +39,26 @@ class Keyframe:
     landmarks: Tensor
     adrift: bool = False
 
+    @property
+    def known(self) -> bool:
+        """Whether an earlier run made it."""
+        return self.frame < 0
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A motion between two keyframes that a place seen again tells.
+
+    Attributes:
+        i: index of the older keyframe.
+        j: index of the newer one.
+        T_ij: pose of camera j in camera i, float64, shape :math:`(4, 4)`.
+    """
+
+    i: int
+    j: int
+    T_ij: Tensor
+
 
 class SparseMap:
     """Keyframes and landmarks with their observations, as tables of tensors.
@@ -51,9 +71,10 @@ class SparseMap:
 
     def __init__(self, config: MappingConfig, features: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._features = features
-        self._camera = camera
+        self.features = features
+        self.camera = camera
         self.keyframes: list[Keyframe] = []
+        self.loops: list[Loop] = []
         self.landmarks = Table(
             point=((3,), torch.float64),
             direction=((3,), torch.float64),
@@ -109,7 +130,9 @@ class SparseMap:
         return keyframe
 
     def record(self, tracking: Tracking) -> None:
-        """Count which landmarks a frame found of those it should have seen."""
+        """Count which landmarks a frame found of those it should have seen; in a map that stays as it is, nothing."""
+        if not self._config.enabled:
+            return
         found = tracking.landmarks[tracking.landmarks >= 0]
         self.landmarks["found"][found] += 1
         self.landmarks["visible"][tracking.visible] += 1
@@ -152,7 +175,9 @@ class SparseMap:
         )
 
     def covisibility(self, least: int) -> Tensor:
-        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and all consecutive ones.
+        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and consecutive ones.
+
+        Not those between which the camera was lost: what joins them is a guess.
 
         Returns:
             int64, shape :math:`(E, 2)`, sorted.
@@ -164,7 +189,8 @@ class SparseMap:
         shared = scipy.sparse.triu(seen @ seen.T, k=1).tocoo()
         enough = shared.data >= least
         pairs = torch.from_numpy(np.stack([shared.row[enough], shared.col[enough]], axis=1).astype(np.int64))
-        first = torch.arange(len(self.keyframes) - 1)
+        adrift = torch.tensor([keyframe.adrift for keyframe in self.keyframes], dtype=torch.bool)
+        first = torch.nonzero(adrift[:-1] == adrift[1:])[:, 0]
         return torch.cat([pairs, torch.stack([first, first + 1], dim=1)]).unique(dim=0)
 
     def move_keyframes(self, T_cw: Tensor) -> None:
@@ -214,24 +240,25 @@ class SparseMap:
         self.landmarks["alive"][(elusive & (age > 0)) | lonely] = False
 
     def _fresh(self, features: Features, landmarks: Tensor) -> Tensor:
-        """Features that become landmarks: unmatched, with good depth, as many as the map wants, spread."""
-        near = (features.depth > 0) & (features.depth <= self._config.max_landmark_depth)
-        if int(near.sum()) < self._config.min_tracked:
-            near = features.depth > 0  # a far scene is better than none
-        fresh = torch.nonzero((landmarks < 0) & near)[:, 0]
+        """Features that become landmarks: unmatched, with depth, as many as the map wants, spread.
+
+        Far ones as well: their depth is worth little, and has its weight, but they tell how the camera turns. Where
+        people fill the view they are often all there is.
+        """
+        fresh = torch.nonzero((landmarks < 0) & (features.depth > 0))[:, 0]
         wanted = max(self._config.landmarks_per_keyframe - int((landmarks >= 0).sum()), 0)
-        return fresh[spread(features.pixel[fresh], wanted, self._features.cell)]
+        return fresh[spread(features.pixel[fresh], wanted, self.features.cell)]
 
     def _create(self, keyframe: int, T_cw: Tensor, features: Features) -> Tensor:
         T_wc = invert(T_cw)
-        points = self._camera.lift(features.uv, features.depth) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        points = self.camera.lift(features.uv, features.depth) @ T_wc[:3, :3].T + T_wc[:3, 3]
         sight = points - T_wc[:3, 3]
         distance = sight.norm(dim=1)
         ones = torch.ones(len(features), dtype=torch.int64)
         return self.landmarks.append(
             point=points,
             direction=sight / distance[:, None],
-            reach=distance * self._features.scale ** features.octave.to(torch.float64),
+            reach=distance * self.features.scale ** features.octave.to(torch.float64),
             descriptor=features.descriptors,
             keyframe=keyframe * ones,
             found=ones,

@@ -17,14 +17,15 @@ class Mapper:
     Args:
         config: of the whole system.
         camera: of the frames.
+        known: map to go on with; None to begin a new one.
     """
 
-    def __init__(self, config: Config, camera: PinholeCamera) -> None:
+    def __init__(self, config: Config, camera: PinholeCamera, known: SparseMap | None = None) -> None:
         self._config = config
         self._camera = camera
         self._most_tracked = 0  # landmarks found by a frame since the last keyframe
-        self._lost_since: float | None = None
-        self.map = SparseMap(config.mapping, config.features, camera)
+        self._untracked_since: float | None = None
+        self.map = SparseMap(config.mapping, config.features, camera) if known is None else known
 
     def __call__(
         self, frame: RGBDFrame, static: Features, estimate: Estimate, reference: Keyframe | None
@@ -44,26 +45,32 @@ class Mapper:
             return None
         keyframe = self.map.insert(frame.index, frame.stamp, estimate.T_cw, static, estimate.landmarks)
         keyframe.adrift = reference is not None and (estimate.status is Status.LOST or reference.adrift)
-        self._most_tracked, self._lost_since = 0, None
+        self._most_tracked, self._untracked_since = 0, None
         adjust_locally(self.map, keyframe, self._config, self._camera)
         self.map.cull()
         return keyframe
 
     def _wants(self, frame: RGBDFrame, static: Features, estimate: Estimate) -> bool:
         config = self._config.mapping
+        if not config.enabled:
+            return False
         self._most_tracked = max(self._most_tracked, estimate.count)
-        if estimate.status is Status.LOST:
-            return self._may_start(frame.stamp, static)
-        self._lost_since = None
-        if estimate.status is Status.ODOMETRY:
-            return True
+        if estimate.status is not Status.TRACKED:
+            return self._may_go_on(frame.stamp, static, estimate.status)
+        self._untracked_since = None
         weak = estimate.count < max(config.min_tracked, config.min_tracked_ratio * self._most_tracked)
         return weak or frame.index - self.map.keyframes[-1].frame >= config.max_gap
 
-    def _may_start(self, stamp: float, static: Features) -> bool:
-        """A camera without a map, or lost for long, starts where it is guessed to be, once it sees enough."""
-        if self._lost_since is None:
-            self._lost_since = stamp
-        patience = self._config.mapping.restart_after if self.map.keyframes else 0.0
-        enough = int((static.depth > 0).sum()) >= self._config.mapping.min_tracked
-        return enough and stamp - self._lost_since >= patience
+    def _may_go_on(self, stamp: float, static: Features, status: Status) -> bool:
+        """Without the map for some time, a camera maps on from where it is thought to be, once it sees enough.
+
+        A map of an earlier run is gone on with from a place that is found in it, and from no other.
+        """
+        config = self._config.mapping
+        if status is Status.LOST and self.map.keyframes and self.map.keyframes[-1].known:
+            return False
+        if self._untracked_since is None:
+            self._untracked_since = stamp
+        patience = config.restart_after if status is Status.LOST else config.odometry_after
+        enough = int((static.depth > 0).sum()) >= config.min_tracked
+        return enough and (not self.map.keyframes or stamp - self._untracked_since >= patience)

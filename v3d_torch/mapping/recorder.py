@@ -17,7 +17,7 @@ class Status(StrEnum):
     """How a frame's pose was found."""
 
     TRACKED = "tracked"  # in the map
-    ODOMETRY = "odometry"  # by its motion since the frame before
+    ODOMETRY = "odometry"  # by its motion since the frame before, or to the one after
     ADRIFT = "adrift"  # in a part of the map that only a guess joins to the rest
     LOST = "lost"  # not at all: predicted, and interpolated once the camera is found again
 
@@ -48,10 +48,11 @@ class _Entry:
     status: Status
     keyframe: Keyframe | None  # None before the first
     T_ck: Tensor
+    linked: bool  # whether the motion since the frame before is known
 
     @property
     def T_cw(self) -> Tensor:
-        return self.T_ck if self.keyframe is None else self.T_ck @ self.keyframe.T_cw
+        return self.T_ck @ _pose(self.keyframe)
 
 
 class PoseRecorder:
@@ -70,6 +71,11 @@ class PoseRecorder:
         return self._entries[-1].status if self._entries else None
 
     @property
+    def located(self) -> bool:
+        """Whether any frame was found so far."""
+        return self._last_found() > -torch.inf
+
+    @property
     def statuses(self) -> list[Status]:
         """Of all frames."""
         return [entry.status for entry in self._entries]
@@ -86,21 +92,56 @@ class PoseRecorder:
         elapsed = min(stamp - self._entries[-1].stamp, self._MAX_PREDICTION)
         return se3_exp(self._velocity * elapsed) @ self.T_cw
 
-    def record(self, stamp: float, estimate: Estimate, keyframe: Keyframe | None) -> None:
-        """Note a frame's pose relative to ``keyframe``."""
+    def record(
+        self, stamp: float, estimate: Estimate, keyframe: Keyframe | None, T_cp: Tensor | None = None
+    ) -> Tensor | None:
+        """Note a frame's pose relative to ``keyframe``.
+
+        Lost frames whose motions up to a frame that is found are known are put where these say. So are, by a guess,
+        those before the first that is found: their world was none.
+
+        Args:
+            stamp: seconds.
+            estimate: of the frame.
+            keyframe: that it is tied to.
+            T_cp: the camera's motion since the frame before, previous camera to this one; None where it is not known.
+
+        Returns:
+            Where the camera is found for the first time: the correction of the world as it was guessed until then, new
+            world from old, shape :math:`(4, 4)`; else None.
+        """
         status = estimate.status
         if status is Status.TRACKED and keyframe is not None and keyframe.adrift:
             status = Status.ADRIFT
-        T_kw = keyframe.T_cw if keyframe is not None else torch.eye(4, dtype=torch.float64)
+        T_new_old = None
+        if self.status is Status.LOST and status is not Status.LOST:
+            expected = self.predict(stamp) if T_cp is None else T_cp @ self.T_cw
+            correction, first = rigid(invert(estimate.T_cw) @ expected), not self.located
+            self._put_right(correction, keyframe, linked=T_cp is not None, first=first)
+            T_new_old = correction if first else None
+        T_kw = _pose(keyframe)
         if self._entries:
             elapsed = stamp - self._entries[-1].stamp
             if estimate.status is Status.LOST:
                 self._velocity = self._velocity * (stamp - self._last_found() < self._MAX_PREDICTION)
             elif self.status is not Status.LOST and elapsed > 0:
                 self._velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
-        self._entries.append(_Entry(stamp, status, keyframe, rigid(estimate.T_cw @ invert(T_kw))))
+        T_ck = rigid(estimate.T_cw @ invert(T_kw))
+        self._entries.append(_Entry(stamp, status, keyframe, T_ck, linked=T_cp is not None))
         if estimate.count:
             self.landmarks = estimate.landmarks[estimate.landmarks >= 0]
+        return T_new_old
+
+    def _put_right(self, T_new_old: Tensor, keyframe: Keyframe | None, *, linked: bool, first: bool) -> None:
+        """Move the lost frames before one that is found, as far back as motions are known; all, before the first."""
+        found = Status.ADRIFT if keyframe is not None and keyframe.adrift else Status.ODOMETRY
+        for index in reversed(range(len(self._entries))):
+            entry = self._entries[index]
+            if entry.status is not Status.LOST or not (linked or first):
+                break
+            T_ck = rigid(entry.T_cw @ invert(T_new_old) @ invert(_pose(keyframe)))
+            self._entries[index] = _Entry(entry.stamp, found if linked else Status.LOST, keyframe, T_ck, entry.linked)
+            linked = linked and entry.linked
 
     def anchor(self, keyframe: Keyframe) -> None:
         """The last frame became a keyframe: from now on its pose is the keyframe's, and so is what it saw."""
@@ -109,7 +150,8 @@ class PoseRecorder:
             status = Status.ADRIFT
         elif status is Status.LOST:
             status = Status.TRACKED  # the first of all
-        self._entries[-1] = _Entry(keyframe.stamp, status, keyframe, torch.eye(4, dtype=torch.float64))
+        own = torch.eye(4, dtype=torch.float64)
+        self._entries[-1] = _Entry(keyframe.stamp, status, keyframe, own, self._entries[-1].linked)
         self.landmarks = keyframe.landmarks[keyframe.landmarks >= 0]
 
     def trajectory(self) -> Trajectory:
@@ -122,6 +164,11 @@ class PoseRecorder:
     def _last_found(self) -> float:
         found = (entry.stamp for entry in reversed(self._entries) if entry.status is not Status.LOST)
         return next(found, -torch.inf)
+
+
+def _pose(keyframe: Keyframe | None) -> Tensor:
+    """World to camera of a keyframe; the world itself, where there is none."""
+    return torch.eye(4, dtype=torch.float64) if keyframe is None else keyframe.T_cw
 
 
 def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:

@@ -24,6 +24,11 @@ class Table:
         """A column as a view: writing to it changes the table."""
         return self._columns[name][: self._length]
 
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """All columns by name, as views."""
+        return {name: self[name] for name in self._columns}
+
     def append(self, **rows: Tensor) -> Tensor:
         """Add rows, every column given; returns their indices, int64."""
         if rows.keys() != self._columns.keys():

@@ -105,6 +105,11 @@ class Arrivals:
     came: Tensor
     stride: int
 
+    @property
+    def still(self) -> Tensor:
+        """Pixels of what was there before, over one baseline at least and none to the contrary, bool, (h, w)."""
+        return (self.came == 0).any(dim=0) & ~(self.came == 1).any(dim=0)
+
     def share(self, mask: Tensor, least: int) -> Tensor:
         """Share of an object's pixels that came.
 

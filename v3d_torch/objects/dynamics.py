@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-import cv2
 import torch
 from torch import Tensor
 
@@ -15,7 +14,7 @@ from v3d_torch.lie import invert
 from v3d_torch.objects.background import Arrivals, DepthView, vacated_share
 from v3d_torch.objects.intra_motion import intra_object_motion
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.outlines import Outliner, grown
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
@@ -46,6 +45,7 @@ class Judged:
         chamfer: root mean nearest-neighbour distance, metres; nan when it was not measured.
         verdict: static, dynamic, deforming or unknown.
         missed: whether the network missed it, so that all but the id is predicted.
+        cloud: as the network last saw it, world frame, metres, float32, shape :math:`(P, 3)`.
     """
 
     id: int
@@ -56,6 +56,7 @@ class Judged:
     chamfer: float
     verdict: Verdict
     missed: bool
+    cloud: Tensor
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,13 @@ class Scene:
         objects: by id.
         static: pixels that tracking may use, bool, shape :math:`(H, W)`.
         unpeopled: pixels of ``static`` that show no person, not even one who stands still, for the coloured map.
+        ballots: votes between objects that counted, over any baseline: ids of who voted and for whom, sorted.
     """
 
     objects: list[Judged]
     static: Tensor
     unpeopled: Tensor
+    ballots: list[tuple[int, int]]
 
 
 class ObjectDynamics:
@@ -103,7 +106,7 @@ class ObjectDynamics:
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
         came = {track: arrivals.share(track.own, self._config.background.min_points) for track in tracks}
         seen = [track for track in tracks if not track.missed]
-        votes = self._vote(seen, came, view)
+        votes, ballots = self._vote(seen, came, view)
         chamfer = self._deform(seen, came, view)
         self._last_stamp = stamp
         fits = self._fit(tracks, witnesses)
@@ -118,16 +121,19 @@ class ObjectDynamics:
                 chamfer=chamfer.get(track, torch.nan),
                 verdict=verdict,
                 missed=track.missed,
+                cloud=track.newest.cloud,
             )
             for track, verdict in verdicts.items()
         ]
         moving = [track for track, verdict in verdicts.items() if not self._may_be_tracked(verdict)]
         people = [track for track in tracks if track.label == PERSON]
         # Who moves is mostly a person: each outline is drawn once and serves both.
-        outlines = {track: self._outline(track, view) for track in dict.fromkeys([*moving, *people])}
+        draw = Outliner(view, arrivals, self._config.mask, self._camera, self._config.clouds.voxel_size)
+        outlines = {track: draw(track) for track in dict.fromkeys([*moving, *people])}
         size = view.depth.shape[-2:]
         static = self._clear_of([outlines[track] for track in moving], size)
-        return Scene(objects, static, static & self._clear_of([outlines[track] for track in people], size))
+        unpeopled = static & self._clear_of([outlines[track] for track in people], size)
+        return Scene(objects, static, unpeopled, ballots)
 
     def _fit(self, tracks: list[Track], witnesses: Witnesses) -> dict[Track, bool]:
         """Whether the features on each object fit the camera's motion."""
@@ -137,12 +143,15 @@ class ObjectDynamics:
         vouched = witnesses.vouch_for(torch.stack([track.own for track in tracks]), config.fit_share, config.fit_least)
         return dict(zip(tracks, vouched.tolist(), strict=True))
 
-    def _vote(self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView) -> dict[Track, int]:
-        """Votes of each object, the most over all baselines; marks those that are voted dynamic."""
+    def _vote(
+        self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView
+    ) -> tuple[dict[Track, int], list[tuple[int, int]]]:
+        """Votes of each object, the most over all baselines, and who cast them; marks those that are voted dynamic."""
         config, background = self._config.voting, self._config.background
         most: dict[Track, int] = {}
+        cast: set[tuple[int, int]] = set()
         if not config.enabled:
-            return most
+            return most, []
         # What is seen for the first time has no distance that could have changed: the background alone has a vote.
         voted = {
             track for track in tracks if background.enabled and bool((came[track] >= background.moved_share).any())
@@ -159,7 +168,9 @@ class ObjectDynamics:
             )
             then = torch.stack([then.centroid for then, _ in pairs.values()])
             now = torch.stack([now.centroid for _, now in pairs.values()])
-            votes, dynamic = elect(then, now, moved if background.enabled else None, config)
+            votes, dynamic, ballots = elect(then, now, moved if background.enabled else None, config)
+            ids = [track.id for track in pairs]
+            cast |= {(ids[voter], ids[elected]) for elected, voter in ballots.nonzero().tolist()}
             for track, count, elected in zip(pairs, votes.tolist(), dynamic.tolist(), strict=True):
                 most[track] = max(most.get(track, 0), count)
                 if elected:
@@ -167,7 +178,7 @@ class ObjectDynamics:
         for track in voted:
             track.last_dynamic = view.stamp
             track.evidence += 1
-        return most
+        return most, sorted(cast)
 
     def _deform(self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView) -> dict[Track, float]:
         """Root mean Chamfer distance of each living object to its own past; marks those that deform."""
@@ -218,30 +229,10 @@ class ObjectDynamics:
         covered = torch.zeros(size, dtype=torch.bool)
         for outline in outlines:
             covered |= outline
-        return ~_grown(covered, self._config.mask.seam)
-
-    def _outline(self, track: Track, view: DepthView) -> Tensor:
-        """Pixels of an object, and of its rim: those whose depth is its own, or missing; bool, shape (H, W)."""
-        config = self._config.mask
-        if track.missed:  # predicted by its depth as it is
-            return track.mask
-        if not track.newest.located:  # too few points to tell which depths are its own
-            return _grown(track.mask, config.margin)
-        cloud = track.newest.cloud.to(torch.float64) @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
-        tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
-        spacing = self._config.clouds.voxel_size
-        _, explained = silhouette(cloud, view.depth, self._camera, spacing, config.margin, tolerance)
-        unmeasured = view.depth[0] <= 0
-        return track.own | (_grown(track.mask, config.margin) & (explained | unmeasured))
+        return ~grown(covered, self._config.mask.seam)
 
 
-def _grown(mask: Tensor, pixels: int) -> Tensor:
-    """A mask with all that is no farther from it, bool, shape (H, W)."""
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
-    return torch.from_numpy(cv2.dilate(mask.to(torch.uint8).numpy(), around) > 0)
-
-
-def elect(then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig) -> tuple[Tensor, Tensor]:
+def elect(then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig) -> tuple[Tensor, Tensor, Tensor]:
     """The paper's vote (Alg. 1), with the background as one more voter that has the casting vote.
 
     Args:
@@ -251,16 +242,18 @@ def elect(then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig)
         config: thresholds.
 
     Returns:
-        Votes for each, int64, and which are dynamic, bool, both of shape :math:`(K,)`.
+        Votes for each, int64, and which are dynamic, bool, both of shape :math:`(K,)`; and the votes of objects that
+        counted, of column j for row i, int64, shape :math:`(K, K)`.
     """
     present = torch.ones(then.shape[0], dtype=torch.bool)
     ballots = hough_vote(then, now, present, config.distance_threshold, config.vote_threshold).pair.to(torch.int64)
     if moved is None:
         votes = ballots.sum(dim=1)
-        return votes, votes >= config.vote_threshold
+        return votes, votes >= config.vote_threshold, ballots
     # Who moves cannot tell who else does, nor can who stands still but whose centroid, cut off, jumps.
     witness = ~moved & ((now - then).norm(dim=1) < 0.5 * config.distance_threshold)
-    votes = (ballots * witness).sum(dim=1) + moved
+    ballots = ballots * witness
+    votes = ballots.sum(dim=1) + moved
     # Where fewer have a vote than are needed, all who have one must agree.
     voters = witness.sum() - witness.long() + 1
-    return votes, moved & (votes >= voters.clamp(max=config.vote_threshold))
+    return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), ballots

@@ -109,6 +109,10 @@ class Track:
         """Centroid at ``stamp`` with constant velocity (paper, Sec. II), world frame, shape :math:`(3,)`."""
         return self._motion.predict(stamp)
 
+    def cloud_at(self, stamp: float) -> Tensor:
+        """The newest cloud, moved on with constant velocity, world frame, float64, shape :math:`(P, 3)`."""
+        return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
+
     def extend(self, sighting: Sighting) -> None:
         """Take in a new sighting, and forget what is older than the history."""
         self._most_points = max(self._most_points, len(sighting.cloud))

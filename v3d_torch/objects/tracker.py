@@ -123,8 +123,7 @@ class InstanceTracker(torch.nn.Module):
     def _predict_mask(self, track: Track, stamp: float, depth: Tensor, T_wc: Tensor) -> Tensor:
         """Pixels where an object should be: its last cloud, moved on, where the depth agrees."""
         T_cw = invert(T_wc)
-        moved = track.newest.cloud.to(torch.float64) + track.velocity * (stamp - track.newest.stamp)
-        cloud = moved @ T_cw[:3, :3].T + T_cw[:3, 3]
+        cloud = track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
         near, explained = silhouette(cloud, depth, self._camera, self._voxel_size, 0, self._DEPTH_GATE)
         return near & (explained | (depth[0] <= 0))
 

@@ -22,11 +22,25 @@ class Motion:
 
     Attributes:
         T_ba: maps points of camera a to camera b, float64, shape :math:`(4, 4)`.
-        pairs: inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`.
+        pairs: inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`; none where pixels told it.
     """
 
     T_ba: Tensor
     pairs: Tensor
+
+    def carry(self, landmarks: Tensor, count: int) -> Tensor:
+        """Ids of the landmarks behind the features of b that the matches carry over from a.
+
+        Args:
+            landmarks: id of the landmark behind each feature of a, -1 for none, int64, shape :math:`(N,)`.
+            count: of the features of b.
+
+        Returns:
+            -1 where there is none, int64, shape ``(count,)``.
+        """
+        carried = torch.full((count,), -1, dtype=torch.int64)
+        carried[self.pairs[:, 1]] = landmarks[self.pairs[:, 0]]
+        return carried
 
 
 class MotionEstimator:
@@ -84,12 +98,11 @@ class MotionEstimator:
         if pose is None or int(pose[1].sum()) < config.min_inliers:
             return None
         T_ba, inliers = pose
-        if not self._possible(T_ba, elapsed):
-            return None
-        return Motion(T_ba, pairs[inliers])
+        return Motion(T_ba, pairs[inliers]) if is_possible(T_ba, elapsed, config) else None
 
-    def _possible(self, T_ba: Tensor, elapsed: float) -> bool:
-        """Whether a camera in a hand or on a robot can move so in the time."""
-        twist = se3_log(T_ba)
-        distance, angle = float(twist[:3].norm()), float(twist[3:].norm())
-        return distance <= self._config.max_speed * elapsed and angle <= self._config.max_rotation_rate * elapsed
+
+def is_possible(T_ba: Tensor, elapsed: float, config: MotionConfig) -> bool:
+    """Whether a camera in a hand or on a robot can move so in the time, given in seconds."""
+    twist = se3_log(T_ba)
+    distance, angle = float(twist[:3].norm()), float(twist[3:].norm())
+    return distance <= config.max_speed * elapsed and angle <= config.max_rotation_rate * elapsed

@@ -48,10 +48,7 @@ _MARGIN = 0.12  # of the width: names of objects nearer to a side start there, s
 
 
 def trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory, path: Path, title: str = "") -> None:
-    """Draw a trajectory as the paper's figures do: ground truth black, estimate blue, their difference red.
-
-    The plane is that of the two axes along which the camera moves most. The estimate is aligned to the ground truth;
-    without ground truth at its stamps it is drawn alone, in its own world.
+    """Draw a trajectory to a file, see `draw_trajectory`.
 
     Args:
         groundtruth: true poses, or None.
@@ -61,6 +58,20 @@ def trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory, path
 
     Raises:
         OutputError: when the file cannot be written.
+    """
+    save(draw_trajectory(groundtruth, estimate, title), path)
+
+
+def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title: str = "") -> Figure:
+    """Draw a trajectory as the paper's figures do: ground truth black, estimate blue, their difference red.
+
+    The plane is that of the two axes along which the camera moves most. The estimate is aligned to the ground truth;
+    without ground truth at its stamps it is drawn alone, in its own world.
+
+    Args:
+        groundtruth: true poses, or None.
+        estimate: estimated poses, any number.
+        title: printed above.
     """
     p_e = estimate.T_wc[:, :3, 3]
     curves: list[tuple[Tensor, Tensor, str, str]] = [(estimate.stamps, p_e, "tab:blue", "estimate")]
@@ -82,7 +93,7 @@ def trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory, path
     across, up = _widest_axes(curves[0][1])
     plane = [across, up]
     for stamps, positions, colour, label in curves:
-        axes.plot(*_with_gaps(stamps, positions[:, plane]).T, color=colour, linewidth=1.2, label=label)
+        axes.plot(*with_gaps(stamps, positions[:, plane]).T, color=colour, linewidth=1.2, label=label)
         axes.plot(*positions[:1, plane].numpy().T, "o", color=colour, markeredgecolor="white", zorder=3)
     if len(segments):
         lines = list(segments[:, :, plane].numpy())
@@ -94,7 +105,7 @@ def trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory, path
     axes.set_title(title, parse_math=False)  # a folder's name may hold dollars
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
-    _save(figure, path)
+    return figure
 
 
 def mask_strip(images: Sequence[Tensor], overlays: Sequence[Sequence[Overlay]], path: Path) -> None:
@@ -123,12 +134,12 @@ def mask_strip(images: Sequence[Tensor], overlays: Sequence[Sequence[Overlay]], 
     for axes in grid:
         axes.axis("off")
     for axes, (image, objects) in zip(grid, frames, strict=False):
-        _draw_objects(axes, image, objects)
-    present = {_verdict(verdict) for _, objects in frames for _, _, verdict in objects}
+        draw_objects(axes, image, objects)
+    present = {known_verdict(verdict) for _, objects in frames for _, _, verdict in objects}
     handles = [Patch(color=colour, label=verdict) for verdict, colour in VERDICT_COLOURS.items() if verdict in present]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _widest_axes(positions: Tensor) -> tuple[int, int]:
@@ -140,8 +151,8 @@ def _widest_axes(positions: Tensor) -> tuple[int, int]:
     return across, up
 
 
-def _with_gaps(stamps: Tensor, points: Tensor) -> NDArray[np.float64]:
-    """Points (N, 2) with a NaN, which ends the pen's stroke, wherever the camera was not seen for long."""
+def with_gaps(stamps: Tensor, points: Tensor) -> NDArray[np.float64]:
+    """Points, shape (N, 2), with a NaN, which ends the pen's stroke, wherever there is none for long."""
     if len(stamps) < 2:
         return points.numpy()
     intervals = stamps.diff()
@@ -160,11 +171,18 @@ def _frame(axes: Axes, points: Tensor) -> None:
     axes.locator_params(nbins=6)
 
 
-def _draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
+def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
+    """Draw an image with its objects: masks tinted and outlined in the colour of the verdict, texts upon them.
+
+    Args:
+        axes: to draw on, in pixels of the image.
+        image: uint8 RGB, shape :math:`(3, H, W)`.
+        objects: masks, texts, verdicts; an empty text is not written.
+    """
     picture = image.permute(1, 2, 0).numpy().astype(np.float32) / 255
     outlines = []
     for mask, _, verdict in objects:
-        colour = VERDICT_COLOURS[_verdict(verdict)]
+        colour = VERDICT_COLOURS[known_verdict(verdict)]
         inside = mask.numpy()
         picture[inside] = (1 - _TINT) * picture[inside] + _TINT * np.array(to_rgb(colour), dtype=np.float32)
         contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -175,8 +193,9 @@ def _draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None
     )
     height, width = image.shape[1:]
     for mask, text, verdict in objects:
-        if not mask.any():
+        if not mask.any() or not text:
             continue
+        colour = VERDICT_COLOURS[known_verdict(verdict)]
         rows, columns = mask.nonzero(as_tuple=True)
         x, y = float(columns.double().mean()), float(rows.double().quantile(0.1))
         side = "left" if x < _MARGIN * width else "right" if x > (1 - _MARGIN) * width else "center"
@@ -190,14 +209,24 @@ def _draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None
             fontsize=8,
             ha=side,
             va="center",
-            bbox={"boxstyle": "round,pad=0.25", "facecolor": VERDICT_COLOURS[_verdict(verdict)], "edgecolor": "none"},
+            bbox={
+                "boxstyle": "round,pad=0.25",
+                "facecolor": VERDICT_COLOURS[known_verdict(verdict)],
+                "edgecolor": "none",
+            },
         )
 
 
-def _verdict(word: str) -> str:
+def known_verdict(word: str) -> str:
+    """The verdict itself, or unknown where it has no colour."""
     return word if word in VERDICT_COLOURS else "unknown"
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure whole or not at all; the suffix chooses the format.
+
+    Raises:
+        OutputError: when the file cannot be written.
+    """
     with written_whole(path) as temporary:
         figure.savefig(temporary)

@@ -1,0 +1,138 @@
+"""The summary of a batch: medians, the best, the paper's figures, in Markdown, LaTeX, CSV and on the screen."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.summary import csv_text, error_tables, latex, markdown, screen_tables
+from v3d_torch.evaluation.tables import paper_scores
+
+
+def runs(sequence: str, config: str, *ates: float | None) -> list[Outcome]:
+    """A run for each error, with RPE a tenth and a hundredfold of it; None is one that failed."""
+
+    def metrics(ate: float | None) -> dict[str, Any]:
+        if ate is None:
+            return {}
+        return {"ate": {"rmse": ate}, "rpe": {"trans": {"rmse": ate / 10}, "rot": {"rmse": ate * 100}}}
+
+    return [
+        Outcome(sequence, config, seed, metrics(ate), "it | broke" if ate is None else None)
+        for seed, ate in enumerate(ates)
+    ]
+
+
+OUTCOMES = [
+    *runs("fr3/w/xyz", "full", 0.012, 0.010, 0.0151),
+    *runs("fr3/w/xyz", "base_line", 0.5, None, 0.3),
+    *runs("my & [own]", "full", 0.2),
+    *runs("my & [own]", "base_line", None),
+]
+"""On one of the paper's sequences, and on another."""
+
+
+def rows(text: str) -> list[list[str]]:
+    """Cells of the rows of a Markdown document."""
+    return [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+
+
+def test_medians_ranges_failures_and_the_papers_figures() -> None:
+    heading, _, paper, own = rows(markdown(OUTCOMES))[:4]
+    methods = list(paper_scores()["ate"]["fr3/w/xyz"])
+    assert heading == ["sequence", "full", "base_line", *(f"{method} (paper)" for method in methods)]
+    assert paper[:3] == ["fr3/w/xyz", "**0.0120 [0.0100-0.0151]**", "0.4000 [0.3000-0.5000], 1 failed"]
+    scores = [paper_scores()["ate"]["fr3/w/xyz"][method].rmse for method in methods]
+    assert paper[3:] == ["-" if score is None else f"{score:.4f}" for score in scores]
+    assert own == ["my & [own]", "0.2000", "failed", *["-"] * len(methods)]  # nothing to compare with, no best
+
+
+def test_all_three_metrics_of_the_paper() -> None:
+    tables = error_tables(OUTCOMES)
+    assert [table.heading for table in tables] == ["ATE, m", "RPE, m/s", "RPE, deg/s"]
+    assert [table.rows["fr3/w/xyz"][0].text for table in tables[1:]] == [
+        "0.0012 [0.0010-0.0015]",
+        "1.2000 [1.0000-1.5100]",
+    ]
+    assert "V3D-SLAM (paper)" in tables[2].methods
+
+
+@pytest.mark.parametrize(
+    ("ours", "best"), [(0.0140, ["full"]), (0.01412, ["full", "CFP-SLAM (paper)"]), (0.5, ["CFP-SLAM (paper)"])]
+)
+def test_the_best_of_a_row_is_the_lowest_as_shown(ours: float, best: list[str]) -> None:
+    (table, *_) = error_tables([*runs("fr3/w/xyz", "full", ours), *runs("fr3/w/xyz", "base", 0.6)])
+    cells = dict(zip(table.methods, table.rows["fr3/w/xyz"], strict=True))
+    assert [method for method, cell in cells.items() if cell.best] == best
+
+
+def test_sequences_that_are_not_the_papers_have_no_columns_of_it() -> None:
+    document = markdown([*runs("demo", "full", 0.1), *runs("demo", "paper", 0.2)])
+    assert rows(document)[0] == ["sequence", "full", "paper"]
+    assert rows(document)[2] == ["demo", "**0.1000**", "0.2000"]
+    assert "(paper)" not in document
+
+
+def test_failures_are_listed_apart() -> None:
+    document = markdown(OUTCOMES)
+    assert document.count("- fr3/w/xyz, base_line, seed 1: failed: it | broke") == 1
+    assert "Failed" not in markdown(runs("demo", "full", 0.1))
+    nothing = markdown(runs("demo", "full", None))
+    assert "seed 0: failed" in nothing and not rows(nothing)
+
+
+def test_without_ground_truth_there_is_nothing_to_show() -> None:
+    outcomes = [Outcome("demo", "full", 0, {"ate": None, "rpe": None})]
+    assert error_tables(outcomes) == [] and screen_tables(outcomes) == []
+    assert "tabular" not in latex(outcomes)
+
+
+def test_latex_is_whole_and_says_the_same() -> None:
+    text = latex(OUTCOMES)
+    for name in ("table*", "tabular"):
+        assert text.count(f"\\begin{{{name}}}") == text.count(f"\\end{{{name}}}") == 3
+    for rule in ("toprule", "midrule", "bottomrule"):
+        assert text.count(f"\\{rule}") == 3
+    assert text.startswith("% \\usepackage{booktabs}")
+    columns = {len(match) for match in re.findall(r"\\begin\{tabular\}\{(l?r+)\}", text)}
+    lines = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert len(lines) == 9
+    assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in lines} == columns
+    assert r"\textbf{0.0120 {[}0.0100--0.0151]}" in text
+    assert r"base\_line" in text and r"my \& {[}own] & 0.2000 & failed & -- &" in text
+    depth = 0
+    for character in re.sub(r"\\[{}]", "", text):
+        depth += (character == "{") - (character == "}")
+        assert depth >= 0
+    assert depth == 0
+
+
+def test_csv_has_the_figures_unrounded() -> None:
+    table = list(csv.DictReader(csv_text(OUTCOMES).splitlines()))
+    ours = {(row["metric"], row["sequence"], row["method"]): row for row in table}
+    assert len(ours) == len(table) == 3 * (2 * 2 + 8)
+    row = ours["ate.rmse", "fr3/w/xyz", "full"]
+    assert [float(row[name]) for name in ("median", "lowest", "highest")] == [0.012, 0.010, 0.0151]
+    assert (row["seeds"], row["failed"]) == ("3", "0")
+    row = ours["rpe.rot.rmse", "fr3/w/xyz", "base_line"]
+    assert [float(row[name]) for name in ("median", "lowest", "highest")] == [40, 30, 50]
+    assert (row["seeds"], row["failed"]) == ("3", "1")
+    assert ours["ate.rmse", "my & [own]", "base_line"]["median"] == ""
+    paper = ours["ate.rmse", "fr3/w/xyz", "V3D-SLAM (paper)"]
+    assert float(paper["median"]) == 0.0153 and paper["seeds"] == ""
+
+
+def test_the_screen_fits_and_brackets_are_no_markup() -> None:
+    console = Console(width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    for table in screen_tables(OUTCOMES):
+        console.print(table)
+    text = console.export_text()
+    for words in ("my & [own]", "[0.0100-0.0151]", "V3D-SLAM", "1 failed", "RPE, deg/s"):
+        assert words in text
+    assert "…" not in text and "DynaSLAM" not in text

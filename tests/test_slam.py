@@ -1,0 +1,92 @@
+"""The system as a researcher calls it: one line to make it, one to take in a frame, stages that can be replaced."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from v3d_torch import V3DSLAM, RGBDFrame, Tracked, load_sequence
+from v3d_torch.config_file import load_config
+from v3d_torch.datasets import RGBDSequence
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.lie import invert
+from v3d_torch.mapping.recorder import Status
+from v3d_torch.segmentation import NoSegmentation
+
+NO_NETWORK = load_config(None, ("segmentation.source=none",))
+
+
+@pytest.fixture(scope="module")
+def demo() -> RGBDSequence:
+    return load_sequence("demo")
+
+
+def test_frames_bring_their_camera_and_poses_come_back(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(config=NO_NETWORK)
+    for index in range(3):
+        pose = slam(demo[index])
+        assert isinstance(pose, Tracked)
+        assert pose.stamp == float(demo.stamps[index])
+        assert pose.T_wc.shape == (4, 4) and pose.T_wc.dtype == torch.float64
+        assert torch.equal(pose.T_wc, invert(slam.poses.T_cw))
+        assert pose.status is Status.TRACKED
+        assert pose.static.shape == (480, 640) and pose.objects == []
+
+
+def test_a_camera_given_or_carried_gives_the_same(demo: RGBDSequence) -> None:
+    given = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
+    carried = V3DSLAM(config=NO_NETWORK)
+    for index in range(3):
+        assert torch.equal(given(demo[index]).T_wc, carried(demo[index]).T_wc)
+
+
+def test_arrays_as_opencv_gives_them_give_the_same(demo: RGBDSequence) -> None:
+    stored, from_arrays = V3DSLAM(config=NO_NETWORK), V3DSLAM(config=NO_NETWORK)
+    for index in range(3):
+        frame = demo[index]
+        image = frame.image.permute(1, 2, 0).numpy()
+        metres = frame.depth[0].numpy().astype(np.float64)
+        metres[metres == 0] = np.nan
+        made = RGBDFrame.of(index, frame.stamp, image, metres, demo.camera)
+        assert torch.equal(made.image, frame.image) and torch.equal(made.depth, frame.depth)
+        assert torch.equal(stored(frame).T_wc, from_arrays(made).T_wc)
+
+
+def test_depth_in_the_cameras_units_becomes_metres(demo: RGBDSequence) -> None:
+    image = torch.zeros(480, 640, 3, dtype=torch.uint8)
+    units = np.full((480, 640), 5000, np.uint16)
+    assert RGBDFrame.of(0, 0.0, image, units, demo.camera).depth.unique().item() == 5000 / demo.camera.depth_scale
+    assert RGBDFrame.of(0, 0.0, image, units).depth.unique().item() == 5.0
+    assert RGBDFrame.of(0, 0.0, image, torch.full((480, 640), -1.0)).depth.unique().item() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("image", "depth"),
+    [
+        (np.zeros((48, 64), np.uint8), np.ones((48, 64))),
+        (np.zeros((3, 48, 64), np.uint8), np.ones((48, 64))),
+        (np.zeros((48, 64, 3), np.float32), np.ones((48, 64))),
+        (np.zeros((48, 64, 3), np.uint8), np.ones((1, 48, 64))),
+        (np.zeros((48, 64, 3), np.uint8), np.ones((64, 48))),
+    ],
+    ids=["grey", "channels first", "float colour", "depth with a channel", "depth of another size"],
+)
+def test_arrays_of_another_shape_or_type_are_refused(image: np.ndarray, depth: np.ndarray) -> None:
+    with pytest.raises(InputError, match=r"frame 7: .*; give "):
+        RGBDFrame.of(7, 0.0, image, depth)
+
+
+def test_without_any_camera_it_says_so(demo: RGBDSequence) -> None:
+    frame = demo[0]
+    with pytest.raises(ConfigError, match="camera"):
+        V3DSLAM(config=NO_NETWORK)(RGBDFrame(0, 0.0, frame.image, frame.depth))
+
+
+def test_a_stage_can_be_replaced(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
+    seen = []
+    smooth = slam.smooth
+    slam.smooth = lambda depth: seen.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
+    slam(demo[0])
+    assert seen == [(1, 1, 480, 640)]

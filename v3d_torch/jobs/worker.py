@@ -1,0 +1,47 @@
+"""A job carried out, wherever that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from v3d_torch.datasets import load_sequence
+from v3d_torch.earlier_results import prepare_folder
+from v3d_torch.errors import V3DError
+from v3d_torch.jobs.job import Job
+from v3d_torch.logged import log_to, run_logged
+from v3d_torch.mapping.recorder import Status
+from v3d_torch.objects.dynamics import Scene
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.types import RGBDFrame
+
+
+def run_job(job: Job, report: Callable[[int], None]) -> str | None:
+    """Run a sequence and write its log and its results.
+
+    Args:
+        job: to be carried out.
+        report: called after each frame with the number of frames done; a KeyboardInterrupt out of it ends the run,
+            with the results until then written.
+
+    Returns:
+        The sentence that the run failed with; None where it did not.
+    """
+
+    def on_frame(frame: RGBDFrame, scene: Scene, status: Status) -> None:
+        report(frame.index + 1)
+
+    try:
+        prepare_folder(job.folder)
+        with log_to(job.folder / "run.log"):
+            sequence = load_sequence(job.source, data_root=job.data_root)
+            segment = make_segmenter(job.config.segmentation)
+            pipeline, _ = run_logged(sequence, segment, job.config, job.folder, on_frame)
+    except Exception as error:  # a run that breaks must not cost the others; its log has the traceback
+        return sentence(error)
+    return pipeline.run.failure
+
+
+def sentence(error: Exception) -> str:
+    """What an error says in one line; an error in the program says its type, too."""
+    said = " ".join(str(error).split())
+    return said if isinstance(error, V3DError) else f"{type(error).__name__}: {said}"

@@ -1,0 +1,60 @@
+"""The pose of a frame by the best that can be had: the map, a place seen before, the motion since the last frame."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from v3d_torch.loop.closing import LoopCloser
+from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
+from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.tracker import MapTracker
+
+
+class Localiser:
+    """Finds the camera.
+
+    Args:
+        track: finds a frame in a local map.
+        places: finds it where it was before.
+        sparse_map: of the system.
+        local_keyframes: keyframes that make up a local map.
+    """
+
+    def __init__(self, track: MapTracker, places: LoopCloser, sparse_map: SparseMap, local_keyframes: int) -> None:
+        self._track = track
+        self._places = places
+        self._map = sparse_map
+        self._local_keyframes = local_keyframes
+
+    def __call__(
+        self, static: Features, T_cw: Tensor, carried: Tensor, poses: PoseRecorder, *, moved: bool
+    ) -> Estimate:
+        """Pose in the local map, else in a place seen before, else by the motion alone, else lost.
+
+        Args:
+            static: features on what stands still.
+            T_cw: predicted, by the motion where it is known, float64, shape :math:`(4, 4)`.
+            carried: id of the landmark behind each feature as far as the last frame tells, -1 for none.
+            poses: of the frames before.
+            moved: whether the motion since the last frame is known.
+        """
+        if self._map.keyframes:
+            local = self._map.local(poses.landmarks, self._local_keyframes)
+            tracking = self._track(static, T_cw, local, carried)
+            if tracking is None:
+                place = self._places.recognise(static, self._map)
+                tracking = place.tracking if place is not None else None
+            if tracking is not None:
+                self._map.record(tracking)
+                return Estimate(Status.TRACKED, tracking.T_cw, tracking.landmarks)
+        known = moved and poses.status in (Status.TRACKED, Status.ODOMETRY)
+        nothing = torch.full((len(static),), -1, dtype=torch.int64)
+        return Estimate(Status.ODOMETRY if known else Status.LOST, T_cw, nothing)
+
+    def reference(self, estimate: Estimate) -> Keyframe | None:
+        """The keyframe that shares most with the frame, else the last one; None while there is none."""
+        keyframes = self._map.keyframes
+        best = self._map.covisible(estimate.landmarks[estimate.landmarks >= 0], 1)
+        return keyframes[int(best[0])] if len(best) else (keyframes[-1] if keyframes else None)

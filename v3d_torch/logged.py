@@ -1,0 +1,124 @@
+"""A run with its log and its results, whoever watches it."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sized
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import torch
+
+from v3d_torch.config import Config
+from v3d_torch.config_file import dump_config
+from v3d_torch.datasets import RGBDStream
+from v3d_torch.errors import OutputError
+from v3d_torch.evaluation import Evaluation
+from v3d_torch.files import write_text
+from v3d_torch.mapping.recorder import Status
+from v3d_torch.mapping.storage import StoredMap
+from v3d_torch.objects.dynamics import Scene
+from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.results import write_results
+from v3d_torch.segmentation.coco import class_name
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame, Segmenter
+from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
+
+_LOG = logging.getLogger("v3d_torch")
+
+
+def run_logged(
+    sequence: RGBDStream,
+    segment: Segmenter,
+    config: Config,
+    folder: Path,
+    on_frame: FrameCallback,
+    *,
+    save_masks: bool = False,
+    viewer: Viewer = NULL_VIEWER,
+    known: StoredMap | None = None,
+) -> tuple[Pipeline, Evaluation | None]:
+    """Run a sequence through a new system, note each frame in the log (`log_to`), and write all results.
+
+    Args:
+        sequence: frames.
+        segment: gives the instances of a frame.
+        config: of the system.
+        folder: for the results, there already.
+        on_frame: called after each frame; a KeyboardInterrupt out of it ends the run between two frames.
+        save_masks: whether to write what is left out of tracking.
+        viewer: looks on.
+        known: map to find the camera in.
+
+    Returns:
+        What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
+
+    Raises:
+        OutputError: when the results cannot be written.
+    """
+    write_text(folder / "config.yaml", dump_config(config))  # where this has no room, an hour's results have none
+    torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    masks = folder / "masks" if save_masks else None
+    slam = V3DSLAM(sequence.camera, segment, config, None if known is None else known.map)
+    pipeline = Pipeline(sequence, slam, masks, viewer, None if known is None else known.views)
+    _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "any number of")
+
+    def note(frame: RGBDFrame, scene: Scene, status: Status) -> None:
+        moves = what_moves(scene) or "nothing moves"
+        _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, status.value, moves)
+        on_frame(frame, scene, status)
+
+    run = pipeline(note)
+    evaluation = write_results(folder, pipeline)
+    if run.failure:
+        _LOG.error(run.failure)
+    return pipeline, evaluation
+
+
+def what_moves(scene: Scene) -> str:
+    """The objects that do not stand still, by class and verdict; empty when there are none."""
+    verdicts = Counter(f"{class_name(judged.label)} {judged.verdict.value}" for judged in scene.objects)
+    return ", ".join(f"{count} {what}" for what, count in sorted(verdicts.items()) if "static" not in what)
+
+
+@contextmanager
+def log_to(path: Path) -> Iterator[None]:
+    """Write the package's log to a new file; an error that leaves the block is in it, with its traceback.
+
+    Raises:
+        OutputError: when the file cannot be written.
+    """
+    try:
+        path.write_text("")
+        # Appended to: what the interpreter itself says of a crash may go to the same file.
+        handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another folder with --out") from error
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    _LOG.addHandler(handler)
+    _LOG.setLevel(logging.INFO)
+    _LOG.propagate = False
+    try:
+        yield
+    except Exception:
+        _LOG.exception("the run broke")
+        raise
+    finally:
+        _LOG.removeHandler(handler)
+        handler.close()
+
+
+class _LogFile(logging.FileHandler):
+    """A disk that is full ends the log, not the run: the results come to tell."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not isinstance(sys.exception(), OSError):
+            super().handleError(record)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()

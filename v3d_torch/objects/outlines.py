@@ -1,0 +1,92 @@
+"""The pixels that an object takes from tracking: its mask, the rim that was cut off, the surface that goes on.
+
+A network draws coarse outlines, and of somebody half in the image it often finds the head and leaves the sleeve. The
+depth tells more: the rim of a mask belongs to the object where its depth is the object's own, and a surface that goes
+on from there without an edge is still the object, unless the camera saw it there before the object came.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import MaskConfig
+from v3d_torch.objects.background import Arrivals, DepthView
+from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.track import Track
+
+
+class Outliner:
+    """Draws the outlines of the objects of one frame.
+
+    Args:
+        view: depth of the frame, and its pose.
+        arrivals: what came since earlier frames, on every n-th pixel.
+        config: margins and tolerances.
+        camera: of the frame.
+        spacing: of the objects' points, metres.
+    """
+
+    def __init__(
+        self, view: DepthView, arrivals: Arrivals, config: MaskConfig, camera: PinholeCamera, spacing: float
+    ) -> None:
+        self._view = view
+        self._config = config
+        self._camera = camera
+        self._spacing = spacing
+        self._stride = arrivals.stride
+        self._open = _smooth(view.depth[0], self._stride, config.edge) & ~arrivals.still
+
+    def __call__(self, track: Track) -> Tensor:
+        """Pixels of an object, bool, shape :math:`(H, W)`."""
+        config, depth = self._config, self._view.depth
+        if not track.newest.located:  # too few points to tell which depths are its own
+            return track.mask if track.missed else grown(track.mask, config.margin)
+        T_cw = self._view.T_cw
+        cloud = track.cloud_at(self._view.stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
+        tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
+        _, reached = silhouette(cloud, depth, self._camera, self._spacing, config.reach, tolerance)
+        going_on = self._going_on(track, reached) & reached
+        if track.missed:  # a mask that is predicted by its depth is as it is
+            return track.mask | going_on
+        _, explained = silhouette(cloud, depth, self._camera, self._spacing, config.margin, tolerance)
+        return track.own | going_on | (grown(track.mask, config.margin) & (explained | (depth[0] <= 0)))
+
+    def _going_on(self, track: Track, reached: Tensor) -> Tensor:
+        """Where an object's pixels go on within reach, up to the next edge, bool, shape (H, W)."""
+        if self._config.reach == 0:
+            return track.own
+        step = self._stride
+        seed = track.own[::step, ::step]
+        near = grown(track.mask[::step, ::step], self._config.reach // step)
+        region = (seed | (near & reached[::step, ::step] & self._open)).to(torch.uint8)
+        count, parts = cv2.connectedComponents(region.numpy(), connectivity=4)
+        size = np.bincount(parts.ravel(), minlength=count)
+        seeds = np.bincount(parts[seed.numpy()], minlength=count)
+        # A surface of which the object is but a small part is what it stands on or leans against.
+        taken = seeds >= self._config.least_part * size
+        taken[0] = False
+        # Up to the edge: the pixels between the last one looked at and it.
+        return _enlarged(grown(torch.from_numpy(taken[parts]), 1), step, reached.shape)
+
+
+def grown(mask: Tensor, pixels: int) -> Tensor:
+    """A mask with all that is no farther from it, bool, shape :math:`(H, W)`."""
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    return torch.from_numpy(cv2.dilate(mask.to(torch.uint8).numpy(), around) > 0)
+
+
+def _smooth(depth: Tensor, step: int, edge: float) -> Tensor:
+    """Every n-th pixel around which, halfway to the next ones, depth differs by less than this share of it."""
+    side = np.ones((step + 1, step + 1), np.uint8)
+    nearest = cv2.erode(torch.where(depth > 0, depth, torch.inf).numpy(), side)[::step, ::step]
+    farthest = cv2.dilate(depth.numpy(), side)[::step, ::step]
+    at = depth[::step, ::step]
+    return (at > 0) & torch.from_numpy(farthest - nearest < edge * at.numpy())
+
+
+def _enlarged(cells: Tensor, step: int, size: torch.Size) -> Tensor:
+    return cells.repeat_interleave(step, 0).repeat_interleave(step, 1)[: size[0], : size[1]]
