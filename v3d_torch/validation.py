@@ -11,5 +11,5 @@ def first_error(error: ValidationError) -> str:
     """The first of the values that a model refuses: its key, the rule and the value, cut where it is long."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "the whole"
-    rule = "write the keys of this section below it" if first["type"] == "model_type" else first["msg"].lower()
+    rule = "input should be a valid dictionary of keys" if first["type"] == "model_type" else first["msg"].lower()
     return f"{key}: {rule}, got {reprlib.repr(first['input'])}"

@@ -107,12 +107,12 @@ CASES = [
     Case(
         "a value for a section",
         config("objects: 3\n"),
-        Says("{seq}/own.yaml: objects: write the keys of this section below it, got 3"),
+        Says("{seq}/own.yaml: objects: input should be a valid dictionary of keys, got 3"),
     ),
     Case(
         "a section with nothing in it",
         config("objects:\n"),
-        Says("{seq}/own.yaml: objects: write the keys of this section below it, got None"),
+        Says("{seq}/own.yaml: objects: input should be a valid dictionary of keys, got None"),
     ),
     Case(
         "a section for a value",
@@ -188,7 +188,7 @@ CASES = [
     Case(
         "--set of a section",
         setting("features=3"),
-        Says("--set: features: write the keys of this section below it, got 3"),
+        Says("--set: features: input should be a valid dictionary of keys, got 3"),
     ),
     Case(
         "--set of broken YAML",

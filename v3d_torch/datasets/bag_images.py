@@ -85,7 +85,8 @@ def _decompressed(message: Any, depth_scale: float, source: str) -> Tensor:
         return metres(units, depth_scale)
     _, a, b = struct.unpack("<iff", content[:_HEADER])
     inverse = units.astype(np.float32)  # depth is a / (inverse - b), and 0 no measurement
-    return _measured(np.where(inverse > 0, a / (inverse - b), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return _measured(np.where(inverse > 0, a / (inverse - b), 0.0))
 
 
 def _measured(pixels: NDArray[Any]) -> Tensor:

@@ -22,7 +22,7 @@ _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
 _MAX_PIXELS = 1 << 26
 """Most pixels of an image: ten times those of any such camera. A file of a megabyte may claim gigabytes."""
 
-_SATURATED = np.iinfo(np.uint16).max
+SATURATED = np.iinfo(np.uint16).max
 """Units of depth that no camera measures; some write it for no measurement."""
 
 
@@ -86,7 +86,7 @@ def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
 
 def metres(units: NDArray[Any], depth_scale: float) -> Tensor:
     """Units of depth (H, W), of which there are ``depth_scale`` in a metre, as `RGBDFrame` holds depth."""
-    nothing = torch.from_numpy((units < 0) | (units >= _SATURATED))
+    nothing = torch.from_numpy((units < 0) | (units >= SATURATED))
     return torch.from_numpy(units.astype(np.float32)).div_(depth_scale).masked_fill_(nothing, 0.0).unsqueeze(0)
 
 
