@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,9 @@ def find_config(name: str | Path) -> Path:
     """
     if str(name) in CONFIGS:
         return CONFIGS[str(name)]
-    if (path := Path(name).expanduser()).is_file():
-        return path
+    with suppress(OSError, RuntimeError):  # a name that is too long, ~somebody who is not known here
+        if (path := Path(name).expanduser()).is_file():
+            return path
     raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
 
 

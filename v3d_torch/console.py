@@ -47,14 +47,18 @@ def exit_on_error() -> Iterator[None]:
     except V3DError as error:
         print(f"error: {_printable(error)}", file=sys.stderr)
         sys.exit(2)
+    except OSError as error:  # of a path that the user gave: its name is too long, its folder may not be looked into
+        where, why = error.filename or "a file", error.strerror or error
+        print(f"error: {_printable(where)}: cannot be used ({why}); check the path and who may use it", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         print("error: interrupted before the results were written", file=sys.stderr)
         sys.exit(2)
 
 
-def _printable(error: V3DError) -> str:
-    """The message on one line: names and lines of files are part of it, and may hold what a terminal obeys."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(error))
+def _printable(what: object) -> str:
+    """A message on one line: names and lines of files are part of it, and may hold what a terminal obeys."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(what))
 
 
 def run_sequence(

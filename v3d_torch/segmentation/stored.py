@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,9 @@ class StoredMasks:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._paths = sorted(folder.glob("*.png"))
+        self._paths: list[Path] = []
+        with suppress(OSError):  # a name that is too long
+            self._paths = sorted(folder.glob("*.png"))
         if not self._paths:
             raise InputError(f"{folder}: holds no PNG files; name the folder of the id images with --masks")
         self._stamps: Tensor | None = None
