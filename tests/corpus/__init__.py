@@ -9,6 +9,7 @@ from corpus import (
     images,
     layouts,
     lists,
+    maps,
     names,
     outputs,
     recordings,
@@ -31,5 +32,6 @@ CATEGORIES = {
     "folders of other datasets": layouts.CASES,
     "what --seq names": names.CASES,
     "archives": archives.CASES,
+    "maps of earlier runs": maps.CASES,
     "results and rights": outputs.CASES,
 }

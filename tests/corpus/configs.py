@@ -38,6 +38,16 @@ CASES = [
         ),
     ),
     Case(
+        "a name of 5000 letters",
+        options("--config", 5000 * "x"),
+        Says("...: is neither a configuration nor a YAML file; there are full, ..."),
+    ),
+    Case(
+        "in the home of nobody",
+        options("--config", "~nobody-of-this-name/own.yaml"),
+        Says("~nobody-of-this-name/own.yaml: is neither a configuration nor a YAML file; there are full, ..."),
+    ),
+    Case(
         "a device without end",
         options("--config", "/dev/zero"),
         Says("/dev/zero: is neither a configuration nor a YAML file; there are full, ..."),
