@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import sys
 import tempfile
+import warnings
 from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["v3d_torch", "yaml", "parsers", "tarfile", "PIL"]):
-    from parsers import PARSERS, SEEDS, outcome
+with atheris.instrument_imports(include=["v3d_torch", "yaml", "parsers", "tarfile", "zipfile", "PIL"]):
+    from parsers import PARSERS, assert_sound, outcome
+    from seeds import SEEDS
 
 
 def main() -> None:
@@ -22,6 +24,8 @@ def main() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name not in PARSERS:
         sys.exit(f"name one of: {', '.join(PARSERS)}")
+    warnings.simplefilter("error")
+    warnings.simplefilter("ignore", DeprecationWarning)
     with tempfile.TemporaryDirectory() as scratch:
         corpus = Path(scratch) / "corpus"
         corpus.mkdir()
@@ -29,8 +33,10 @@ def main() -> None:
             (corpus / f"{number}").write_bytes(seed)
         folder = Path(scratch) / "files"
         folder.mkdir()
-        limits = ["-rss_limit_mb=3000", "-timeout=20", "-max_len=4096"]
-        atheris.Setup([sys.argv[0], *limits, *sys.argv[2:], str(corpus)], lambda data: outcome(name, data, folder))
+        longest = max(4096, *map(len, SEEDS[name]))
+        limits = ["-rss_limit_mb=3000", "-timeout=20", f"-max_len={longest}"]
+        parse = lambda data: assert_sound(outcome(name, data, folder))  # noqa: E731
+        atheris.Setup([sys.argv[0], *limits, *sys.argv[2:], str(corpus)], parse)
         atheris.Fuzz()
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import struct
-import tarfile
-import tempfile
+import math
+import shutil
 from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from bags import DEPTH, INFO, RGB, Kind, Messages
-from PIL import Image
+import torch
 
+from v3d_torch import stored_run
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets import openloris
 from v3d_torch.datasets.bag import BagSequence
@@ -25,7 +25,9 @@ from v3d_torch.datasets.lists import read_associations, read_image_list
 from v3d_torch.datasets.matrices import read_matrix, read_poses
 from v3d_torch.errors import V3DError
 from v3d_torch.extract import extract_tar
+from v3d_torch.mapping.storage import load_map
 from v3d_torch.trajectory import read_trajectory
+from v3d_torch.types import Trajectory
 
 Parser = Callable[[bytes, Path], object]
 """Parses bytes, in a folder for files that it needs."""
@@ -74,8 +76,13 @@ def frames_of(bag: Path) -> object:
 
 def unpack(path: Path) -> object:
     folder = path.with_name("unpacked")
-    return extract_tar(path, folder, max_bytes=1 << 20)
+    try:
+        return extract_tar(path, folder, max_bytes=1 << 20)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)  # what is there is not unpacked again
 
+
+CAMERA = PinholeCamera(fx=8.0, fy=8.0, cx=3.5, cy=2.5, width=8, height=6)
 
 PARSERS: dict[str, Parser] = {
     "image list": from_file("rgb.txt", read_image_list),
@@ -102,109 +109,10 @@ PARSERS: dict[str, Parser] = {
     "ROS 2 bag": from_file("take.db3", frames_of),
     "mcap": from_file("take.mcap", frames_of),
     "archive": from_file("archive.tgz", unpack),
+    "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
+    "metrics.json": from_file("metrics.json", stored_run._read_metrics),
+    "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
 }
-
-
-def _bag(kind: Kind) -> bytes:
-    """A frame of 8x6 pixels."""
-    to = Messages(kind)
-    matrix = [8.0, 0, 3.5, 0, 8.0, 2.5, 0, 0, 1]
-    pixels = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
-    messages = [
-        (INFO, 1.0, to.info(8, 6, matrix, [], [*matrix[:3], 0, *matrix[3:6], 0, *matrix[6:], 0])),
-        (RGB, 1.0, to.image(1.0, "mono8", pixels.astype(np.uint8))),
-        (DEPTH, 1.0, to.image(1.0, "16UC1", pixels)),
-    ]
-    with tempfile.TemporaryDirectory() as folder:
-        path = to.write(Path(folder) / "take", messages)
-        return (path if kind == "bag" else next(path.glob(f"*.{kind}"))).read_bytes()
-
-
-def _tar(mode: str) -> bytes:
-    file = BytesIO()
-    with tarfile.open(fileobj=file, mode=mode) as tar:
-        for name in ("seq/rgb.txt", "seq/" + 120 * "x", "seq/depth/1.png"):
-            info = tarfile.TarInfo(name)
-            info.size = 5
-            tar.addfile(info, BytesIO(b"12345"))
-    return file.getvalue()
-
-
-def _image(form: str, mode: str) -> bytes:
-    file = BytesIO()
-    pixels = np.arange(48, dtype=np.uint16 if mode == "I;16" else np.uint8).reshape(6, 8)
-    Image.fromarray(pixels).convert(mode if mode != "I;16" else None).save(file, form)
-    return file.getvalue()
-
-
-def _message(encoding: int, pixel: int) -> bytes:
-    """An 8x6 image as `message` reads it."""
-    return struct.pack("<BBHHH", encoding, 0, 8, 6, 8 * pixel) + bytes(range(48 * pixel))
-
-
-_LIST = b"# colour\n1305031102.175304 rgb/1305031102.175304.png\n1305031102.2 rgb/a b.png\r\n"
-_POSES = b"# stamp tx ty tz qx qy qz qw\n1.5 0.1 -2 3e-1 0 0 0 1\n2.5,1,2,3,0,0,0.7071,0.7071\n"
-_POSE = b"1 0 0 0.5\n0 0 -1 2\n0 1 0 -inf\n0 0 0 1\n"
-_CAMERA = (
-    b"fx: 525.0\nfy: 525\ncx: 319.5\ncy: 239.5\nwidth: 640\nheight: 480\ndepth_scale: 5000\n"
-    b"distortion: [0.1, 0, 0, 0, 0]\n"
-)
-_PNGS = [_image("png", mode) for mode in ("RGB", "L", "P", "1", "RGBA", "I;16")]
-_JPEGS = [_image("jpeg", mode) for mode in ("RGB", "L", "CMYK")]
-_TIFFS = [_image("tiff", mode) for mode in ("RGB", "I;16", "F")]
-_OTHERS = [_image("bmp", "RGB"), _image("ppm", "RGB"), _image("webp", "RGB")]
-_RASTERS = [*_PNGS, *_JPEGS, *_TIFFS, *_OTHERS]
-_SENSORS = b"""%YAML:1.0
-d400_color_optical_frame:
-   width: 8
-   height: 6
-   intrinsics: !!opencv-matrix
-      rows: 1
-      cols: 4
-      dt: d
-      data: [ 8.5, 3.5, 8.5, 2.5 ]
-"""
-_LINKS = b"""%YAML:1.0
-trans_matrix:
-   -
-      parent_frame: base_link
-      child_frame: d400_color_optical_frame
-      matrix: !!opencv-matrix
-         rows: 4
-         cols: 4
-         dt: d
-         data: [ 0., 0., 1., 0.3, -1., 0., 0., 0.05, 0., -1., 0., 0.4, 0., 0., 0., 1. ]
-"""
-_YAML = b"seed: 3\nobjects:\n  voting: {distance_threshold: 0.1, baselines: [0.0, .inf]}\n"
-
-SEEDS: dict[str, list[bytes]] = {
-    "image list": [_LIST],
-    "associations": [b"1.5 rgb/1.png 1.51 depth/1.png\n2 rgb/a 2.png 2.0 depth/a, b.png\n"],
-    "trajectory": [_POSES, b"1403636579763555584 0 0 0 0 0 0 1\n"],
-    "matrix": [_POSE, b"525 0 319.5\n0 525 239.5\n0 0 1\n"],
-    "pose": [_POSE, _POSE.replace(b"-inf", b"1")],
-    "camera.yaml": [_CAMERA],
-    "K.txt": [b"525 525 319.5 239.5 5000 640 480\n", b"525 0 319.5\n0 525 239.5\n0 0 1\n"],
-    "configuration": [_YAML],
-    "--set": [b"objects.voting.distance_threshold=0.1\nseed=3\nfeatures={count: 30}\n"],
-    "colour file": _RASTERS,
-    "JPEG file": _JPEGS,
-    "depth file": _RASTERS,
-    "colour in a message": _RASTERS,
-    "depth in a message": _RASTERS,
-    "colour message": [_message(i, COLOURS[encoding][0]) for i, encoding in enumerate(COLOURS)],
-    "depth message": [_message(len(COLOURS), 2), _message(len(COLOURS) + 2, 4)],
-    "compressed colour message": [b"\0" + image for image in _RASTERS],
-    "compressed depth message": [bytes([i]) + struct.pack("<iff", 0, 1.0, 0.0) + _PNGS[-1] for i in (2, 3)]
-    + [b"\1" + _PNGS[-1]],
-    "sensors.yaml": [_SENSORS],
-    "trans_matrix.yaml": [_LINKS],
-    "ROS 1 bag": [_bag("bag")],
-    "ROS 2 bag": [_bag("db3")],
-    "mcap": [_bag("mcap")],
-    "archive": [_tar(mode) for mode in ("w", "w:gz", "w:bz2", "w:xz")],
-}
-"""Bytes that a parser takes, to begin with."""
 
 
 def outcome(parser: str, content: bytes, folder: Path) -> object | V3DError:
@@ -219,3 +127,19 @@ def outcome(parser: str, content: bytes, folder: Path) -> object | V3DError:
     except V3DError as error:
         assert str(error)
         return error
+
+
+def assert_sound(result: object) -> None:
+    """What has been taken for an input makes sense."""
+    if isinstance(result, V3DError):
+        assert str(result).strip()
+    elif isinstance(result, Trajectory):
+        assert torch.isfinite(result.T_wc).all() and torch.isfinite(result.stamps).all()
+        assert (result.stamps.diff() > 0).all()
+        R = result.T_wc[:, :3, :3]
+        torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), rtol=0, atol=0.02)
+    elif isinstance(result, PinholeCamera):
+        assert math.isfinite(result.cx + result.cy + sum(result.distortion))
+        assert min(result.fx, result.fy, result.depth_scale, result.width, result.height) >= 1
+    elif isinstance(result, torch.Tensor):
+        assert result.ndim == 3 and (result.dtype == torch.uint8 or bool((result >= 0).all()))

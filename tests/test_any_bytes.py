@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from parsers import PARSERS, SEEDS, outcome
+from parsers import PARSERS, assert_sound, outcome
+from seeds import SEEDS
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import V3DError
-from v3d_torch.types import Trajectory
 
 CRASHES = sorted((Path(__file__).parent / "crashes").glob("*/*"))
 """Inputs that once led to another error, by parser."""
@@ -52,22 +49,6 @@ WORDS = [
     b"!!",
 ]
 """What parsers stumble over."""
-
-
-def assert_sound(result: object) -> None:
-    """What has been taken for an input makes sense."""
-    if isinstance(result, V3DError):
-        assert str(result).strip()
-    elif isinstance(result, Trajectory):
-        assert torch.isfinite(result.T_wc).all() and torch.isfinite(result.stamps).all()
-        assert (result.stamps.diff() > 0).all()
-        R = result.T_wc[:, :3, :3]
-        torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), rtol=0, atol=0.02)
-    elif isinstance(result, PinholeCamera):
-        assert math.isfinite(result.cx + result.cy + sum(result.distortion))
-        assert min(result.fx, result.fy, result.depth_scale, result.width, result.height) >= 1
-    elif isinstance(result, torch.Tensor):
-        assert result.ndim == 3 and (result.dtype == torch.uint8 or bool((result >= 0).all()))
 
 
 @pytest.mark.parametrize("parser", PARSERS)
