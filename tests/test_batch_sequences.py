@@ -72,3 +72,9 @@ def test_a_pattern_that_matches_nothing(root: Path) -> None:
         with pytest.raises(InputError, match="matches no sequence") as raised:
             matching_sequences(["sit", pattern], root)
         assert str(raised.value).startswith(pattern) and str(root) in str(raised.value)
+
+
+@pytest.mark.parametrize("pattern", [5000 * "x" + "/*", "~nobody-of-this-name/*", "a**b/*", "[" + 3 * "*" + "]"])
+def test_a_pattern_that_can_match_nothing(pattern: str, root: Path) -> None:
+    with pytest.raises(InputError, match="match"):
+        matching_sequences([pattern], root)
