@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -38,7 +39,11 @@ def colour_from(message: Any, source: str) -> Tensor:
             f" converted to one of {', '.join(COLOURS)}"
         )
     pixels = _rows(message, np.dtype((np.uint8, COLOURS[message.encoding][0])), source)
-    return to_rgb(message.encoding, pixels)
+    try:
+        return to_rgb(message.encoding, pixels)
+    except cv2.error as error:  # an odd width where two pixels share a colour
+        size = f"{message.width}x{message.height}"
+        raise InputError(f"{source}: holds no {message.encoding} image of {size} pixels; record it again") from error
 
 
 def depth_from(message: Any, depth_scale: float, source: str) -> Tensor:
