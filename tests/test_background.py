@@ -18,7 +18,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import BackgroundConfig
 from v3d_torch.lie import invert, se3_exp
-from v3d_torch.objects.background import Arrivals, BackgroundWatch, DepthView, look_through, vacated_share
+from v3d_torch.objects.background import Arrivals, BackgroundWatch, DepthView, look_through, vacated_shares
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 CONFIG = BackgroundConfig()
@@ -48,7 +48,7 @@ def view(*boards: tuple[tuple[int, int], float], wall: float = WALL, T_wc: Tenso
 
 
 def share(cloud: Tensor, seen: DepthView, **config: float) -> float:
-    return vacated_share(cloud, seen, CAMERA, BackgroundConfig(**config))
+    return float(vacated_shares([cloud], seen, CAMERA, BackgroundConfig(**config))[0])
 
 
 # ---------------------------------------------------------------- what is looked through
@@ -87,7 +87,7 @@ def test_the_faster_the_camera_turns_the_farther_a_place_may_be_off() -> None:
 def test_a_place_beside_something_is_not_looked_through_by_a_camera_that_turns(shift: int, expected: float) -> None:
     """The box was 5 pixels beside the place, no more than its depth may be off: nothing has left."""
     seen = replace(view(((65, 85), OBJECT)), shift=shift)
-    assert vacated_share(surface((57, 63)), seen, CAMERA, CONFIG) == expected
+    assert share(surface((57, 63)), seen) == expected
 
 
 def test_all_are_still_there() -> None:
@@ -244,8 +244,16 @@ def test_a_view_of_another_pose_sees_the_same_slanted_floor() -> None:
         views.append(DepthView(0.0, depth[None].float(), invert(T_wc)))
         clouds.append((direction * depth[..., None] + T_wc[:3, 3])[depth > 0].float())
     assert float(((clouds[0][:, 1] - 1.2).abs()).max()) < 1e-5
-    assert vacated_share(clouds[0], views[1], CAMERA, CONFIG) < 0.001
-    assert vacated_share(clouds[1], views[0], CAMERA, CONFIG) < 0.001
+    assert share(clouds[0], views[1]) < 0.001
+    assert share(clouds[1], views[0]) < 0.001
+
+
+def test_shares_of_several_clouds_are_those_of_each() -> None:
+    clouds = [surface((60, 80)), torch.zeros(0, 3), surface((50, 70)), surface((0, 20))]
+    seen = view(((65, 85), OBJECT))
+    together = vacated_shares(clouds, seen, CAMERA, CONFIG)
+    torch.testing.assert_close(together.tolist(), [share(cloud, seen) for cloud in clouds], equal_nan=True)
+    assert vacated_shares([], seen, CAMERA, CONFIG).shape == (0,)
 
 
 # ---------------------------------------------------------------- what came
@@ -340,7 +348,7 @@ def test_the_view_itself_is_not_what_it_is_compared_with() -> None:
 def test_turned_off_there_is_nothing_to_compare_with() -> None:
     arrivals = watch(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
     assert arrivals.came.shape == (0, 30, 40)
-    assert arrivals.share(torch.ones(120, 160, dtype=torch.bool), 1).shape == (0,)
+    assert arrivals.shares([torch.ones(120, 160, dtype=torch.bool)], 1).shape == (1, 0)
 
 
 def test_a_pose_that_is_a_guess_tells_nothing() -> None:
@@ -420,13 +428,16 @@ def test_a_world_that_is_moved_takes_its_views_along(twist: tuple[float, ...]) -
 def test_share_of_an_object_is_the_mean_of_what_is_told(seed: int, baselines: int, stride: int, least: int) -> None:
     rng = np.random.default_rng(seed)
     came = rng.choice([0.0, 1.0, np.nan], (baselines, 7, 9), p=[0.3, 0.2, 0.5])
-    mask = rng.random((7 * stride, 9 * stride)) < rng.random()
-    within = [[came[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(baselines)]
-    told = [[value for value in row if not math.isnan(value)] for row in within]
-    expected = torch.tensor([sum(row) / len(row) if len(row) >= least else math.nan for row in told]).double()
-    shares = Arrivals(torch.from_numpy(came), stride).share(torch.from_numpy(mask), least)
-    assert shares.dtype == torch.float64
-    torch.testing.assert_close(shares, expected, equal_nan=True, rtol=1e-6, atol=0)
+    masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
+    shares = Arrivals(torch.from_numpy(came), stride).shares([torch.from_numpy(mask) for mask in masks], least)
+    assert shares.dtype == torch.float64 and shares.shape == (3, baselines)
+    for row, mask in zip(shares, masks, strict=True):
+        within = [
+            [came[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(baselines)
+        ]
+        told = [[value for value in values if not math.isnan(value)] for values in within]
+        expected = [sum(values) / len(values) if len(values) >= least else math.nan for values in told]
+        torch.testing.assert_close(row, torch.tensor(expected).double(), equal_nan=True, rtol=1e-6, atol=0)
 
 
 def test_share_of_half_a_box_is_a_half() -> None:
@@ -434,6 +445,6 @@ def test_share_of_half_a_box_is_a_half() -> None:
     arrivals = watch(view(at=0.0))(view(WITH_BOX, at=0.3))
     mask = torch.zeros(120, 160, dtype=torch.bool)
     mask[40:80, 60:140] = True
-    shares = arrivals.share(mask, CONFIG.min_points)
+    (shares,) = arrivals.shares([mask], CONFIG.min_points)
     assert shares[0] == 0.5 and shares[1].isnan()
-    assert arrivals.share(mask, 201)[0].isnan()
+    assert arrivals.shares([mask], 201)[0, 0].isnan()

@@ -87,6 +87,19 @@ def test_rigid_puts_bent_rotations_right() -> None:
     torch.testing.assert_close(stretch, stretch.mT, rtol=0, atol=1e-14)
 
 
+def test_a_long_chain_of_relative_poses_stays_rigid() -> None:
+    """A pose is kept relative to a keyframe and read back, frame after frame: rounding must not grow from it."""
+    keyframe, pose = se3_exp(tangents(1.0, 2))
+    step = se3_exp(1e-2 * tangents(1.0, 1)[0])
+    step[3, 3] += 2.2e-16
+    for _ in range(1000):
+        relative = rigid(step @ pose @ invert(keyframe))
+        pose = relative @ keyframe
+    assert pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+    identity = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(pose[:3, :3] @ pose[:3, :3].T, identity, rtol=0, atol=1e-12)
+
+
 def test_batches_of_any_shape() -> None:
     xi = tangents(1.0, 6).reshape(2, 3, 6)
     T = se3_exp(xi)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import cv2
+import kornia_rs
 import numpy as np
+import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from v3d_torch.odometry.matching import hamming, match_descriptors, match_near
 
@@ -36,6 +40,17 @@ def test_mutual_matches_equal_opencv_cross_check() -> None:
     assert len(expected) == 120
 
 
+@pytest.mark.parametrize("max_ratio", [0.7, 0.8, 0.95])
+def test_matches_with_a_ratio_equal_kornia_rs(max_ratio: float) -> None:
+    a, b = _descriptors(200, 0), torch.cat([_descriptors(150, 1), _descriptors(50, 2)])
+    b[:120] = _flip(a[:120], 60)
+    b[150:] = _flip(b[:50], 20)  # these have a rival
+    limits = {"max_distance": 64, "max_ratio": max_ratio, "cross_check": True}
+    expected = kornia_rs.features.match_descriptors(a.numpy(), b.numpy(), **limits)
+    assert 60 < len(expected) <= 120
+    assert torch.equal(match_descriptors(a, b, max_hamming=64, max_ratio=max_ratio), torch.from_numpy(expected))
+
+
 def test_too_few_descriptors_match_nothing() -> None:
     assert match_descriptors(_descriptors(1, 0), _descriptors(5, 1), max_hamming=64, max_ratio=0.8).shape == (0, 2)
 
@@ -55,6 +70,30 @@ def test_guided_matching_finds_what_is_near_and_alike() -> None:
     order = torch.randperm(300, generator=generator)
     projected = uv[order] + 2.0
     assert _search(projected, uv, _flip(b[order], 30), b) == [[i, int(j)] for i, j in enumerate(order)]
+
+
+@given(seed=st.integers(0, 1000), landmarks=st.integers(0, 60), features=st.integers(0, 60), spread=st.floats(1, 300))
+@settings(max_examples=60, deadline=None)
+def test_guided_matching_equals_a_search_through_all_pairs(
+    seed: int, landmarks: int, features: int, spread: float
+) -> None:
+    """Also for landmarks beside all features, and searched for in the whole image or next to nowhere."""
+    generator = torch.Generator().manual_seed(seed)
+    projected = spread * torch.randn(landmarks, 2, generator=generator, dtype=torch.float64)
+    uv = 50.0 * torch.randn(features, 2, generator=generator, dtype=torch.float64)
+    radius = 100.0 * torch.rand(landmarks, generator=generator, dtype=torch.float64) ** 3
+    a, b = _descriptors(landmarks, seed), _descriptors(features, seed + 1)
+    levels = torch.zeros(landmarks, dtype=torch.int64)
+    octave = torch.zeros(features, dtype=torch.int64)
+    pairs = match_near(projected, radius, levels, a, uv, octave, b, max_hamming=256, max_ratio=0.9)
+    suitors: dict[int, list[tuple[int, int]]] = {}
+    for i in range(landmarks):
+        near = torch.nonzero((uv - projected[i]).norm(dim=1) <= radius[i])[:, 0]
+        rivals = sorted((int(hamming(a[i : i + 1], b[j : j + 1])), int(j)) for j in near)
+        if rivals and (len(rivals) == 1 or rivals[0][0] <= 0.9 * rivals[1][0]):
+            distance, feature = rivals[0]
+            suitors.setdefault(feature, []).append((distance, i))
+    assert pairs.tolist() == sorted([min(who)[1], feature] for feature, who in suitors.items())
 
 
 def test_guided_matching_ignores_what_is_far_or_on_another_level() -> None:

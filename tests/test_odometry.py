@@ -89,7 +89,7 @@ def test_ransac_of_too_few_points_is_empty() -> None:
     a, b, _ = _views()
     assert not epipolar_inliers(a.uv[:7], b.uv[:7], threshold=1.0, iterations=10, seed=0).any()
     points = CAMERA.lift(a.uv[:5], a.depth[:5])
-    assert pnp_ransac(points, b.uv[:5], CAMERA.K, threshold=2.0, iterations=10, seed=0) is None
+    assert pnp_ransac(points, b.uv[:5], CAMERA, threshold=2.0, iterations=10, seed=0) is None
 
 
 @pytest.mark.parametrize("kind", ["identical", "collinear"])
@@ -97,7 +97,7 @@ def test_degenerate_points_give_no_wrong_pose(kind: str) -> None:
     points = torch.ones(50, 3, dtype=torch.float64)
     if kind == "collinear":
         points[:, 0] = torch.linspace(-1, 1, 50)
-    found = pnp_ransac(points, CAMERA.project(points), CAMERA.K, threshold=2.0, iterations=50, seed=0)
+    found = pnp_ransac(points, CAMERA.project(points), CAMERA, threshold=2.0, iterations=50, seed=0)
     if found is not None:  # many poses explain a line: whichever comes back must be one of them
         T_cw, inliers = found
         seen = CAMERA.project(points @ T_cw[:3, :3].T + T_cw[:3, 3])

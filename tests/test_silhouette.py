@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.silhouette import silhouettes
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 WALL, OBJECT = 4.0, 2.0
@@ -37,7 +37,8 @@ ON_BOARD = before_a_wall()[0] == OBJECT
 
 
 def draw(cloud: Tensor, depth: Tensor, spacing: float = SPACING, margin: int = 0) -> tuple[Tensor, Tensor]:
-    return silhouette(cloud, depth, CAMERA, spacing, margin, TOLERANCE)
+    (silhouette,) = silhouettes([cloud], CAMERA, spacing)
+    return silhouette(depth, margin, TOLERANCE)
 
 
 @pytest.mark.parametrize("margin", [0, 8, 20])
@@ -131,7 +132,7 @@ def test_a_lens_folds_nothing_from_afar_into_the_image(degrees: float) -> None:
     lens = (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
     camera = PinholeCamera(542.822841, 542.576870, 315.593520, 237.756098, distortion=lens)
     cloud = OBJECT * torch.tensor([[math.tan(math.radians(degrees)), 0.0, 1.0]])
-    near, _ = silhouette(cloud, torch.full((1, 480, 640), OBJECT), camera, SPACING, 8, TOLERANCE)
+    near, _ = silhouettes([cloud], camera, SPACING)[0](torch.full((1, 480, 640), OBJECT), 8, TOLERANCE)
     assert bool(near.any()) is (degrees < 31)
 
 
@@ -148,6 +149,14 @@ def test_each_point_is_near_and_explains_its_own_depth(height: int, width: int, 
     z = 0.5 + 4 * torch.rand(len(v), generator=generator)
     depth = torch.zeros(1, height, width)
     depth[0, v, u] = z
-    near, explained = silhouette(camera.rays[v, u] * z[:, None], depth, camera, SPACING, margin, 0.01)
+    near, explained = silhouettes([camera.rays[v, u] * z[:, None]], camera, SPACING)[0](depth, margin, 0.01)
     assert near[v, u].all() and explained[v, u].all()
     assert not (explained & ~near).any()
+
+
+def test_several_clouds_are_drawn_as_each_alone() -> None:
+    clouds = [points(), torch.zeros(0, 3), points(1.5, every=3), -points()]
+    together = [drawn(before_a_wall(), 8, TOLERANCE) for drawn in silhouettes(clouds, CAMERA, SPACING)]
+    for cloud, (near, explained) in zip(clouds, together, strict=True):
+        alone = draw(cloud, before_a_wall(), margin=8)
+        assert torch.equal(near, alone[0]) and torch.equal(explained, alone[1])

@@ -23,17 +23,23 @@ _TINY = 1e-8  # squared angle below which the limits of the closed forms are exa
 def invert(T: Tensor) -> Tensor:
     """Inverse of rigid motions, shape :math:`(..., 4, 4)`: ``invert(T_wc)`` is ``T_cw``."""
     R = T[..., :3, :3].mT
-    return torch.cat([torch.cat([R, -(R @ T[..., :3, 3:])], dim=-1), T[..., 3:, :]], dim=-2)
+    return _motion(R, -(R @ T[..., :3, 3:]))
 
 
 def rigid(T: Tensor) -> Tensor:
     """The rigid motions nearest to matrices that rounding has bent, shape :math:`(..., 4, 4)`.
 
     `invert` takes rotations for orthonormal, so that a chain of products and inverses doubles its rounding error at
-    each link: a pose that is kept is put right first.
+    each link: a pose that is kept is put right first. The last row becomes (0, 0, 0, 1), whatever it was.
     """
     U, _, Vh = torch.linalg.svd(T[..., :3, :3])
-    return torch.cat([torch.cat([U @ Vh, T[..., :3, 3:]], dim=-1), T[..., 3:, :]], dim=-2)
+    return _motion(U @ Vh, T[..., :3, 3:])
+
+
+def _motion(R: Tensor, t: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) and translations (..., 3, 1) as one. The last row is exact: its error would double, too."""
+    last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*R.shape[:-2], 1, 4)
+    return torch.cat([torch.cat([R, t], dim=-1), last], dim=-2)
 
 
 def se3_exp(xi: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ camera looks through the place, the point has gone; where an earlier view looked
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -39,6 +40,11 @@ class DepthView:
     shift: int = 0
 
     _SLACK: ClassVar[float] = 0.01  # of the image's width, 0.6 degrees of a Kinect's: poses are no better
+
+    @cached_property
+    def missing(self) -> Tensor:
+        """Pixels without depth, bool, shape :math:`(H, W)`."""
+        return torch.from_numpy(self.depth[0].numpy() <= 0)  # in a third of torch's time
 
     @cached_property
     def nearest(self) -> Tensor:
@@ -77,19 +83,27 @@ def look_through(points: Tensor, view: DepthView, camera: PinholeCamera, config:
     return torch.where(in_sight, (measured > expected + tolerance).to(torch.float64), torch.nan)
 
 
-def vacated_share(cloud: Tensor, view: DepthView, camera: PinholeCamera, config: BackgroundConfig) -> float:
-    """Share of a cloud's points, of those in sight, whose place another view looks through.
+def vacated_shares(
+    clouds: Sequence[Tensor], view: DepthView, camera: PinholeCamera, config: BackgroundConfig
+) -> Tensor:
+    """Share of each cloud's points, of those in sight, whose place another view looks through.
 
     Args:
-        cloud: world frame, metres, shape :math:`(P, 3)`.
+        clouds: of K objects, world frame, metres, each of shape :math:`(P_k, 3)`.
         view: of another time.
         camera: of the view.
         config: tolerances.
 
     Returns:
-        Between 0 (all are there) and 1 (all are not); nan when too few are in sight to tell.
+        Between 0 (all are there) and 1 (all are not); nan when too few are in sight to tell; float64, :math:`(K,)`.
     """
-    return _share(look_through(cloud.to(torch.float64), view, camera, config), config.min_points)
+    if not clouds:
+        return torch.zeros(0, dtype=torch.float64)
+    told = look_through(torch.cat([cloud.to(torch.float64) for cloud in clouds]), view, camera, config)
+    cloud = torch.arange(len(clouds)).repeat_interleave(torch.tensor([len(cloud) for cloud in clouds]))
+    nothing = told.new_zeros(len(clouds))
+    known = nothing.index_add(0, cloud, (~told.isnan()).to(told.dtype))
+    return (nothing.index_add(0, cloud, told.nan_to_num()) / known).masked_fill(known < config.min_points, torch.nan)
 
 
 @dataclass(frozen=True)
@@ -110,18 +124,22 @@ class Arrivals:
         """Pixels of what was there before, over one baseline at least and none to the contrary, bool, (h, w)."""
         return (self.came == 0).any(dim=0) & ~(self.came == 1).any(dim=0)
 
-    def share(self, mask: Tensor, least: int) -> Tensor:
-        """Share of an object's pixels that came.
+    def shares(self, masks: Sequence[Tensor], least: int) -> Tensor:
+        """Share of each object's pixels that came.
 
         Args:
-            mask: bool, shape :math:`(H, W)`.
+            masks: of K objects, bool, each of shape :math:`(H, W)`.
             least: fewer pixels of which it can be told make nan.
 
         Returns:
-            For each baseline, float64, shape :math:`(B,)`.
+            For each object and baseline, float64, shape :math:`(K, B)`.
         """
-        within = self.came[:, mask[:: self.stride, :: self.stride]]
-        return torch.tensor([_share(row, least) for row in within], dtype=torch.float64)
+        step, told = self.stride, self.came.flatten(1).T
+        if not masks:
+            return self.came.new_zeros(0, told.shape[1])
+        within = torch.stack([mask[::step, ::step] for mask in masks]).flatten(1).to(told.dtype)
+        known = within @ (~told.isnan()).to(told.dtype)
+        return (within @ told.nan_to_num() / known).masked_fill(known < least, torch.nan)
 
 
 class BackgroundWatch:
@@ -191,8 +209,3 @@ class BackgroundWatch:
     def _before(self, stamp: float) -> DepthView | None:
         """The newest view at least that old."""
         return next((view for view in reversed(self._views) if view.stamp <= stamp + 1e-3), None)
-
-
-def _share(told: Tensor, least: int) -> float:
-    known = told[~torch.isnan(told)]
-    return float(known.mean()) if len(known) >= least else torch.nan

@@ -8,8 +8,6 @@ import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -129,21 +127,20 @@ def _join(component: Ints, a: Ints, b: Ints) -> Ints:
     """Components, numbered below N, after connecting points ``a[k]`` and ``b[k]`` for every k.
 
     Most pairs tell nothing new. If every component follows one partner of lower number, and that one its own to the
-    end, nearly all that belongs together has met; the pairs that still connect two components after that are few.
+    end, nearly all that belongs together has met; the pairs that still connect two components after that are few, and
+    are taken in the same way, until there are none.
     """
-    size = len(component)
-    a, b = component[a], component[b]
-    joined = np.arange(size, dtype=np.int32)
-    joined[np.maximum(a, b)] = np.minimum(a, b)
-    while not np.array_equal(joined, further := joined[joined]):
-        joined = further
-
-    a, b = joined[a], joined[b]
-    apart = a != b
-    if apart.any():
-        rest = coo_array((np.ones(apart.sum(), dtype=np.int8), (a[apart], b[apart])), shape=(size, size))
-        joined = connected_components(rest, directed=False)[1][joined]
-    return joined[component]
+    joined = component
+    while len(a):
+        a, b = joined[a], joined[b]
+        apart = a != b
+        a, b = a[apart], b[apart]
+        follows = np.arange(len(component), dtype=component.dtype)
+        follows[np.maximum(a, b)] = np.minimum(a, b)
+        while not np.array_equal(follows, further := follows[follows]):
+            follows = further
+        joined = follows[joined]
+    return joined
 
 
 class DBSCAN(torch.nn.Module):

@@ -11,10 +11,11 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import ObjectsConfig, VotingConfig
 from v3d_torch.lie import invert
-from v3d_torch.objects.background import Arrivals, DepthView, vacated_share
+from v3d_torch.objects.background import Arrivals, DepthView, vacated_shares
 from v3d_torch.objects.intra_motion import intra_object_motion
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.outlines import Outliner, grown
+from v3d_torch.objects.outlines import Outliner
+from v3d_torch.objects.regions import grown
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
@@ -104,10 +105,12 @@ class ObjectDynamics:
         """
         stamp = view.stamp
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
-        came = {track: arrivals.share(track.own, self._config.background.min_points) for track in tracks}
+        shares = arrivals.shares([track.own for track in tracks], self._config.background.min_points)
+        came = dict(zip(tracks, shares, strict=True))
         seen = [track for track in tracks if not track.missed]
-        votes, ballots = self._vote(seen, came, view)
-        chamfer = self._deform(seen, came, view)
+        left = self._vacated(seen, view)
+        votes, ballots = self._vote(seen, came, left, stamp)
+        chamfer = self._deform(seen, came, left, stamp)
         self._last_stamp = stamp
         fits = self._fit(tracks, witnesses)
         verdicts = {track: self._judge(track, came[track], stamp, fits[track]) for track in tracks}
@@ -137,14 +140,12 @@ class ObjectDynamics:
 
     def _fit(self, tracks: list[Track], witnesses: Witnesses) -> dict[Track, bool]:
         """Whether the features on each object fit the camera's motion."""
-        if not tracks:
-            return {}
         config = self._config.mask
-        vouched = witnesses.vouch_for(torch.stack([track.own for track in tracks]), config.fit_share, config.fit_least)
+        vouched = witnesses.vouch_for([track.own for track in tracks], config.fit_share, config.fit_least)
         return dict(zip(tracks, vouched.tolist(), strict=True))
 
     def _vote(
-        self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView
+        self, tracks: list[Track], came: dict[Track, Tensor], left: dict[Sighting, float], stamp: float
     ) -> tuple[dict[Track, int], list[tuple[int, int]]]:
         """Votes of each object, the most over all baselines, and who cast them; marks those that are voted dynamic."""
         config, background = self._config.voting, self._config.background
@@ -164,7 +165,7 @@ class ObjectDynamics:
                 continue
             share = background.moved_share
             moved = torch.tensor(
-                [self._has_moved(then, came[track], view, share) for track, (then, _) in pairs.items()]
+                [self._has_moved(came[track], left[then], share) for track, (then, _) in pairs.items()]
             )
             then = torch.stack([then.centroid for then, _ in pairs.values()])
             now = torch.stack([now.centroid for _, now in pairs.values()])
@@ -176,11 +177,13 @@ class ObjectDynamics:
                 if elected:
                     voted.add(track)
         for track in voted:
-            track.last_dynamic = view.stamp
+            track.last_dynamic = stamp
             track.evidence += 1
         return most, sorted(cast)
 
-    def _deform(self, tracks: list[Track], came: dict[Track, Tensor], view: DepthView) -> dict[Track, float]:
+    def _deform(
+        self, tracks: list[Track], came: dict[Track, Tensor], left: dict[Sighting, float], stamp: float
+    ) -> dict[Track, float]:
         """Root mean Chamfer distance of each living object to its own past; marks those that deform."""
         config = self._config.chamfer
         share = self._config.background.deformed_share
@@ -192,16 +195,21 @@ class ObjectDynamics:
             then, now = pair
             motion = intra_object_motion(then.cloud[None], now.cloud[None], config.distance_threshold)
             measured[track] = float(motion.distance)
-            if motion.deforming and self._has_moved(then, came[track], view, share):
-                track.last_deforming = view.stamp
+            if motion.deforming and self._has_moved(came[track], left[then], share):
+                track.last_deforming = stamp
         return measured
 
-    def _has_moved(self, then: Sighting, came: Tensor, view: DepthView, share: float) -> bool:
+    def _vacated(self, tracks: list[Track], view: DepthView) -> dict[Sighting, float]:
+        """Share of its places that each object has left since the sightings that are compared with it now."""
+        baselines = {*self._config.voting.baselines, self._config.chamfer.baseline}
+        pairs = (track.pair(baseline) for track in tracks for baseline in baselines)
+        then = list(dict.fromkeys(pair[0] for pair in pairs if pair is not None))
+        shares = vacated_shares([sighting.cloud for sighting in then], view, self._camera, self._config.background)
+        return dict(zip(then, shares.tolist(), strict=True))
+
+    def _has_moved(self, came: Tensor, left: float, share: float) -> bool:
         """Whether so much of an object has come, or has left its places; always, where the background has no say."""
-        config = self._config.background
-        if not config.enabled or bool((came >= share).any()):
-            return True
-        return vacated_share(then.cloud, view, self._camera, config) >= share
+        return not self._config.background.enabled or bool((came >= share).any()) or left >= share
 
     def _judge(self, track: Track, came: Tensor, stamp: float, fits: bool) -> Verdict:
         config = self._config.mask

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.camera import BackProjector, PinholeCamera
+from v3d_torch.camera import PinholeCamera, back_project
 from v3d_torch.config import CloudConfig
 from v3d_torch.objects.clusters import largest_clusters
 from v3d_torch.objects.dbscan import dbscan
+from v3d_torch.objects.regions import enlarged
 from v3d_torch.objects.voxel import voxel_pool
 from v3d_torch.types import Instances
 
@@ -45,7 +46,7 @@ class CloudLifter:
 
     def __init__(self, config: CloudConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._project = BackProjector(camera)
+        self._rays = camera.rays[:: config.stride, :: config.stride]
 
     def __call__(self, depth: Tensor, instances: Instances) -> ObjectClouds:
         """Lift all instances of a frame at once.
@@ -67,11 +68,11 @@ class CloudLifter:
 
     def _own(self, masks: Tensor, valid: Tensor, owner: Tensor, pixel: Tensor) -> Tensor:
         """Pixels of each mask whose point is in a voxel that stayed, bool, :math:`(N, H, W)`."""
-        step, (height, width) = self._config.stride, masks.shape[-2:]
+        step = self._config.stride
         own = torch.zeros_like(masks[:, ::step, ::step])
         instance, point = torch.nonzero(owner >= 0, as_tuple=True)
         own.flatten(1)[instance, pixel[instance, point]] = valid[instance, owner[instance, point]]
-        return own.repeat_interleave(step, dim=1).repeat_interleave(step, dim=2)[:, :height, :width] & masks
+        return enlarged(own.numpy(), step, masks.shape[-2:]) & masks
 
     def _gather(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor, Tensor]:
         """Every n-th masked pixel with depth as a padded set of points.
@@ -80,8 +81,9 @@ class CloudLifter:
             Points :math:`(N, P, 3)`, which exist :math:`(N, P)`, and their pixels, numbered row by row, :math:`(N, P)`.
         """
         step = self._config.stride
-        cloud = self._project(depth[None])[0, ::step, ::step].reshape(-1, 3)
-        z = depth[0, ::step, ::step].reshape(-1)
+        z = depth[:, ::step, ::step]
+        cloud = back_project(z[None], self._rays).reshape(-1, 3)
+        z = z.reshape(-1)
         masks = instances.masks[:, ::step, ::step].flatten(1)
         masks = masks & (z > 0) & (z <= self._config.max_depth)
         instance, pixel = torch.nonzero(masks, as_tuple=True)

@@ -15,7 +15,8 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import MaskConfig
 from v3d_torch.objects.background import Arrivals, DepthView
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.regions import enlarged, grown
+from v3d_torch.objects.silhouette import silhouettes
 from v3d_torch.objects.track import Track
 
 
@@ -48,12 +49,13 @@ class Outliner:
         T_cw = self._view.T_cw
         cloud = track.cloud_at(self._view.stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
         tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
-        _, reached = silhouette(cloud, depth, self._camera, self._spacing, config.reach, tolerance)
+        (silhouette,) = silhouettes([cloud], self._camera, self._spacing)
+        _, reached = silhouette(depth, config.reach, tolerance)
         going_on = self._going_on(track, reached) & reached
         if track.missed:  # a mask that is predicted by its depth is as it is
             return track.mask | going_on
-        _, explained = silhouette(cloud, depth, self._camera, self._spacing, config.margin, tolerance)
-        return track.own | going_on | (grown(track.mask, config.margin) & (explained | (depth[0] <= 0)))
+        _, explained = silhouette(depth, config.margin, tolerance)
+        return track.own | going_on | (grown(track.mask, config.margin) & (explained | self._view.missing))
 
     def _going_on(self, track: Track, reached: Tensor) -> Tensor:
         """Where an object's pixels go on within reach, up to the next edge, bool, shape (H, W)."""
@@ -70,13 +72,7 @@ class Outliner:
         taken = seeds >= self._config.least_part * size
         taken[0] = False
         # Up to the edge: the pixels between the last one looked at and it.
-        return _enlarged(grown(torch.from_numpy(taken[parts]), 1), step, reached.shape)
-
-
-def grown(mask: Tensor, pixels: int) -> Tensor:
-    """A mask with all that is no farther from it, bool, shape :math:`(H, W)`."""
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
-    return torch.from_numpy(cv2.dilate(mask.to(torch.uint8).numpy(), around) > 0)
+        return enlarged(grown(torch.from_numpy(taken[parts]), 1).numpy(), step, reached.shape)
 
 
 def _smooth(depth: Tensor, step: int, edge: float) -> Tensor:
@@ -86,7 +82,3 @@ def _smooth(depth: Tensor, step: int, edge: float) -> Tensor:
     farthest = cv2.dilate(depth.numpy(), side)[::step, ::step]
     at = depth[::step, ::step]
     return (at > 0) & torch.from_numpy(farthest - nearest < edge * at.numpy())
-
-
-def _enlarged(cells: Tensor, step: int, size: torch.Size) -> Tensor:
-    return cells.repeat_interleave(step, 0).repeat_interleave(step, 1)[: size[0], : size[1]]

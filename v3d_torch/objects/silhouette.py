@@ -6,12 +6,17 @@ The object's cloud, cleaned of what does not belong to it, says which depths are
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.objects.regions import enlarged
 
 _CELL = 4
 """Side of the cells in which the depths of a cloud are gathered, pixels: those of the network's masks."""
@@ -19,45 +24,80 @@ _CELL = 4
 _NONE = 1e6
 """Depth of cells without points, metres: farther than anything."""
 
-
 _NEAREST = 0.1
 """Points nearer than this, or behind the camera, have no place in the image, metres."""
 
 
-def silhouette(
-    cloud: Tensor, depth: Tensor, camera: PinholeCamera, spacing: float, margin: int, tolerance: float
-) -> tuple[Tensor, Tensor]:
-    """Pixels near an object's points in the image, and those of them that its depths explain.
+def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float) -> list[Silhouette]:
+    """Clouds as they lie in an image, all at once.
 
     Args:
-        cloud: camera frame, metres, shape :math:`(P, 3)`.
-        depth: metres, shape :math:`(1, H, W)`; 0 = no measurement.
-        camera: of both.
+        clouds: camera frame, metres, each of shape :math:`(P, 3)`.
+        camera: that takes the image.
         spacing: of the points, metres: gaps of this size are closed.
-        margin: pixels by which the outline is farther out than the outermost points.
-        tolerance: metres by which depth may lie before or behind the points around it.
-
-    Returns:
-        near and explained, bool, both of shape :math:`(H, W)`; none where the cloud has no points before the camera.
     """
-    height, width = depth.shape[-2:]
-    pixels, inside = camera.locate(cloud.to(torch.float64), _NEAREST)
-    if not inside.any():
-        nowhere = torch.zeros(height, width, dtype=torch.bool)
-        return nowhere, nowhere
-    rows, columns = -(-height // _CELL), -(-width // _CELL)
+    if not clouds:
+        return []
+    points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
+    pixels, inside = camera.locate(points, _NEAREST)
     # Pixel centres lie at integers: a cell begins half a pixel before its first.
-    u, v = ((pixels[inside] + 0.5) / _CELL).floor().to(torch.int64).unbind(dim=1)
-    cell, z = v * columns + u, cloud[inside, 2].to(torch.float32)
-    front = torch.full((rows * columns,), _NONE).scatter_reduce_(0, cell, z, "amin").reshape(rows, columns)
-    back = torch.full((rows * columns,), -_NONE).scatter_reduce_(0, cell, z, "amax").reshape(rows, columns)
-    reach = (margin + spacing * camera.fx / float(z.median())) / _CELL
-    side = 2 * max(round(reach), 1) + 1
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    nearest = _enlarged(cv2.erode(front.numpy(), around, borderValue=_NONE), height, width)
-    farthest = _enlarged(cv2.dilate(back.numpy(), around, borderValue=-_NONE), height, width)
-    return nearest < _NONE, (depth[0] > nearest - tolerance) & (depth[0] < farthest + tolerance)
+    cells = np.floor((pixels.numpy() + 0.5) / _CELL).astype(np.int64)
+    z, seen = points[:, 2].numpy().astype(np.float32), inside.numpy()
+    ends = np.cumsum([len(cloud) for cloud in clouds]).tolist()
+    drawn = []
+    for begin, end in pairwise([0, *ends]):
+        own = seen[begin:end]
+        drawn.append(Silhouette(cells[begin:end][own], z[begin:end][own], camera, spacing))
+    return drawn
 
 
-def _enlarged(cells: np.ndarray, height: int, width: int) -> Tensor:
-    return torch.from_numpy(cells).repeat_interleave(_CELL, 0).repeat_interleave(_CELL, 1)[:height, :width]
+class Silhouette:
+    """A cloud as it lies in an image.
+
+    Args:
+        cells: (column, row) of the cell of each point, int64, shape :math:`(P, 2)`.
+        z: depth of each, metres, float32, shape :math:`(P,)`.
+        camera: that takes the image.
+        spacing: of the points, metres.
+    """
+
+    def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
+        self._size = camera.height, camera.width
+        self._cells, self._z = cells, z
+        self._gap = spacing * camera.fx / float(np.median(z)) if len(z) else 0.0
+
+    def __call__(self, depth: Tensor, margin: int, tolerance: float) -> tuple[Tensor, Tensor]:
+        """Pixels near the points, and those of them that the points' depths explain.
+
+        Args:
+            depth: metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            margin: pixels by which the outline is farther out than the outermost points.
+            tolerance: metres by which depth may lie before or behind the points around it.
+
+        Returns:
+            near and explained, bool, both of shape :math:`(H, W)`; none where no point is in the image.
+        """
+        height, width = self._size
+        near = torch.zeros(height, width, dtype=torch.bool)
+        explained = torch.zeros_like(near)
+        if len(self._z) == 0:
+            return near, explained
+        radius = max(round((margin + self._gap) / _CELL), 1)
+        # Nothing is near beyond the radius: all that follows looks at this part of the image only.
+        left, top = np.maximum(self._cells.min(axis=0) - radius, 0).tolist()
+        right, bottom = (self._cells.max(axis=0) + radius + 1).tolist()
+        here = slice(top * _CELL, min(bottom * _CELL, height)), slice(left * _CELL, min(right * _CELL, width))
+        rows, columns = -(-here[0].stop // _CELL) - top, -(-here[1].stop // _CELL) - left
+        cell = (self._cells[:, 1] - top) * columns + self._cells[:, 0] - left
+        front, back = np.full(rows * columns, _NONE, np.float32), np.full(rows * columns, -_NONE, np.float32)
+        np.minimum.at(front, cell, self._z)
+        np.maximum.at(back, cell, self._z)
+        around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        nearest = cv2.erode(front.reshape(rows, columns), around, borderValue=_NONE)
+        farthest = cv2.dilate(back.reshape(rows, columns), around, borderValue=-_NONE)
+        size = near[here].shape
+        near[here] = enlarged(nearest < _NONE, _CELL, size)
+        low, high = (enlarged(z, _CELL, size).numpy() for z in (nearest - tolerance, farthest + tolerance))
+        z = depth[0].numpy()[here]  # NumPy compares in a third of torch's time
+        explained[here] = torch.from_numpy((z > low) & (z < high))
+        return near, explained

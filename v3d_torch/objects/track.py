@@ -14,7 +14,7 @@ from v3d_torch.objects.motion_filter import MotionFilter
 from v3d_torch.segmentation.coco import UNNAMED
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # a sighting is itself, not its values
 class Sighting:
     """Where an object was at one time.
 

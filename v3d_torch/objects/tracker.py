@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -10,7 +12,7 @@ from v3d_torch.config import IdentityConfig
 from v3d_torch.lie import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.silhouette import silhouette
+from v3d_torch.objects.silhouette import silhouettes
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.types import Instances
 
@@ -56,7 +58,8 @@ class InstanceTracker(torch.nn.Module):
         """
         sightings = [self._sight(stamp, clouds, i, T_wc) for i in range(len(instances))]
         # Where each should be by now: to be found there, and left out there if it is not found.
-        moved = {track: self._predict_mask(track, stamp, depth, T_wc) for track in self.tracks}
+        missing = torch.from_numpy(depth[0].numpy() <= 0)
+        moved = self._predict_masks(stamp, depth, missing, T_wc)
         owner = self._assign(stamp, instances, sightings, moved)
         continued = set()
         for i, sighting in enumerate(sightings):
@@ -75,15 +78,27 @@ class InstanceTracker(torch.nn.Module):
             if track.id not in continued:
                 track.missed = True
                 track.mask = moved[track]
-                track.own = track.mask & (depth[0] > 0)
-        self.tracks = [track for track in self.tracks if not (track.missed and self._is_found_again(track))]
+                track.own = track.mask & ~missing
+        self._drop_found_again()
         return list(self.tracks)
 
-    def _is_found_again(self, missed: Track) -> bool:
-        """Whether an object of its class was found where a missed one should be: the same, with another id."""
-        least = self._config.least_overlap * int(missed.own.sum())
-        others = (t for t in self.tracks if not t.missed and t.newest.located and t.label == missed.label)
-        return any(int((missed.own & other.mask).sum()) > least for other in others)
+    def _drop_found_again(self) -> None:
+        """Drop missed objects where one of their class was found where they should be: the same, with another id."""
+        missed = [track for track in self.tracks if track.missed]
+        found = [track for track in self.tracks if not track.missed and track.newest.located]
+        if not missed or not found:
+            return
+        own = self._coarse([track.own for track in missed])
+        both = own @ self._coarse([track.mask for track in found]).T
+        alike = torch.tensor([[track.label == other.label for other in found] for track in missed])
+        again = (alike & (both > self._config.least_overlap * own.sum(dim=1, keepdim=True))).any(dim=1)
+        dropped = {track for track, is_again in zip(missed, again.tolist(), strict=True) if is_again}
+        self.tracks = [track for track in self.tracks if track not in dropped]
+
+    def _coarse(self, masks: Sequence[Tensor]) -> Tensor:
+        """Masks as rows of numbers, some of their pixels, float32, :math:`(K, P)`."""
+        step = self._stride
+        return torch.stack([mask[::step, ::step] for mask in masks]).flatten(1).to(torch.float32)
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the tracks along when the map is corrected under them.
@@ -107,11 +122,9 @@ class InstanceTracker(torch.nn.Module):
             return {}
         predicted = torch.stack([track.predict(stamp) for track in self.tracks])
         seen = torch.stack([sighting.centroid for sighting in sightings])
-        masks = instances.masks[:, :: self._stride, :: self._stride]
-        before = torch.stack([track.mask[:: self._stride, :: self._stride] for track in self.tracks])
-        now = torch.stack([moved[track][:: self._stride, :: self._stride] for track in self.tracks])
         # A mask as it was is exact where little moves; moved on, it keeps up with fast walkers and a camera that turns.
-        overlap = torch.maximum(_overlap(before, masks), _overlap(now, masks))
+        expected = self._coarse([*(track.mask for track in self.tracks), *(moved[track] for track in self.tracks)])
+        overlap = _overlap(expected, self._coarse(list(instances.masks))).unflatten(0, (2, -1)).amax(dim=0)
         elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
         gate = self._config.max_jump + self._config.max_speed * elapsed
         alike = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
@@ -120,17 +133,19 @@ class InstanceTracker(torch.nn.Module):
         )[0]
         return {i: self.tracks[track] for i, track in enumerate(matched.tolist()) if track >= 0}
 
-    def _predict_mask(self, track: Track, stamp: float, depth: Tensor, T_wc: Tensor) -> Tensor:
-        """Pixels where an object should be: its last cloud, moved on, where the depth agrees."""
+    def _predict_masks(self, stamp: float, depth: Tensor, missing: Tensor, T_wc: Tensor) -> dict[Track, Tensor]:
+        """Pixels where each object should be: its last cloud, moved on, where the depth agrees or is missing."""
         T_cw = invert(T_wc)
-        cloud = track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
-        near, explained = silhouette(cloud, depth, self._camera, self._voxel_size, 0, self._DEPTH_GATE)
-        return near & (explained | (depth[0] <= 0))
+        clouds = [track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in self.tracks]
+        masks = {}
+        for track, silhouette in zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True):
+            near, explained = silhouette(depth, 0, self._DEPTH_GATE)
+            masks[track] = near & (explained | missing)
+        return masks
 
 
 def _overlap(a: Tensor, b: Tensor) -> Tensor:
-    """Intersection over union of every mask of ``a`` with every one of ``b``, float64, shape :math:`(A, B)`."""
-    a, b = a.flatten(1).to(torch.float32), b.flatten(1).to(torch.float32)
+    """Intersection over union of every row of ``a`` with every one of ``b``, float64, shape :math:`(A, B)`."""
     both = a @ b.T
     either = a.sum(dim=1)[:, None] + b.sum(dim=1)[None, :] - both
     return (both / either.clamp(min=1)).to(torch.float64)

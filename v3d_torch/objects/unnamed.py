@@ -13,6 +13,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.objects.background import Arrivals
+from v3d_torch.objects.regions import enlarged
 from v3d_torch.segmentation.coco import UNNAMED
 from v3d_torch.types import Instances
 
@@ -49,6 +50,5 @@ def unnamed_instances(
     large = 1 + np.flatnonzero(area[1:] >= min_area)
     if len(large) == 0:
         return Instances.empty(height, width)
-    small = torch.from_numpy(region == large[:, None, None])
-    masks = small.repeat_interleave(step, dim=1).repeat_interleave(step, dim=2)[:, :height, :width]
+    masks = enlarged(region == large[:, None, None], step, (height, width))
     return Instances(masks, torch.full((len(large),), UNNAMED), torch.zeros(len(large)), torch.zeros(len(large), 4))

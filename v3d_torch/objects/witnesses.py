@@ -7,8 +7,10 @@ walks few fit the motion that the rest of the image agrees on.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -24,18 +26,19 @@ class Witnesses:
     pixel: Tensor
     fits: Tensor
 
-    def vouch_for(self, masks: Tensor, share: float, least: int) -> Tensor:
+    def vouch_for(self, masks: Sequence[Tensor], share: float, least: int) -> Tensor:
         """For which objects they vouch.
 
         Args:
-            masks: of objects, bool, shape :math:`(K, H, W)`.
+            masks: of K objects, bool, each of shape :math:`(H, W)`.
             share: of an object's features so many must fit, in shares of how many fit outside of all objects.
             least: and at least so many.
 
         Returns:
             bool, shape :math:`(K,)`.
         """
-        inside = masks[:, self.pixel[:, 1], self.pixel[:, 0]]
+        column, row = self.pixel.unbind(dim=1)
+        inside = torch.cat([self.fits.new_zeros(0, len(column)), *(mask[row, column][None] for mask in masks)])
         outside = ~inside.any(dim=0)
         usual = (self.fits & outside).sum() / outside.sum().clamp(min=1)
         fitting, all_ = (inside & self.fits).sum(dim=1), inside.sum(dim=1)

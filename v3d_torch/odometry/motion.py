@@ -90,7 +90,7 @@ class MotionEstimator:
         pose = pnp_ransac(
             self._camera.lift(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]]),
             b.uv[pairs[:, 1]],
-            self._camera.K,
+            self._camera,
             threshold=config.pnp_threshold,
             iterations=config.iterations,
             seed=self._seed,

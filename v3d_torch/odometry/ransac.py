@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import kornia_rs
 import torch
 from torch import Tensor
 
+from v3d_torch.camera import PinholeCamera
 from v3d_torch.lie import rigid
+from v3d_torch.odometry.refine import INLIER_LIMIT, refine_pose
+
+_SOME = 100
+"""Points that RANSAC looks at first, evenly taken from all: kornia-rs takes 30 microseconds for each. Where no pose
+explains half of all points, so few are too few to find the one that explains a fifth."""
 
 
 def epipolar_inliers(uv_a: Tensor, uv_b: Tensor, *, threshold: float, iterations: int, seed: int) -> Tensor:
@@ -34,14 +42,14 @@ def epipolar_inliers(uv_a: Tensor, uv_b: Tensor, *, threshold: float, iterations
 
 
 def pnp_ransac(
-    points: Tensor, uv: Tensor, K: Tensor, *, threshold: float, iterations: int, seed: int
+    points: Tensor, uv: Tensor, camera: PinholeCamera, *, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor] | None:
-    """Pose of a camera that sees known points (EPnP in RANSAC with local optimisation).
+    """Pose of a camera that sees known points: EPnP in RANSAC, refined on all that agree.
 
     Args:
         points: metres, float64, shape :math:`(N, 3)`, in some frame "w".
         uv: undistorted pixels, float64, shape :math:`(N, 2)`.
-        K: camera matrix, float64, shape :math:`(3, 3)`.
+        camera: that sees them.
         threshold: reprojection error of an inlier, pixels.
         iterations: most hypotheses.
         seed: of the sampling.
@@ -49,13 +57,29 @@ def pnp_ransac(
     Returns:
         ``T_cw``, float64, shape :math:`(4, 4)`, and the inliers, bool, shape :math:`(N,)`; None without a solution.
     """
-    if points.shape[0] < 6:
+    count = points.shape[0]
+    if count < 6:
         return None
+    found = None
+    for enough in (_SOME, count):
+        some = torch.linspace(0, count - 1, min(enough, count)).round().to(torch.int64)
+        T_cw = _sampled(points[some], uv[some], camera.K, threshold=threshold, iterations=iterations, seed=seed)
+        if T_cw is not None:
+            no_depth = uv.new_zeros(count)  # of the camera's own: the points' depths have told what they can
+            sigma = torch.full_like(no_depth, threshold / math.sqrt(INLIER_LIMIT))
+            refined = refine_pose(T_cw, points, uv, no_depth, sigma, camera, inverse_depth_sigma=1.0, rounds=2)
+            found = refined.T_cw, refined.inliers
+            if 2 * int(refined.inliers.sum()) > count:
+                break
+    return found
+
+
+def _sampled(points: Tensor, uv: Tensor, K: Tensor, *, threshold: float, iterations: int, seed: int) -> Tensor | None:
     try:
-        R, t, inliers, _ = kornia_rs.k3d.solve_pnp_ransac(
-            points.contiguous().numpy(),
-            uv.contiguous().numpy(),
-            K.contiguous().numpy(),
+        R, t, _, _ = kornia_rs.k3d.solve_pnp_ransac(
+            points.numpy(),
+            uv.numpy(),
+            K.numpy(),
             threshold=threshold,
             max_iterations=iterations,
             lo_every=5,
@@ -66,6 +90,4 @@ def pnp_ransac(
     T_cw = torch.eye(4, dtype=torch.float64)
     T_cw[:3, :3] = torch.from_numpy(R)
     T_cw[:3, 3] = torch.from_numpy(t).reshape(3)
-    if not torch.isfinite(T_cw).all():
-        return None
-    return rigid(T_cw), torch.from_numpy(inliers.astype(bool))
+    return rigid(T_cw) if bool(torch.isfinite(T_cw).all()) else None

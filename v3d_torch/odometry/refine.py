@@ -18,6 +18,11 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.levenberg import huber, levenberg_marquardt
 from v3d_torch.lie import rigid, se3_exp
 
+INLIER_LIMIT = 5.991
+"""Squared error of (u, v) in sigmas that 95 % of good observations stay below: chi-square with 2 degrees of freedom."""
+
+_LIMIT_WITH_DEPTH = 7.815  # the same for (u, v, 1/z), with 3
+
 _NEAREST = 0.05  # metres: no camera sees nearer; keeps 1/z finite for points that a step puts behind the camera
 
 
@@ -40,11 +45,8 @@ class Measurements:
 
     @property
     def limit(self) -> Tensor:
-        """Squared error in sigmas that 95 % of good observations stay below, :math:`(M,)`.
-
-        It is the quantile of chi-square with 3 degrees of freedom, or 2 without depth.
-        """
-        return torch.full_like(self.inverse_depth, 5.991).masked_fill_(self.inverse_depth > 0, 7.815)
+        """Squared error in sigmas that 95 % of good observations stay below, :math:`(M,)`."""
+        return torch.full_like(self.inverse_depth, INLIER_LIMIT).masked_fill_(self.inverse_depth > 0, _LIMIT_WITH_DEPTH)
 
 
 def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
