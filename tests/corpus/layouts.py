@@ -179,7 +179,7 @@ CASES = [
     Case(
         "OpenLORIS, a broken camera",
         openloris("%YAML:1.0\nd400_color_optical_frame: [\n"),
-        Says("{seq}/sensors.yaml: is no YAML as OpenCV writes it; copy it again"),
+        Says("{seq}/sensors.yaml: is no YAML as OpenCV writes it (...); copy it again"),
     ),
     Case(
         "OpenLORIS, no camera",
@@ -190,9 +190,20 @@ CASES = [
         ),
     ),
     Case(
+        "OpenLORIS, a matrix that OpenCV falls over",
+        openloris(
+            "%YAML:1.0\nd400_color_optical_frame:\n   intrinsics: !!opencv-matrix\n      rows: 1\n      col: 4\n"
+            "      dt: d\n      data: [ 1., 2. ]\n"
+        ),
+        Says(
+            "{seq}/sensors.yaml: holds no d400_color_optical_frame with width, height, intrinsics; copy it"
+            " again, or give --camera"
+        ),
+    ),
+    Case(
         "OpenLORIS, a camera of noise",
         openloris(NOISE),
-        Says("{seq}/sensors.yaml: is no YAML as OpenCV writes it; copy it again"),
+        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it is YAML as OpenCV writes it"),
     ),
     Case(
         "images without times",

@@ -96,16 +96,14 @@ def scale_error(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> float | Non
         alignment: of the two, from `align`.
 
     Returns:
-        Size of the ground truth over that of the estimate; None where that explains no more than the half of the
-        errors, or is less than `_SCALE` either way.
+        Size of the ground truth over that of the estimate; None where that is less than `_SCALE` either way, or the
+        shape is another one: the estimate in this size leaves more than half of the ground truth's spread.
     """
     p_g, p_e = T_gc[:, :3, 3], (alignment.T_ge @ T_ec)[:, :3, 3]
     p_g, p_e = p_g - p_g.mean(dim=0), p_e - p_e.mean(dim=0)
     factor = float((p_g * p_e).sum() / p_e.square().sum())
-    left = (factor * p_e - p_g).square().sum() / (p_e - p_g).square().sum()
-    if not 1 / _SCALE < factor < _SCALE and factor > 0 and left < 0.25:
-        return factor
-    return None
+    left = (factor * p_e - p_g).square().sum() / p_g.square().sum()
+    return factor if factor > 0 and not 1 / _SCALE < factor < _SCALE and left < 0.25 else None
 
 
 def _nearest_rotation(M: Tensor) -> Tensor:
