@@ -183,7 +183,7 @@ def test_every_frame_is_reported_and_every_object_noted() -> None:
     assert (stamps := [shot.frame.stamp for shot in done.snapshots]) == sorted(stamps)
     assert len(done.snapshots) == 6
     assert set(flow.slam.clock.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
-    assert sum(flow.slam.clock.seconds.values()) <= done.seconds
+    assert max(flow.slam.clock.seconds.values()) <= done.seconds
 
 
 @pytest.mark.parametrize("where", [0, 1, 5])
@@ -267,7 +267,7 @@ def test_metrics_have_their_stable_keys(results: Path, run: Pipeline) -> None:
     assert metrics["fps"] == pytest.approx(FRAMES / metrics["seconds"])
     assert 50 < metrics["peak_memory_mb"] < 20_000
     assert metrics["seed"] == 0 and metrics["versions"]["torch"] == torch.__version__
-    assert sum(metrics["seconds_per_stage"].values()) <= metrics["seconds"]
+    assert max(metrics["seconds_per_stage"].values()) <= metrics["seconds"]  # they overlap
 
 
 def test_frames_are_a_table_of_how_each_was_found_and_how_long_it_took(results: Path, run: Pipeline) -> None:

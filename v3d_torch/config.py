@@ -370,6 +370,8 @@ class Config(Section):
     """Seed of every random choice."""
     threads: int = Field(1, gt=0, le=256)
     """Threads of torch: the tensors of a frame are so small that more threads wait for each other."""
+    lookahead: bool = True
+    """Whether the next frame is read, segmented and lifted while one is tracked; the results are the same."""
     segmentation: SegmentationConfig = SegmentationConfig()
     depth: DepthConfig = DepthConfig()
     objects: ObjectsConfig = ObjectsConfig()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sized
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
+from v3d_torch.lookahead import percepts
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.views import StaticViews
 from v3d_torch.objects.dynamics import Judged, Scene, Verdict
@@ -107,20 +109,17 @@ class Pipeline:
             on_frame: called after each frame.
         """
         start = time.perf_counter()
-        frames = iter(self.sequence)
+        ahead = self.slam.config.lookahead
         try:
-            while True:
-                with self.slam.clock("read"):
-                    frame = next(frames, None)
-                if frame is None:
-                    break
-                scene = self.slam(frame)
-                seconds = self.slam.clock.lap()
-                self.run.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
-                self._note(frame, scene)
-                self._viewer.show(frame, scene, self.slam, seconds)
-                if on_frame is not None:
-                    on_frame(frame, scene, self.slam.poses.statuses[-1])
+            with closing(percepts(iter(self.sequence), self.slam, ahead=ahead)) as coming:
+                for percept in coming:
+                    frame, scene = percept.frame, self.slam.take_in(percept)
+                    seconds = self.slam.clock.lap()
+                    self.run.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
+                    self._note(frame, scene)
+                    self._viewer.show(frame, scene, self.slam, seconds)
+                    if on_frame is not None:
+                        on_frame(frame, scene, self.slam.poses.statuses[-1])
         except V3DError as error:
             self.run.failure = str(error)
         except Exception as error:  # what was computed is worth keeping when the program is at fault, too

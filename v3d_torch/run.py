@@ -54,6 +54,9 @@ def main(
     map_in: Annotated[
         Path | None, typer.Option("--load-map", metavar="FILE", help="Find the camera in a map, and go on with it.")
     ] = None,
+    serial: Annotated[
+        bool, typer.Option("--serial", help="One thing after the other on one core, with the same results.")
+    ] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: leave the map as it is.")] = False,
 ) -> None:
     """Track an RGB-D camera in a room where people move, and map what stands still."""
@@ -67,6 +70,7 @@ def main(
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
     overrides += ["mapping.enabled=false"] if localise else []
+    overrides += ["lookahead=false", "segmentation.threads=1"] if serial else []
     with exit_on_error():
         run_sequence(
             seq,

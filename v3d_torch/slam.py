@@ -16,19 +16,19 @@ from v3d_torch.localise import Localiser
 from v3d_torch.loop.closing import LoopCloser
 from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.mapper import Mapper
-from v3d_torch.mapping.recorder import PoseRecorder, Status
+from v3d_torch.mapping.recorder import Outlook, PoseRecorder, Status
 from v3d_torch.objects.background import BackgroundWatch
 from v3d_torch.objects.dynamics import ObjectDynamics, Scene
-from v3d_torch.objects.lift import CloudLifter
+from v3d_torch.objects.lift import CloudLifter, ObjectClouds
 from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.odometry.motion import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, View
-from v3d_torch.odometry.orb import ORB
+from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.tracker import MapTracker
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
-from v3d_torch.types import RGBDFrame, Segmenter
+from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +46,32 @@ class Tracked(Scene):
     status: Status
 
 
+@dataclass(frozen=True)
+class Percept:
+    """What a frame shows by itself, whatever was seen before.
+
+    Attributes:
+        frame: as it came.
+        instances: that the segmentation finds.
+        depth: re-estimated, metres, float32, shape :math:`(1, H, W)`.
+        features: of the whole image.
+        clouds: of the instances.
+        seconds: that each stage took.
+    """
+
+    frame: RGBDFrame
+    instances: Instances
+    depth: Tensor
+    features: Features
+    clouds: ObjectClouds
+    seconds: dict[str, float]
+
+
 class V3DSLAM:
     """Tracks an RGB-D camera and maps what stands still.
 
-    Every stage is an attribute, and any callable of the same signature can take its place.
+    Every stage is an attribute, and any callable of the same signature can take its place. Those up to the clouds look
+    at a frame by itself (`perceive`), and may run ahead of those that follow the camera (`take_in`).
 
     Args:
         camera: intrinsics; None takes those of the first frame.
@@ -74,6 +96,7 @@ class V3DSLAM:
         self.clock = StageClock()
         self._last: View | None = None
         self._known = known
+        self._outlook = self.outlook()
         self._ready = camera is not None
         if camera is not None:
             self._set_up(camera)
@@ -101,31 +124,57 @@ class V3DSLAM:
         Raises:
             ConfigError: nobody said which camera took the first frame.
         """
+        percept = self.perceive(frame, self._outlook)
+        self._outlook = self.outlook()
+        return self.take_in(percept)
+
+    def outlook(self) -> Outlook | None:
+        """How the camera is expected to go on; None in a known map as long as nobody knows where."""
+        return self.poses.outlook() if self.poses.located or self._known is None else None
+
+    def perceive(self, frame: RGBDFrame, outlook: Outlook | None) -> Percept:
+        """Look at a frame by itself: nothing of what follows the camera is touched.
+
+        Args:
+            frame: the next one.
+            outlook: how the camera was expected to go on before the frame before was taken in, which tells up from
+                down; see `percepts`, which runs this ahead.
+
+        Raises:
+            ConfigError: nobody said which camera took the first frame.
+        """
         if not self._ready:
             if frame.camera is None:
                 raise ConfigError("the camera is not known: give it to V3DSLAM, or frames that carry it")
             self._set_up(frame.camera)
             self._ready = True
-        predicted = self.poses.predict(frame.stamp)
-        with self.clock("segmentation"):  # III-A: instances, people among them set aside
-            placed = self.poses.located or not self.mapper.map.keyframes  # a known map does not tell where in it
-            instances = self.segment(replace(frame, T_cw=predicted if placed else None))
-        with self.clock("depth"):  # III-B.1: depth re-estimated
+        clock = StageClock()
+        with clock("segmentation"):  # III-A: instances, people among them set aside
+            instances = self.segment(replace(frame, T_cw=None if outlook is None else outlook.at(frame.stamp)))
+        with clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
-        with self.clock("features"):  # III-A: ORB
+        with clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
+        with clock("clouds"):  # III-B.2: instances lifted to clean clouds
+            clouds = self.lift(depth, instances)
+        return Percept(frame, instances, depth, features, clouds, dict(clock.seconds))
+
+    def take_in(self, percept: Percept) -> Tracked:
+        """Follow the camera and the objects on to the next frame."""
+        frame, instances, depth, features = percept.frame, percept.instances, percept.depth, percept.features
+        self.clock.add(percept.seconds)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             seen = View(frame, depth, features)
-            last, T_lw = self._last, self.poses.T_cw
+            last, T_lw, predicted = self._last, self.poses.T_cw, self.poses.predict(frame.stamp)
             motion = None if last is None else self.move(last, seen, predicted @ invert(T_lw))
             T_cw = predicted if motion is None else rigid(motion.T_ba @ T_lw)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             view = self.watch.look(frame.stamp, depth, T_cw)
             arrivals = self.watch(view, trusted=motion is not None)
+            clouds = percept.clouds
             if self.config.segmentation.source != "none":  # the baseline has no masks at all
-                instances = instances.joined(self.propose(arrivals, instances, depth))
-        with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
-            clouds = self.lift(depth, instances)
+                proposed = self.propose(arrivals, instances, depth)
+                instances, clouds = instances.joined(proposed), clouds.joined(self.lift(depth, proposed))
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
             scene = self.judge(instances, clouds, view, arrivals, Witnesses(features.pixel, seen.matched(motion)))
             keep = features.on(scene.static)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 
@@ -26,7 +26,11 @@ class StageClock:
         try:
             yield
         finally:
-            elapsed = time.perf_counter() - start
+            self.add({stage: time.perf_counter() - start})
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Add what another clock measured, by stage."""
+        for stage, elapsed in seconds.items():
             self.seconds[stage] += elapsed
             self._lap[stage] += elapsed
 

@@ -83,4 +83,4 @@ class Job:
 def on_one_thread(config: Config) -> Config:
     """The same configuration on one thread, which changes the time and nothing else."""
     segmentation = config.segmentation.model_copy(update={"threads": 1})
-    return config.model_copy(update={"threads": 1, "segmentation": segmentation})
+    return config.model_copy(update={"threads": 1, "lookahead": False, "segmentation": segmentation})

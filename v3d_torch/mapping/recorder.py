@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -55,10 +56,30 @@ class _Entry:
         return self.T_ck @ _pose(self.keyframe)
 
 
+@dataclass(frozen=True)
+class Outlook:
+    """How a camera is expected to go on from where it was.
+
+    Attributes:
+        stamp: of the frame that this was after, seconds.
+        T_cw: of that frame, world to camera, float64, shape :math:`(4, 4)`.
+        velocity: twist per second, in the camera frame, float64, shape :math:`(6,)`.
+    """
+
+    stamp: float
+    T_cw: Tensor
+    velocity: Tensor
+
+    LONGEST: ClassVar[float] = 0.2  # seconds: a hand changes its motion within that; then a lost camera stands still
+
+    def at(self, stamp: float) -> Tensor:
+        """``T_cw`` at ``stamp`` with constant velocity."""
+        elapsed = min(stamp - self.stamp, self.LONGEST)
+        return se3_exp(self.velocity * elapsed) @ self.T_cw
+
+
 class PoseRecorder:
     """Remembers the pose of each frame relative to a keyframe, and predicts the next one."""
-
-    _MAX_PREDICTION = 0.2  # seconds: a hand changes its motion within that; then a lost camera stands still
 
     def __init__(self) -> None:
         self._entries: list[_Entry] = []
@@ -85,12 +106,14 @@ class PoseRecorder:
         """World to camera of the last frame, float64, shape :math:`(4, 4)`."""
         return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
 
+    def outlook(self) -> Outlook:
+        """How the camera is expected to go on from the last frame; where there is none it stands at the origin."""
+        stamp = self._entries[-1].stamp if self._entries else 0.0
+        return Outlook(stamp, self.T_cw, self._velocity)
+
     def predict(self, stamp: float) -> Tensor:
         """``T_cw`` at ``stamp`` with constant velocity."""
-        if not self._entries:
-            return self.T_cw
-        elapsed = min(stamp - self._entries[-1].stamp, self._MAX_PREDICTION)
-        return se3_exp(self._velocity * elapsed) @ self.T_cw
+        return self.outlook().at(stamp)
 
     def record(
         self, stamp: float, estimate: Estimate, keyframe: Keyframe | None, T_cp: Tensor | None = None
@@ -123,7 +146,7 @@ class PoseRecorder:
         if self._entries:
             elapsed = stamp - self._entries[-1].stamp
             if estimate.status is Status.LOST:
-                self._velocity = self._velocity * (stamp - self._last_found() < self._MAX_PREDICTION)
+                self._velocity = self._velocity * (stamp - self._last_found() < Outlook.LONGEST)
             elif self.status is not Status.LOST and elapsed > 0:
                 self._velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
         T_ck = rigid(estimate.T_cw @ invert(T_kw))
