@@ -91,6 +91,8 @@ def unreadable(file: str) -> Make:
 
 
 SAVE = options("--save-masks")
+SERIAL = options("--serial")
+"""A frame is read when the one before is done with, so that what happens then happens at the same place each time."""
 
 CASES = [
     Case("a file", out_is_a_file, Says("{out}: cannot be made (File exists); choose another folder with --out")),
@@ -153,19 +155,19 @@ CASES = [
     ),
     Case(
         "the disk becomes full while masks are saved",
-        SAVE,
+        all_of(SAVE, SERIAL),
         Says("{out}/trajectory.txt: cannot be written (File too large); free the disk or choose another folder"),
         lambda place: full_from_frame(3),
     ),
     Case(
         "the folder is removed during the run",
-        SAVE,
+        all_of(SAVE, SERIAL),
         Right(),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.out)),
     ),
     Case(
         "the folder becomes a file during the run",
-        SAVE,
+        all_of(SAVE, SERIAL),
         Says("{out}/trajectory.txt: cannot be written (File exists); free the disk or choose another folder"),
         lambda place: at_frame(4, lambda: (shutil.rmtree(place.out), place.out.write_text(""))),
     ),
@@ -191,7 +193,7 @@ CASES = [
     ),
     Case(
         "Ctrl-C",
-        lambda place: None,
+        SERIAL,
         Says("interrupted after 5 of 8 frames (the results of the 5 frames before are in {out})", kept=5),
         lambda place: at_frame(4, lambda: os.kill(os.getpid(), signal.SIGINT)),
     ),
