@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,11 @@ def photograph(name: str) -> Tensor:
     return torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1)
 
 
-@pytest.fixture(scope="module", params=list(REGISTRY))
+@pytest.fixture(scope="module", params=list(product(REGISTRY, ("float32", "int8"))), ids="-".join)
 def segmenter(request: pytest.FixtureRequest) -> YOLOSegmenter:
-    """Each model at the default size."""
-    return YOLOSegmenter(SegmentationConfig(model=request.param, threads=1))
+    """Each model at the default size, in each precision."""
+    model, precision = request.param
+    return YOLOSegmenter(SegmentationConfig(model=model, precision=precision, threads=1))
 
 
 def test_the_astronaut_is_a_person_where_she_stands(segmenter: YOLOSegmenter) -> None:
@@ -74,7 +76,8 @@ def test_cup_and_cat_are_found(segmenter: YOLOSegmenter, name: str, label: str, 
 def test_convention_channels_are_red_green_blue(segmenter: YOLOSegmenter) -> None:
     """The ginger cat turns blue, and less of a cat, when red and blue are swapped."""
     image = photograph("chelsea")
-    assert segmenter.segment(image).scores[0] > segmenter.segment(image.flip(0)).scores[0] + 0.05
+    found, swapped = (segmenter.segment(channels).scores for channels in (image, image.flip(0)))
+    assert found[0] > (swapped[0] if len(swapped) else 0.0) + 0.05
 
 
 def test_same_bytes_with_one_thread_and_two() -> None:

@@ -18,6 +18,7 @@ from v3d_torch.segmentation.export import exported
 from v3d_torch.segmentation.letterbox import CELL, letterbox
 from v3d_torch.segmentation.networks.head import STRIDES
 from v3d_torch.segmentation.networks.prototypes import PROTOTYPES
+from v3d_torch.segmentation.quantise import is_worth_it, quantised
 from v3d_torch.segmentation.weights import REGISTRY, resolve
 from v3d_torch.types import Instances, RGBDFrame
 
@@ -39,6 +40,8 @@ class YOLOSegmenter:
             path = weights
         else:
             path = exported(config.model, resolve(config.model, weights), config.height, config.width)
+            if config.precision == "int8" and is_worth_it():
+                path = quantised(path)
         self.config = config
         self._path = path
         self._session = _open_session(path, config.threads)
