@@ -160,3 +160,14 @@ def test_several_clouds_are_drawn_as_each_alone() -> None:
     for cloud, (near, explained) in zip(clouds, together, strict=True):
         alone = draw(cloud, before_a_wall(), margin=8)
         assert torch.equal(near, alone[0]) and torch.equal(explained, alone[1])
+
+
+@pytest.mark.parametrize("step", [2, 3, 4, 5, 8])
+def test_every_nth_pixel_is_drawn_as_among_all(step: int) -> None:
+    depth = before_a_wall()
+    depth[0, 50:60, 70:80] = 0.0
+    (drawn,) = silhouettes([points(every=3)], CAMERA, SPACING)
+    for all_of_them, some in zip(
+        drawn(depth, 8, TOLERANCE), drawn(depth[:, ::step, ::step], 8, TOLERANCE, step), strict=True
+    ):
+        assert some.any() and torch.equal(some, all_of_them[::step, ::step])

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.objects.regions import enlarged
 
 _CELL = 4
 """Side of the cells in which the depths of a cloud are gathered, pixels: those of the network's masks."""
@@ -62,23 +61,22 @@ class Silhouette:
     """
 
     def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
-        self._size = camera.height, camera.width
         self._cells, self._z = cells, z
         self._gap = spacing * camera.fx / float(np.median(z)) if len(z) else 0.0
 
-    def __call__(self, depth: Tensor, margin: int, tolerance: float) -> tuple[Tensor, Tensor]:
+    def __call__(self, depth: Tensor, margin: int, tolerance: float, step: int = 1) -> tuple[Tensor, Tensor]:
         """Pixels near the points, and those of them that the points' depths explain.
 
         Args:
-            depth: metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            depth: metres, of every n-th pixel, shape :math:`(1, h, w)`; 0 = no measurement.
             margin: pixels by which the outline is farther out than the outermost points.
             tolerance: metres by which depth may lie before or behind the points around it.
+            step: that n.
 
         Returns:
-            near and explained, bool, both of shape :math:`(H, W)`; none where no point is in the image.
+            near and explained, bool, both of shape :math:`(h, w)`; none where no point is in the image.
         """
-        height, width = self._size
-        near = torch.zeros(height, width, dtype=torch.bool)
+        near = torch.zeros(depth.shape[1:], dtype=torch.bool)
         explained = torch.zeros_like(near)
         if len(self._z) == 0:
             return near, explained
@@ -86,8 +84,7 @@ class Silhouette:
         # Nothing is near beyond the radius: all that follows looks at this part of the image only.
         left, top = np.maximum(self._cells.min(axis=0) - radius, 0).tolist()
         right, bottom = (self._cells.max(axis=0) + radius + 1).tolist()
-        here = slice(top * _CELL, min(bottom * _CELL, height)), slice(left * _CELL, min(right * _CELL, width))
-        rows, columns = -(-here[0].stop // _CELL) - top, -(-here[1].stop // _CELL) - left
+        rows, columns = bottom - top, right - left
         cell = (self._cells[:, 1] - top) * columns + self._cells[:, 0] - left
         front, back = np.full(rows * columns, _NONE, np.float32), np.full(rows * columns, -_NONE, np.float32)
         np.minimum.at(front, cell, self._z)
@@ -95,9 +92,17 @@ class Silhouette:
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         nearest = cv2.erode(front.reshape(rows, columns), around, borderValue=_NONE)
         farthest = cv2.dilate(back.reshape(rows, columns), around, borderValue=-_NONE)
-        size = near[here].shape
-        near[here] = enlarged(nearest < _NONE, _CELL, size)
-        low, high = (enlarged(z, _CELL, size).numpy() for z in (nearest - tolerance, farthest + tolerance))
-        z = depth[0].numpy()[here]  # NumPy compares in a third of torch's time
-        explained[here] = torch.from_numpy((z > low) & (z < high))
+        v, of_row = _pixels(top, bottom, step, depth.shape[1])
+        u, of_column = _pixels(left, right, step, depth.shape[2])
+        # Columns first, while there are few rows.
+        low, high = (cells.take(of_column, axis=1).take(of_row, axis=0) for cells in (nearest, farthest))
+        z = depth[0].numpy()[v, u]  # NumPy compares in a third of torch's time
+        near[v, u] = torch.from_numpy(low < _NONE)
+        explained[v, u] = torch.from_numpy((z > low - tolerance) & (z < high + tolerance))
         return near, explained
+
+
+def _pixels(first: int, last: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
+    """Along one axis, which of every n-th pixel lie in the cells from ``first`` to before ``last``, and their cells."""
+    begin, end = -(-first * _CELL // step), min(-(-last * _CELL // step), size)
+    return slice(begin, end), np.arange(begin, end) * step // _CELL - first

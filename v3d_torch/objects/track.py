@@ -47,6 +47,7 @@ class Track:
         sightings: newest last, not older than the history of the configuration; at least one.
         missed: whether the newest frame has it only by prediction.
         labels: how often the network gave it which class.
+        label: the class that it gave most often: it may flicker from frame to frame. A name once given stays.
         score: sum of the scores that the network gave it.
         evidence: frames in which it was voted dynamic.
         last_dynamic: stamp of the last vote that went through, seconds.
@@ -61,6 +62,7 @@ class Track:
     sightings: list[Sighting] = field(default_factory=list)
     missed: bool = False
     labels: Counter[int] = field(default_factory=Counter)
+    label: int = UNNAMED
     score: float = 0.0
     evidence: int = 0
     last_dynamic: float = -torch.inf
@@ -72,11 +74,12 @@ class Track:
         self._motion = MotionFilter(self.config)
         self._most_points = 1
 
-    @property
-    def label(self) -> int:
-        """The class that the network gave most often: it may flicker from frame to frame. A name once given stays."""
+    def name(self, label: int, score: float) -> None:
+        """Take in the class that the network gives it in a frame, and with which score."""
+        self.labels[label] += 1
+        self.score += score
         named = Counter({label: count for label, count in self.labels.items() if label != UNNAMED})
-        return (named or self.labels).most_common(1)[0][0]
+        self.label = (named or self.labels).most_common(1)[0][0]
 
     @property
     def newest(self) -> Sighting:

@@ -12,7 +12,7 @@ from v3d_torch.config import IdentityConfig
 from v3d_torch.lie import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.lift import ObjectClouds
-from v3d_torch.objects.silhouette import silhouettes
+from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.types import Instances
 
@@ -58,9 +58,10 @@ class InstanceTracker(torch.nn.Module):
         """
         sightings = [self._sight(stamp, clouds, i, T_wc) for i in range(len(instances))]
         # Where each should be by now: to be found there, and left out there if it is not found.
-        missing = torch.from_numpy(depth[0].numpy() <= 0)
-        moved = self._predict_masks(stamp, depth, missing, T_wc)
-        owner = self._assign(stamp, instances, sightings, moved)
+        expected = self._expect(stamp, T_wc)
+        missing = depth <= 0
+        now = {track: self._where(silhouette, depth, missing, self._stride) for track, silhouette in expected.items()}
+        owner = self._assign(stamp, instances, sightings, now)
         continued = set()
         for i, sighting in enumerate(sightings):
             track = owner.get(i)
@@ -70,15 +71,14 @@ class InstanceTracker(torch.nn.Module):
                 self.tracks.append(track)
             track.extend(sighting)
             track.mask, track.own, track.missed = instances.masks[i], clouds.own[i], False
-            track.labels[int(instances.labels[i])] += 1
-            track.score += float(instances.scores[i])
+            track.name(int(instances.labels[i]), float(instances.scores[i]))
             continued.add(track.id)
         self.tracks = [t for t in self.tracks if stamp - t.newest.stamp <= self._config.max_gap]
         for track in self.tracks:
             if track.id not in continued:
                 track.missed = True
-                track.mask = moved[track]
-                track.own = track.mask & ~missing
+                track.mask = self._where(expected[track], depth, missing)
+                track.own = track.mask & ~missing[0]
         self._drop_found_again()
         return list(self.tracks)
 
@@ -115,16 +115,18 @@ class InstanceTracker(torch.nn.Module):
         return Sighting(stamp, R @ clouds.centroid[i].to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud))
 
     def _assign(
-        self, stamp: float, instances: Instances, sightings: list[Sighting], moved: dict[Track, Tensor]
+        self, stamp: float, instances: Instances, sightings: list[Sighting], now: dict[Track, Tensor]
     ) -> dict[int, Track]:
-        """Track of each instance that continues one."""
+        """Track of each instance that continues one; where each should be by now is given on every n-th pixel."""
         if not self.tracks or not sightings:
             return {}
         predicted = torch.stack([track.predict(stamp) for track in self.tracks])
         seen = torch.stack([sighting.centroid for sighting in sightings])
         # A mask as it was is exact where little moves; moved on, it keeps up with fast walkers and a camera that turns.
-        expected = self._coarse([*(track.mask for track in self.tracks), *(moved[track] for track in self.tracks)])
-        overlap = _overlap(expected, self._coarse(list(instances.masks))).unflatten(0, (2, -1)).amax(dim=0)
+        before = self._coarse([track.mask for track in self.tracks])
+        moved = torch.stack(list(now.values())).flatten(1).to(before.dtype)
+        either = torch.cat([before, moved])
+        overlap = _overlap(either, self._coarse(list(instances.masks))).unflatten(0, (2, -1)).amax(dim=0)
         elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
         gate = self._config.max_jump + self._config.max_speed * elapsed
         alike = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
@@ -133,15 +135,16 @@ class InstanceTracker(torch.nn.Module):
         )[0]
         return {i: self.tracks[track] for i, track in enumerate(matched.tolist()) if track >= 0}
 
-    def _predict_masks(self, stamp: float, depth: Tensor, missing: Tensor, T_wc: Tensor) -> dict[Track, Tensor]:
-        """Pixels where each object should be: its last cloud, moved on, where the depth agrees or is missing."""
+    def _expect(self, stamp: float, T_wc: Tensor) -> dict[Track, Silhouette]:
+        """The last cloud of each object, moved on to where it should be in the image."""
         T_cw = invert(T_wc)
         clouds = [track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in self.tracks]
-        masks = {}
-        for track, silhouette in zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True):
-            near, explained = silhouette(depth, 0, self._DEPTH_GATE)
-            masks[track] = near & (explained | missing)
-        return masks
+        return dict(zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True))
+
+    def _where(self, expected: Silhouette, depth: Tensor, missing: Tensor, step: int = 1) -> Tensor:
+        """Every n-th pixel of an object where the depth agrees or is missing, bool, :math:`(h, w)`."""
+        near, explained = expected(depth[:, ::step, ::step], 0, self._DEPTH_GATE, step)
+        return near & (explained | missing[0, ::step, ::step])
 
 
 def _overlap(a: Tensor, b: Tensor) -> Tensor:

@@ -1,0 +1,64 @@
+"""The same input gives the same bytes: run after run, ahead or one by one, with one thread or two."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import pytest
+import torch
+
+from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch.config_file import load_config
+from v3d_torch.datasets import RGBDSequence
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.trajectory import write_trajectory
+
+FRAMES = 14
+RUNS = {
+    "by default": (),
+    "again": (),
+    "one by one": ("lookahead=false",),
+    "one thread for the network": ("segmentation.threads=1",),
+    "one by one, two threads": ("lookahead=false", "threads=2"),
+    "two threads": ("threads=2",),
+}
+
+
+class Beginning:
+    """The first frames of a sequence."""
+
+    name, groundtruth = "beginning", None
+
+    def __init__(self, sequence: RGBDSequence) -> None:
+        self._sequence, self.camera = sequence, sequence.camera
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return islice(iter(self._sequence), FRAMES)
+
+
+@pytest.fixture
+def one_thread_after() -> Iterator[None]:
+    yield
+    torch.set_num_threads(1)
+
+
+def trajectory(sequence: RGBDSequence, overrides: tuple[str, ...], path: Path) -> bytes:
+    config = load_config(None, overrides)
+    torch.set_num_threads(config.threads)
+    flow = Pipeline(Beginning(sequence), V3DSLAM(sequence.camera, config=config))
+    assert flow().failure is None
+    write_trajectory(path, flow.slam.poses.trajectory())
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["demo", "walkers_desk", "crowd_rpy"])
+@pytest.mark.usefixtures("one_thread_after")
+def test_every_run_gives_the_same_bytes(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """walkers_desk rolls: its images are turned by what an earlier frame tells. The network is the real one."""
+    root = None if name == "demo" else request.getfixturevalue("v3d_data")
+    sequence = load_sequence(name, data_root=root)
+    written = {run: trajectory(sequence, overrides, tmp_path / "trajectory.txt") for run, overrides in RUNS.items()}
+    assert len(written["by default"].splitlines()) == FRAMES
+    assert {run for run, content in written.items() if content != written["by default"]} == set()
