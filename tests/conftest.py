@@ -12,6 +12,9 @@ from v3d_torch.datasets.demo.sequence import write_sequence
 
 torch.set_num_threads(1)
 
+collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
+"""Full disks and little memory are made with the limits of Unix."""
+
 
 @pytest.fixture(scope="session")
 def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:

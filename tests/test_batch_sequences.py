@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from corpus.base import write_base
+from rich.console import Console
 
+from v3d_torch.console import open_sequences
 from v3d_torch.datasets.names import PAPER_SEQUENCES, SEQUENCES, short_name
 from v3d_torch.datasets.patterns import matching_sequences
 from v3d_torch.errors import InputError
@@ -72,3 +75,17 @@ def test_a_pattern_that_matches_nothing(root: Path) -> None:
         with pytest.raises(InputError, match="matches no sequence") as raised:
             matching_sequences(["sit", pattern], root)
         assert str(raised.value).startswith(pattern) and str(root) in str(raised.value)
+
+
+@pytest.mark.parametrize("pattern", [5000 * "x" + "/*", "~nobody-of-this-name/*", "a**b/*", "[" + 3 * "*" + "]"])
+def test_a_pattern_that_can_match_nothing(pattern: str, root: Path) -> None:
+    with pytest.raises(InputError, match="match"):
+        matching_sequences([pattern], root)
+
+
+def test_runs_that_are_compared_need_a_whole_ground_truth(tmp_path: Path) -> None:
+    write_base(tmp_path / "seq")
+    assert list(open_sequences([str(tmp_path / "seq")], None, Console())) == ["seq"]
+    (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
+    with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
+        open_sequences([str(tmp_path / "seq")], None, Console())

@@ -51,7 +51,7 @@ def test_camera_files(tmp_path: Path, name: str, text: str) -> None:
     [
         ("c.yaml", CAMERA_YAML.replace("fx: 30.0\n", ""), "fx: field required"),
         ("c.yaml", CAMERA_YAML.replace("30.0", "wide"), "fx: .*got 'wide'"),
-        ("c.yaml", CAMERA_YAML.replace("30.0", "-30"), "fx: .*greater than 0.*got -30"),
+        ("c.yaml", CAMERA_YAML.replace("30.0", "-30"), "fx: .*greater than or equal to 1.*got -30"),
         ("c.yaml", CAMERA_YAML.replace("15.5", ".nan"), "cx: .*finite.*got nan"),
         ("c.yaml", CAMERA_YAML + "distortion: [1, 2]\n", "distortion.*field required"),
         ("c.yaml", CAMERA_YAML + "focal: 3\n", "focal: extra"),

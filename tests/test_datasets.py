@@ -71,10 +71,10 @@ def test_frames(folder: Path) -> None:
         np.testing.assert_allclose(frame.depth[0].numpy(), depth_of(i) / 1000.0, rtol=1e-6)
 
 
-def test_convention_depth_is_metres_and_zero_is_none(folder: Path) -> None:
+def test_convention_depth_is_metres_and_zero_and_the_most_are_none(folder: Path) -> None:
     units = np.array([[0, 1, 5000, 65535]], dtype=np.uint16)
     Image.fromarray(units).save(folder / "depth.png")
-    assert read_depth(folder / "depth.png", 5000).tolist() == [[pytest.approx([0.0, 0.0002, 1.0, 13.107])]]
+    assert read_depth(folder / "depth.png", 5000).tolist() == [[pytest.approx([0.0, 0.0002, 1.0, 0.0])]]
 
 
 def test_convention_images_are_rgb(folder: Path) -> None:
@@ -131,7 +131,7 @@ def test_index_behind_the_end(folder: Path) -> None:
 
 def camera_after(change: Callable[[Path], object], folder: Path, **arguments: str) -> PinholeCamera:
     change(folder)
-    return load_sequence(str(folder), **arguments).camera
+    return tum.TUMSequence(folder, **arguments).camera  # whatever the size of its images
 
 
 def test_camera_comes_from_the_best_source(folder: Path) -> None:
@@ -143,7 +143,7 @@ def test_camera_comes_from_the_best_source(folder: Path) -> None:
     (folder / "K.txt").unlink()
     for name, preset in [("rgbd_dataset_freiburg2_desk", "tum_fr2"), ("my_fr1_copy", "tum_fr1")]:
         folder = folder.rename(folder.with_name(name))
-        assert load_sequence(str(folder)).camera == load_camera(preset)
+        assert tum.TUMSequence(folder).camera == load_camera(preset)
     with pytest.raises(InputError, match=r"says nothing about its camera.*--camera"):
         load_sequence(str(folder.rename(folder.with_name("unknown"))))
 
@@ -180,7 +180,7 @@ def swap_lists(folder: Path) -> None:
         (lambda f: (f / "rgb" / "0.png").unlink(), "rgb/0.png: is listed but not there .1 such"),
         (lambda f: truncate(f / "rgb" / "0.png"), "rgb/0.png: is truncated"),
         (lambda f: truncate(f / "depth" / "0.png"), "depth/0.png: is truncated"),
-        (lambda f: (f / "depth" / "0.png").write_bytes(b""), "depth/0.png: is truncated or no image"),
+        (lambda f: (f / "depth" / "0.png").write_bytes(b""), "depth/0.png: is (no image|truncated)"),
         (as_jpeg, "rgb/0.jpg: is truncated"),
         (
             lambda f: Image.fromarray(depth_of(0).astype(np.uint8)).save(f / "depth" / "0.png"),
@@ -188,17 +188,26 @@ def swap_lists(folder: Path) -> None:
         ),
         (swap_lists, "depth image where colour belongs; are colour and depth swapped"),
         (lambda f: Image.fromarray(colour_of(0)).save(f / "depth" / "0.png"), "colour image where depth belongs"),
-        (lambda f: Image.new("RGB", (8, 8)).save(f / "rgb" / "0.png"), "rgb/0.png: has 8x8 pixels, the camera 32x24"),
+        (
+            lambda f: Image.new("RGB", (8, 8)).save(f / "rgb" / "0.png"),
+            "depth/0.png: has 32x24 pixels, its colour image 8x8",
+        ),
         (lambda f: Image.new("I;16", (9, 8)).save(f / "depth" / "0.png"), "depth/0.png: has 9x8 pixels"),
-        (lambda f: (f / "groundtruth.txt").write_text("a b c"), "groundtruth.txt"),
     ],
 )
 def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path], object], message: str) -> None:
     damage(folder)
     with pytest.raises(InputError, match=message) as caught:
         load_sequence(str(folder))[0]
-    assert str(folder) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_broken_ground_truth_costs_no_frame(folder: Path) -> None:
+    (folder / "groundtruth.txt").write_text("a b c")
+    sequence = load_sequence(str(folder))
+    assert len(list(sequence)) == len(sequence) and sequence.groundtruth is None
+    assert isinstance(sequence, tum.TUMSequence)
+    assert str(sequence.groundtruth_error).startswith(f"{folder / 'groundtruth.txt'}: line 1 is 'a b c'")
 
 
 def test_a_file_is_no_sequence(folder: Path) -> None:

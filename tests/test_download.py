@@ -291,6 +291,49 @@ def test_extract_refuses_a_truncated_archive(tmp_path: Path, keep: float) -> Non
     assert names_in(tmp_path) == ["a.tgz"]
 
 
+@pytest.mark.parametrize("kind", ["gz", "bz2", "xz"])
+@pytest.mark.parametrize("where", [0.3, 0.6, 0.999])
+def test_extract_refuses_a_wrong_byte(tmp_path: Path, kind: str, where: float) -> None:
+    """Also in what is behind the last member, where `tarfile` does not look."""
+    path = tmp_path / "a.tgz"
+    with tarfile.open(path, f"w:{kind}") as tar:
+        info, content = a_file("seq/a", os.urandom(20_000))
+        info.size = len(content)
+        tar.addfile(info, io.BytesIO(content))
+    content = bytearray(path.read_bytes())
+    content[int(where * len(content))] ^= 0x55
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="not a whole tar archive"):
+        extract_tar(path, tmp_path / "out")
+    assert names_in(tmp_path) == ["a.tgz"]
+
+
+def test_extract_takes_a_broken_header_for_no_end(tmp_path: Path) -> None:
+    path = tmp_path / "a.tar"
+    with tarfile.open(path, "w:") as tar:
+        for name in ("seq/a", "seq/b"):
+            tar.addfile(tarfile.TarInfo(name))
+    content = bytearray(path.read_bytes())
+    content[512 + 10] ^= 0x55  # in the name of the second, which its checksum counts in
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"not a whole tar archive \(.*checksum"):
+        extract_tar(path, tmp_path / "out")
+    assert names_in(tmp_path) == ["a.tar"]
+
+
+def test_extract_limits_headers_and_the_number_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.tar"
+    info = tarfile.TarInfo("././@PaxHeader")
+    info.type, info.size = tarfile.XHDTYPE, 1 << 30
+    path.write_bytes(tarfile.TarInfo("a").tobuf() + info.tobuf() + bytes(1024))
+    with pytest.raises(InputError, match="a header of 1073741824 bytes"):
+        extract_tar(path, tmp_path / "out")
+    monkeypatch.setattr("v3d_torch.extract._MAX_MEMBERS", 2)
+    extract_tar(archive_of(tmp_path / "2.tgz", a_file("seq/a"), a_file("seq/b")), tmp_path / "two")
+    with pytest.raises(InputError, match="more than 2 files"):
+        extract_tar(archive_of(tmp_path / "3.tgz", a_file("a"), a_file("b"), a_file("c")), tmp_path / "three")
+
+
 def test_extract_never_overwrites(tmp_path: Path) -> None:
     archive = archive_of(tmp_path / "a.tgz", a_file("seq/a"))
     (tmp_path / "out").mkdir()

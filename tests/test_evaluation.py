@@ -157,6 +157,35 @@ def test_errors_do_not_depend_on_the_estimates_world(xi: list[float]) -> None:
     assert torch.allclose(there.alignment.T_ge @ T, here.alignment.T_ge, atol=1e-9)
 
 
+@given(scale=st.floats(0.05, 20), seed=st.integers(0, 1000))
+@settings(max_examples=40, deadline=None)
+def test_a_wrong_unit_of_depth_is_noted(scale: float, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    steps = torch.randn(60, 6, dtype=torch.float64, generator=generator) * 0.02
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(60, 1, 1)
+    for i in range(1, 60):
+        T_wc[i] = T_wc[i - 1] @ se3_exp(steps[i])
+    stamps = torch.arange(60, dtype=torch.float64) / 10
+    small = T_wc.clone()
+    small[:, :3, 3] *= scale
+    notes = " ".join(evaluate(Trajectory(stamps, T_wc), Trajectory(stamps, small)).notes)
+    said = re.search(r"is (\S+) times as large as the estimate", notes)
+    if 0.7 < scale < 1.4:
+        assert said is None
+    elif not 0.6 < scale < 1.6:
+        assert said is not None and float(said[1]) == pytest.approx(1 / scale, rel=0.01)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=40, deadline=None)
+def test_an_estimate_of_another_shape_has_no_wrong_unit(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    stamps = torch.arange(60, dtype=torch.float64) / 10
+    one, other = (se3_exp(torch.randn(60, 6, dtype=torch.float64, generator=generator)) for _ in range(2))
+    other[:, :3, 3] *= 5
+    assert "times as large" not in " ".join(evaluate(Trajectory(stamps, one), Trajectory(stamps, other)).notes)
+
+
 def test_convention_alignment_maps_the_estimate_to_the_ground_truth() -> None:
     groundtruth = walk(50, seed=6)
     estimate = noisy(groundtruth, seed=7, sigma=0.0)

@@ -76,6 +76,19 @@ def test_ground_truth_is_saved_and_not_transformed_twice(tmp_path: Path) -> None
     torch.testing.assert_close(saved.groundtruth.T_wc, source.groundtruth.T_wc, atol=1e-8, rtol=0)
 
 
+def test_a_broken_ground_truth_costs_no_frame(tmp_path: Path) -> None:
+    folder = tmp_path / "take"
+    save(folder / "rgb" / "0.png", colour_of(0))
+    save(folder / "depth" / "0.png", depth_of(0))
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").write_text(f"10.0 {kind}/0.png\n")
+    (folder / "camera.yaml").write_text(CAMERA_YAML)
+    (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0 nan\n")
+    done = call("--seq", folder, "--out", tmp_path / "out")
+    assert_one_sentence(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite", "frames")
+    assert len(load_sequence(str(tmp_path / "out"))) == 1
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
 def test_ctrl_c_ends_it_well(tmp_path: Path) -> None:
     folder, out = tmp_path / "long", tmp_path / "out"
@@ -128,9 +141,9 @@ def test_depth_is_exact_and_what_does_not_fit_is_none(tmp_path: Path) -> None:
             writer.add(RGBDFrame(0, stamp, image, depth))
     frame = load_sequence(str(tmp_path / "1.0"))[0]
     assert np.array_equal(as_rgb(frame.image), colour_of(0, 256, 256))
-    assert torch.equal(frame.depth, units / 1000)
+    assert torch.equal(frame.depth, torch.where(units < 65535, units / 1000, 0))
     far = load_sequence(str(tmp_path / "2.0"))[0].depth
-    assert torch.equal(far == 0, units > 35535)
+    assert torch.equal(far == 0, units >= 35535)
 
 
 def test_a_file_where_the_folder_belongs(tmp_path: Path) -> None:

@@ -205,6 +205,7 @@ def test_no_results_and_broken_ones_are_a_sentence_each(copy: Path, tmp_path: Pa
     write_text(tmp_path / "late.txt", "9000.0 0 0 0 0 0 0 1\n9000.1 0 0 0 0 0 0 1\n")
     for arguments, words in (
         ([tmp_path / "nowhere"], "nowhere: holds no results of a run"),
+        ([tmp_path / (300 * "x")], "cannot be used (File name too long); check the path"),
         ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 poses"),
     ):
         done = call(*arguments)

@@ -356,19 +356,17 @@ def test_without_ground_truth_there_are_no_scores(run: Pipeline, tmp_path: Path)
     bare = Pipeline(Wall(), run.slam)
     bare.sequence.groundtruth = None  # type: ignore[misc]
     bare.run = replace(run.run)
-    for stale in ("groundtruth.txt", "figures/voting.png"):  # of another run into the same folder
-        write_text(tmp_path / stale, "")
     assert write_results(tmp_path, bare) is None
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert "rmse" not in (metrics.get("ate") or {})
     assert metrics["frames"] == FRAMES
     assert (tmp_path / "figures" / "trajectory.png").is_file()
-    assert not (tmp_path / "groundtruth.txt").exists() and not (tmp_path / "figures" / "voting.png").exists()
+    assert not (tmp_path / "groundtruth.txt").exists()
 
 
 def test_results_that_cannot_be_written_are_named(run: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"file/config\.yaml: cannot be written"):
+    with pytest.raises(OutputError, match=r"file/trajectory\.txt: cannot be written"):
         write_results(tmp_path / "file", run)
 
 

@@ -80,7 +80,7 @@ def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.png: has 3 channels"):
         StoredMasks(tmp_path)(frame(0, 0.0))
     Image.fromarray(ids(np.uint8, 1)).save(path)
-    with pytest.raises(InputError, match=r"a\.png: is \(12, 16\) pixels, but the frame is \(24, 16\)"):
+    with pytest.raises(InputError, match=r"a\.png: has 16x12 pixels, its frame 16x24"):
         StoredMasks(tmp_path)(frame(0, 0.0, height=24))
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(InputError, match=r"a\.png: cannot be read"):

@@ -213,7 +213,7 @@ def test_compressed_depth() -> None:
         ("colour", ROS2.image(1, "16UC1", depth_of(0)), "holds 16UC1 images, not colour; .*--rgb-topic"),
         ("depth", ROS2.image(1, "rgb8", colour_of(0)), "holds rgb8 images, not depth; .*--depth-topic"),
         ("depth", ROS2.compressed(1, "16UC1; compressedDepth rvl", b"1" * 40), "RVL cannot be read"),
-        ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "truncated or no image"),
+        ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "is no image"),
         ("depth", ROS2.compressed(1, "mono8; png compressed", png(colour_of(0)[..., 0])), "8-bit"),
         ("colour", ROS2.compressed(1, "bgr8; jpeg compressed bgr8", png(colour_of(0))[:-40]), "truncated"),
         ("colour", ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))), "16-bit depth image where colour"),
@@ -347,7 +347,7 @@ def test_a_depth_topic_under_any_name() -> None:
     [
         ([RGB, INFO], {}, f"no topic has the name of depth images; give --depth-topic one of {RGB}$"),
         ([DEPTH, INFO], {}, f"no topic has the name of colour images; give --rgb-topic one of {DEPTH}$"),
-        ([INFO], {}, "the name of colour images; give --rgb-topic one of none: it holds no such topic"),
+        ([INFO], {}, "holds no images; record the topics of colour, of depth"),
         ([RGB, DEPTH, INFO], {"rgb_topic": "/x"}, f"has no images on /x; give --rgb-topic one of {DEPTH}, {RGB}$"),
         ([RGB, DEPTH, INFO], {"info_topic": "/x"}, f"has no camera on /x; give --info-topic one of {INFO}$"),
         ([RGB, DEPTH], {}, f"has no camera beside {RGB}; name it with --info-topic, or give --camera$"),
@@ -389,7 +389,7 @@ def test_depth_that_is_not_registered_to_colour(tmp_path: Path) -> None:
 
 
 def test_depth_of_another_size(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"{DEPTH} has 40x24 pixels, {RGB} 32x24; name depth"):
+    with pytest.raises(InputError, match=f"{DEPTH}: has 40x24 pixels, its colour image 32x24; name depth"):
         load_sequence(str(changed(tmp_path, size=(40, HEIGHT))))
 
 

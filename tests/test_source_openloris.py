@@ -13,6 +13,7 @@ from tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.openloris import OpenLORISSequence
+from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.errors import InputError
 
 SENSORS = f"""%YAML:1.0
@@ -97,7 +98,7 @@ def test_convention_ground_truth_is_of_the_camera(folder: Path) -> None:
 
 def test_a_camera_of_the_user_needs_no_sensors(folder: Path) -> None:
     (folder / "sensors.yaml").write_text("%YAML:1.0\nnothing: 1\n")
-    own = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=500)
+    own = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=2000)
     assert load_sequence(str(folder), camera=own).camera is own
 
 
@@ -105,13 +106,6 @@ def test_a_camera_of_the_user_needs_no_sensors(folder: Path) -> None:
     ("damage", "message"),
     [
         (lambda f: (f / "aligned_depth.txt").unlink(), "has no aligned_depth.txt"),
-        (lambda f: (f / "trans_matrix.yaml").unlink(), "trans_matrix.yaml: is not there"),
-        (lambda f: (f / "trans_matrix.yaml").write_text("{"), "trans_matrix.yaml: is no YAML as OpenCV writes"),
-        (lambda f: (f / "trans_matrix.yaml").write_text("%YAML:1.0\nx: 1\n"), "does not say where d400_color_opt"),
-        (
-            lambda f: (f / "trans_matrix.yaml").write_text("%YAML:1.0\ntrans_matrix:\n   - { parent_frame: a }\n"),
-            "trans_matrix.yaml: a link has no",
-        ),
         (lambda f: (f / "sensors.yaml").write_text("%YAML:1.0\nx: 1\n"), "sensors.yaml: holds no d400_color"),
         (lambda f: (f / "sensors.yaml").write_text(SENSORS.replace("30.5", "-30.5")), "sensors.yaml: fx: .*-30.5"),
         (lambda f: (f / "aligned_depth" / "1.png").unlink(), "1.png: is listed but not there"),
@@ -122,3 +116,20 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
     with pytest.raises(InputError, match=message) as caught:
         load_sequence(str(folder))
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("links", "message"),
+    [
+        (None, "cannot be read"),
+        ("{", "is no YAML as OpenCV writes"),
+        ("%YAML:1.0\nx: 1\n", "does not say where d400_color_opt"),
+        ("%YAML:1.0\ntrans_matrix:\n   - { parent_frame: a }\n", "a link has no"),
+    ],
+)
+def test_without_the_place_of_the_camera_there_is_no_truth(folder: Path, links: str | None, message: str) -> None:
+    file = folder / "trans_matrix.yaml"
+    file.unlink() if links is None else file.write_text(links)
+    sequence = load_sequence(str(folder))
+    assert isinstance(sequence, StoredFrames) and sequence.groundtruth is None
+    assert str(sequence.groundtruth_error).startswith(f"{file}: {message}")

@@ -13,6 +13,7 @@ from tiny_images import colour_of, depth_of, save
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.scannet import ScanNetSequence
+from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.errors import InputError
 
 FULL, SIZE = (260, 193), (128, 96)
@@ -108,13 +109,14 @@ def test_no_pose_at_all_is_no_ground_truth(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda f: (f / "pose" / "0.txt").write_text("1 2 3\n"), "0.txt: is no matrix"),
-        (lambda f: (f / "pose" / "0.txt").write_text("1 0 0\n0 1 0\n0 0 1\n"), "0.txt: is no 4x4 matrix"),
         (
             lambda f: (f / "intrinsic" / "intrinsic_depth.txt").write_text("a b c\n"),
             "intrinsic_depth.txt: is no matrix",
         ),
-        (lambda f: (f / "intrinsic" / "intrinsic_depth.txt").write_text("0 0 0\n" * 3), "intrinsic_depth.txt: fx: "),
+        (
+            lambda f: (f / "intrinsic" / "intrinsic_depth.txt").write_text("0 0 0\n" * 3),
+            "_depth.txt: is no camera",
+        ),
         (lambda f: [p.unlink() for p in (f / "intrinsic").iterdir()], "says nothing about its camera"),
         (lambda f: [p.rename(p.with_stem(f"1{p.stem}")) for p in (f / "depth").glob("*")], "has the number of a depth"),
         (lambda f: (f / "depth" / "0.png").write_bytes(b"\x89PNG"), "0.png: is no image"),
@@ -125,3 +127,14 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
     with pytest.raises(InputError, match=message) as caught:
         load_sequence(str(folder))
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"), [("1 2 3\n", "is no matrix"), ("1 0 0\n0 1 0\n0 0 1\n", "is no 4x4 matrix")]
+)
+def test_a_broken_pose_costs_no_frame(folder: Path, pose: str, message: str) -> None:
+    file = next(folder.rglob("pose/0.txt"))
+    file.write_text(pose)
+    sequence = load_sequence(str(folder))
+    assert isinstance(sequence, StoredFrames) and sequence.groundtruth is None
+    assert str(sequence.groundtruth_error).startswith(f"{file}: {message}")

@@ -41,14 +41,14 @@ class SegmentationConfig(Section):
     """Whether the network is shown the images of a rolled camera upright (off in the paper)."""
     max_instances: int = Field(32, gt=0)
     """Most instances kept in an image, by score: bounds memory, far above what a room shows."""
-    threads: int = Field(2, gt=0)
+    threads: int = Field(2, gt=0, le=256)
     """Threads of the inference engine."""
 
 
 class DepthConfig(Section):
     """Depth re-estimation (paper, Sec. III-B.1)."""
 
-    kernel_size: int = Field(5, gt=0)
+    kernel_size: Literal[1, 3, 5, 7, 9, 11, 13, 15] = 5
     """Side of the Gaussian window, pixels (the authors' code)."""
     sigma: float = Field(1.0, gt=0)
     """Standard deviation of the Gaussian, pixels (the authors' code)."""
@@ -59,7 +59,7 @@ class DepthConfig(Section):
 class CloudConfig(Section):
     """Instance clouds and their outlier rejection (paper, Sec. III-B.2)."""
 
-    stride: int = Field(2, gt=0)
+    stride: int = Field(2, gt=0, le=100)
     """Every n-th pixel of a mask becomes a point; 2 still puts several points into a voxel up to 5 m."""
     max_depth: float = Field(6.0, gt=0)
     """Farther points are left out, metres: a Kinect's depth is good to 10 cm there, as much as what is to be found."""
@@ -141,7 +141,7 @@ class BackgroundConfig(Section):
     """Depth that differs by this times z^2 is the same, 1/m: four times a structured-light camera's error."""
     min_tolerance: float = Field(0.04, gt=0)
     """And so is depth that differs by this, metres: the thickness of clothes and of a voxel."""
-    sync: float = Field(0.02, ge=0)
+    sync: float = Field(0.02, ge=0, le=1)
     """Colour and depth of a frame are taken so far apart, seconds: TUM pairs what is no farther, and a rolling shutter
     takes as long to read half an image. A camera that turns sees them as many pixels apart as it turns meanwhile."""
     min_depth: float = Field(0.3, gt=0)
@@ -180,12 +180,12 @@ class MaskConfig(Section):
     bridge_score: float = Field(0.3, ge=0)
     """A missed object that was never seen to move is left out if the scores of its sightings add up to this: two weak
     ones or a strong one. The network sees a person in rolled furniture for single frames."""
-    seam: int = Field(2, ge=0)
+    seam: int = Field(2, ge=0, le=100)
     """Pixels by which a left-out mask grows whatever the depth: colour and depth are not aligned better."""
-    margin: int = Field(8, ge=0)
+    margin: int = Field(8, ge=0, le=100)
     """Pixels by which it grows where the depth is the object's own, or missing: a network mask at a quarter of the
     resolution errs by about two of its pixels."""
-    reach: int = Field(32, ge=0)
+    reach: int = Field(32, ge=0, le=1000)
     """Pixels by which it grows over surface that goes on without an edge: a hand at 3 m. The more it may, the more
     of a table goes with whoever touches it. 0 turns it off."""
     edge: float = Field(0.04, gt=0)
@@ -216,7 +216,7 @@ class FeaturesConfig(Section):
     count: int = Field(2500, gt=0)
     """Features asked of the detector. More than ORB-SLAM2's 1000: people take their share, and a feature that the
     next frame detects again is worth more than one chosen well (three times as many inliers from frame to frame)."""
-    levels: int = Field(8, gt=0)
+    levels: int = Field(8, gt=0, le=20)
     """Levels of the scale pyramid (ORB-SLAM2)."""
     scale: float = Field(1.2, gt=1)
     """Ratio of neighbouring levels (ORB-SLAM2)."""
@@ -344,7 +344,7 @@ class MeshConfig(Section):
 class DenseMapConfig(Section):
     """The coloured map of what stands still, and its mesh."""
 
-    stride: int = Field(2, gt=0)
+    stride: int = Field(2, gt=0, le=100)
     """Every n-th pixel of a keyframe goes into the map, by row and by column: 8 mm apart at 2 m, less than a voxel."""
     max_depth: float = Field(4.0, gt=0)
     """Farther pixels stay out, metres: their noise would blur the map."""
@@ -369,9 +369,9 @@ class LoopConfig(Section):
 class Config(Section):
     """The whole configuration of a run."""
 
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, lt=1 << 63)
     """Seed of every random choice."""
-    threads: int = Field(1, gt=0)
+    threads: int = Field(1, gt=0, le=256)
     """Threads of torch: the tensors of a frame are so small that more threads wait for each other."""
     lookahead: bool = True
     """Whether the next frame is read, segmented and lifted while one is tracked; the results are the same."""

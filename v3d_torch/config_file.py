@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,13 @@ import yaml
 from pydantic import ValidationError
 
 from v3d_torch.config import Config, Section
-from v3d_torch.errors import ConfigError
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.files import read_text
+from v3d_torch.plain_yaml import parse_yaml
+from v3d_torch.validation import first_error
+
+_NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
+"""Between which a number lies that is neither 0 nor infinite."""
 
 FULL = "full"
 """The whole system, as it is by default."""
@@ -35,8 +43,9 @@ def find_config(name: str | Path) -> Path:
     """
     if str(name) in CONFIGS:
         return CONFIGS[str(name)]
-    if (path := Path(name).expanduser()).is_file():
-        return path
+    with suppress(OSError, RuntimeError):  # a name that is too long, ~somebody who is not known here
+        if (path := Path(name).expanduser()).is_file():
+            return path
     raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
 
 
@@ -66,20 +75,20 @@ def dump_config(config: Config) -> str:
 def _validated(tree: Mapping[str, Any], source: str) -> Config:
     _refuse_unknown_keys(tree, Config, source)
     try:
-        return Config.model_validate(tree)
+        config = Config.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{source}: {key}: {first['msg'].lower()}, got {first['input']!r}") from error
+        raise ConfigError(f"{source}: {first_error(error)}") from error
+    _refuse_absurd_numbers(config, source)
+    return config
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); check the path given as --config") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not valid YAML ({str(error).splitlines()[0]})") from error
+        tree = parse_yaml(read_text(path, "a configuration is a YAML file"))
+    except InputError as error:
+        raise ConfigError(str(error)) from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: is not valid YAML ({error}); repair it") from error
     if tree is None:
         return {}
     if not isinstance(tree, dict):
@@ -97,9 +106,24 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
         if not isinstance(tree, dict):
             raise ConfigError(f"--set {override!r}: {section!r} is a value, it has no keys below it")
     try:
-        tree[leaf] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {override!r}: the value is not valid YAML") from error
+        tree[leaf] = parse_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"--set {override!r}: the value is not valid YAML ({error})") from error
+
+
+def _refuse_absurd_numbers(section: Section, source: str, prefix: str = "") -> None:
+    """Numbers that a rule of their own lets through, and with which arithmetic or memory overflows."""
+    for name, value in section:
+        if isinstance(value, Section):
+            _refuse_absurd_numbers(value, source, f"{prefix}{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if name == "seed" or type(number) not in _NUMBERS or number == 0 or math.isinf(number):
+                continue
+            least, most = _NUMBERS[type(number)]
+            if not least <= abs(number) <= most:
+                raise ConfigError(
+                    f"{source}: {prefix}{name}: input should lie between {least:g} and {most:g}, got {number!r:.40}"
+                )
 
 
 def _refuse_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:

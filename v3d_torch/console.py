@@ -22,6 +22,8 @@ from rich.table import Table
 from v3d_torch.config import Config
 from v3d_torch.config_file import FULL, find_config, load_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
+from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.earlier_results import prepare_folder
 from v3d_torch.errors import ConfigError, InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
@@ -32,6 +34,7 @@ from v3d_torch.mapping.storage import StoredMap, load_map, save_map
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.shortfall import shortfall
 from v3d_torch.types import RGBDFrame, Segmenter
 from v3d_torch.viz.viewer import NULL_VIEWER, Viewer, make_viewer
 
@@ -42,11 +45,20 @@ def exit_on_error() -> Iterator[None]:
     try:
         yield
     except V3DError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {_printable(error)}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:  # of a path that the user gave: its name is too long, its folder may not be looked into
+        where, why = error.filename or "a file", error.strerror or error
+        print(f"error: {_printable(where)}: cannot be used ({why}); check the path and who may use it", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("error: interrupted before the results were written", file=sys.stderr)
         sys.exit(2)
+
+
+def _printable(what: object) -> str:
+    """A message on one line: names and lines of files are part of it, and may hold what a terminal obeys."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(what))
 
 
 def run_sequence(
@@ -84,6 +96,8 @@ def run_sequence(
     segment = make_segmenter(config.segmentation, weights=weights, masks_dir=masks)
     viewer = make_viewer(viz, rerun_file, sequence)
     folder = result_folder(out, sequence.name)
+    if masks is not None and masks.resolve() == (folder / "masks").resolve():
+        raise OutputError(f"{masks}: would be written to while it is read; choose another folder with --out")
     pipeline, evaluation = track(
         sequence, segment, config, folder, console, save_masks=save_masks, viewer=viewer, known=known
     )
@@ -92,12 +106,16 @@ def run_sequence(
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(sequence.name, evaluation)) is not None:
         console.print(table)
+    for note in evaluation.notes if evaluation is not None else ():
+        console.print(f"note: {note}", markup=False)
     console.print(f"results: {folder}", markup=False)  # brackets in the name are no markup
     if (failure := pipeline.run.failure) is not None:
         done = len(pipeline.slam.poses.statuses)
-        raise InputError(f"{failure}; the results of the {done} frames before are in {folder}")
+        raise InputError(f"{failure} (the results of the {done} frames before are in {folder})")
     if known is not None and not pipeline.slam.poses.located:
         raise InputError(f"{map_in}: no frame of {name} shows a place of this map; its results are in {folder}")
+    if (doubt := shortfall(pipeline, evaluation)) is not None:
+        raise InputError(f"{doubt} (the results are in {folder})")
 
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
@@ -116,6 +134,8 @@ def open_sequences(names: Sequence[str], data_root: Path | None, console: Consol
     sequences: dict[str, RGBDSequence] = {}
     for name in dict.fromkeys(names):
         sequence = open_sequence(name, data_root, None, console)
+        if isinstance(sequence, StoredFrames) and sequence.groundtruth_error is not None:
+            raise sequence.groundtruth_error  # runs that are compared are compared by their scores
         if sequence.name in sequences:
             raise InputError(f"{name}: another sequence is called {sequence.name} too; give each once, or them apart")
         sequences[sequence.name] = sequence
@@ -157,6 +177,7 @@ def track(
         OutputError: when the results cannot be written.
     """
     total = len(sequence) if isinstance(sequence, Sized) else None
+    prepare_folder(folder)
     with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log_to(folder / "run.log"):
         show = _Verdicts(progress, total, interrupted)
         pipeline, evaluation = run_logged(

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from v3d_torch.errors import InputError, OutputError
 
+_MAX_LENGTH = 100 << 20
+"""Letters: a trajectory of an hour at 200 Hz has fewer, and a device that never ends has more."""
+
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
@@ -57,21 +60,27 @@ def refuse_unwritable(path: Path) -> None:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """Read UTF-8 text, with or without a byte order mark.
+    """Read UTF-8 text, with or without a byte order mark, and with any line ends, which become those of Unix.
 
     Args:
         path: of the file.
         expected: what the file should hold, for the message: "a trajectory has lines of ...".
 
     Raises:
-        InputError: when the file cannot be read or is not text.
+        InputError: when the file cannot be read, is not text or larger than any such file is.
     """
     try:
-        return path.read_text(encoding="utf-8-sig")
+        with path.open(encoding="utf-8-sig") as file:
+            text = file.read(_MAX_LENGTH + 1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check that it is a file and who may read it"
+        ) from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file in UTF-8; {expected}") from error
+        raise InputError(f"{path}: is not a text file in UTF-8; convert it to that, {expected}") from error
+    if len(text) > _MAX_LENGTH:
+        raise InputError(f"{path}: is larger than {_MAX_LENGTH >> 20} MB; {expected}")
+    return text
 
 
 def numbered_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:

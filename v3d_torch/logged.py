@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sized
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
 
 from v3d_torch.config import Config
+from v3d_torch.config_file import dump_config
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import Evaluation
+from v3d_torch.files import write_text
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.storage import StoredMap
 from v3d_torch.objects.dynamics import Scene
@@ -56,6 +59,7 @@ def run_logged(
     Raises:
         OutputError: when the results cannot be written.
     """
+    write_text(folder / "config.yaml", dump_config(config))  # where this has no room, an hour's results have none
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     masks = folder / "masks" if save_masks else None
@@ -91,7 +95,7 @@ def log_to(path: Path) -> Iterator[None]:
     try:
         path.write_text("")
         # Appended to: what the interpreter itself says of a crash may go to the same file.
-        handler = logging.FileHandler(path, mode="a", encoding="utf-8")
+        handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another folder with --out") from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -106,3 +110,15 @@ def log_to(path: Path) -> Iterator[None]:
     finally:
         _LOG.removeHandler(handler)
         handler.close()
+
+
+class _LogFile(logging.FileHandler):
+    """A disk that is full ends the log, not the run: the results come to tell."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not isinstance(sys.exception(), OSError):
+            super().handleError(record)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()

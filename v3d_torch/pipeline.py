@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sized
 from contextlib import closing
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
-from v3d_torch.errors import V3DError
+from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
 from v3d_torch.lookahead import percepts
@@ -23,6 +24,8 @@ from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
+
+_LOG = logging.getLogger(__name__)
 
 FrameCallback = Callable[[RGBDFrame, Scene, Status], None]
 
@@ -49,6 +52,7 @@ class Run:
         seconds: wall time of the frames.
         failure: why the run ended before the sequence did; None when it did not.
         interrupted: whether the user ended it.
+        unscored: why masks were not evaluated although there are true ones.
     """
 
     frames: list[dict[str, float]] = field(default_factory=list)
@@ -59,6 +63,7 @@ class Run:
     seconds: float = 0.0
     failure: str | None = None
     interrupted: bool = False
+    unscored: str | None = None
 
 
 class Pipeline:
@@ -117,6 +122,10 @@ class Pipeline:
                         on_frame(frame, scene, self.slam.poses.statuses[-1])
         except V3DError as error:
             self.run.failure = str(error)
+        except Exception as error:  # what was computed is worth keeping when the program is at fault, too
+            _LOG.exception("the run broke")
+            why = (str(error).splitlines() or [""])[0]
+            self.run.failure = f"the program failed with {type(error).__name__}: {why}; report it with the run.log"
         except KeyboardInterrupt:
             self.run.interrupted = True
             if isinstance(self.sequence, Sized):
@@ -158,7 +167,12 @@ class Pipeline:
             snapshots.append(shot)
 
     def _evaluate_masks(self, frame: RGBDFrame, scene: Scene) -> None:
-        truth = self.sequence.who_moves(frame.index) if isinstance(self.sequence, KnowsWhoMoves) else None
+        truth = None
+        if isinstance(self.sequence, KnowsWhoMoves) and self.run.unscored is None:
+            try:
+                truth = self.sequence.who_moves(frame.index)
+            except InputError as error:  # the truth is for the scores only
+                self.run.unscored = str(error)
         if truth is not None:
             objects = {judged.id: judged.mask for judged in scene.objects}
             self.run.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static, objects)

@@ -26,7 +26,7 @@ def main(
     depth_topic: Annotated[str | None, typer.Option(help="Topic of a bag's depth images [guessed].")] = None,
     info_topic: Annotated[str | None, typer.Option(help="Topic of the colour images' camera [guessed].")] = None,
     fps: Annotated[
-        float | None, typer.Option(min=0.01, help="Frames a second, of a live camera or where nothing says the times.")
+        float | None, typer.Option(help="Frames a second, of a live camera or where nothing says the times.")
     ] = None,
 ) -> None:
     """Save RGB-D frames as PNG with their lists and camera, until the source ends or Ctrl-C."""
@@ -35,6 +35,7 @@ def main(
 
     from v3d_torch.console import exit_on_error, interrupts_between_frames
     from v3d_torch.datasets import SourceOptions, open_source
+    from v3d_torch.datasets.stored import StoredFrames
     from v3d_torch.datasets.tum_writer import TUMWriter
     from v3d_torch.errors import InputError
 
@@ -51,6 +52,8 @@ def main(
         if not len(writer):
             raise InputError(f"{seq}: sent no frame before the end")
         console.print(f"{len(writer)} frames: {out}", markup=False)
+        if isinstance(source, StoredFrames) and source.groundtruth_error is not None:
+            raise InputError(f"{source.groundtruth_error} (the frames, without ground truth, are in {out})")
 
 
 if __name__ == "__main__":

@@ -65,14 +65,13 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
         OutputError: when the folder cannot be written or the disk is full.
     """
     slam, sequence = pipeline.slam, pipeline.sequence
-    write_text(folder / "config.yaml", dump_config(slam.config))
     trajectory = slam.poses.trajectory()
-    write_trajectory(folder / "trajectory.txt", trajectory)
+    write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
+    write_text(folder / "config.yaml", dump_config(slam.config))
     own = torch.tensor([not keyframe.known for keyframe in slam.mapper.map.keyframes], dtype=torch.bool)
     stamps = torch.tensor([keyframe.stamp for keyframe in slam.mapper.map.keyframes], dtype=torch.float64)
     write_trajectory(folder / "keyframes.txt", Trajectory(stamps[own], invert(slam.mapper.map.T_cw[own])))
     evaluation = None
-    (folder / "groundtruth.txt").unlink(missing_ok=True)  # of another sequence that left its results here
     if sequence.groundtruth is not None:
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
         with suppress(InputError):  # too few poses to score are still worth writing

@@ -29,7 +29,7 @@ def main(
     depth_topic: Annotated[str | None, typer.Option(help="Topic of a bag's depth images [guessed].")] = None,
     info_topic: Annotated[str | None, typer.Option(help="Topic of the colour images' camera [guessed].")] = None,
     fps: Annotated[
-        float | None, typer.Option(min=0.01, help="Frames a second, where images or videos do not say their times.")
+        float | None, typer.Option(help="Frames a second, where images or videos do not say their times.")
     ] = None,
     config: Annotated[
         str | None,

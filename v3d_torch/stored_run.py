@@ -19,6 +19,7 @@ from v3d_torch.files import read_text
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.trajectory import read_trajectory
 from v3d_torch.types import Trajectory
+from v3d_torch.validation import first_error
 
 
 class Metrics(BaseModel):
@@ -121,14 +122,15 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
 
 
 def _read_metrics(path: Path) -> Metrics:
+    text = read_text(path, "it is written by a run")
     try:
-        return Metrics.model_validate(json.loads(read_text(path, "it is written by a run")))
-    except json.JSONDecodeError as error:
+        tree = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is no JSON ({error}); run the sequence again") from error
+    try:
+        return Metrics.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or "the whole"
-        raise InputError(f"{path}: {key}: {first['msg'].lower()}; it is not of this version, run again") from error
+        raise InputError(f"{path}: {first_error(error)}; it is not of this version, run again") from error
 
 
 def _read_poses(path: Path) -> Trajectory | None:
@@ -141,9 +143,11 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> pa.Table | None:
         return None
     try:
         table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: is no parquet table ({str(error).splitlines()[0]}); run again") from error
-    if missing := set(columns) - set(table.column_names):
+        missing = set(columns) - set(table.column_names)  # which decodes the names
+    except (pa.ArrowException, OSError, ValueError) as error:
+        why = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: is no parquet table ({why}); run again") from error
+    if missing:
         raise InputError(
             f"{path}: lacks the columns {', '.join(sorted(missing))}; it is not of this version, run again"
         )

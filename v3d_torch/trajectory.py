@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import InputError
 from v3d_torch.files import numbered_lines, write_text
+from v3d_torch.stamps import seconds
 from v3d_torch.types import Trajectory
+
+_MAX_DISTANCE = 1e7
+"""Metres from the origin: the radius of the earth, for ground truth in a geocentric frame."""
+
+_MAX_LENGTH = 1e3
+"""Of a quaternion, and its inverse the least: what is off by more is no rounding and no other scale."""
 
 _COLUMNS = "stamp tx ty tz qx qy qz qw"
 
@@ -29,12 +36,15 @@ def read_trajectory(path: Path) -> Trajectory:
         Convention: ``T_wc`` maps camera to world, as the benchmark's files do.
 
     Raises:
-        InputError: the file cannot be read, holds no pose, or a line is not eight finite numbers with a rotation.
+        InputError: the file cannot be read, holds no pose, or a line is not eight sensible numbers with a rotation.
     """
     numbers, poses = _parse(path)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(poses[:, 4:], axis=1)
     for wrong, what in (
         (~np.isfinite(poses).all(axis=1), "a number that is not finite"),
-        (~poses[:, 4:].any(axis=1), "a quaternion of zeros, which is no rotation"),
+        ((np.abs(poses[:, 1:4]) > _MAX_DISTANCE).any(axis=1), f"a position more than {_MAX_DISTANCE:g} m away"),
+        (~((length > 1 / _MAX_LENGTH) & (length < _MAX_LENGTH)), "a quaternion of zeros, or far from a unit one"),
     ):
         if wrong.any():
             raise InputError(f"{path}: line {numbers[wrong.argmax()]} has {what}; remove or repair it")
@@ -73,13 +83,13 @@ def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
     for number, line in numbered_lines(path, f"a trajectory has lines of {_COLUMNS}"):
         words = line.replace(",", " ").split()
         try:
-            pose = [float(word) for word in words]
+            pose = [seconds(word) for word in words[:1]] + [float(word) for word in words[1:]]
         except ValueError:
             pose = []
         if len(pose) != len(_COLUMNS.split()):
-            raise InputError(f"{path}: line {number} is {line[:80]!r} where {_COLUMNS} is expected")
+            raise InputError(f"{path}: line {number} is {line[:80]!r} where {_COLUMNS} is expected; repair it")
         numbers.append(number)
         poses.append(pose)
     if not poses:
-        raise InputError(f"{path}: holds no pose; lines of {_COLUMNS} are expected")
+        raise InputError(f"{path}: holds no pose; lines of {_COLUMNS} are expected, copy it again")
     return numbers, np.array(poses, dtype=np.float64)

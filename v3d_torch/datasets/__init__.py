@@ -10,6 +10,7 @@ from v3d_torch.datasets.locate import sequence_path
 from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
 from v3d_torch.datasets.realsense import open_camera
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
+from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.download import Progress, cache_dir
 from v3d_torch.errors import InputError
@@ -26,6 +27,9 @@ __all__ = [
     "open_source",
     "short_name",
 ]
+
+_RATES = (0.01, 1e4)
+"""Between which frames a second lie."""
 
 
 def open_source(
@@ -57,6 +61,24 @@ def open_source(
         DownloadError: it is not here and cannot be downloaded.
     """
     options = options or SourceOptions()
+    if options.fps is not None and not _RATES[0] <= options.fps <= _RATES[1]:
+        raise InputError(f"--fps {options.fps:g}: give frames a second, between {_RATES[0]:g} and {_RATES[1]:g}")
+    try:
+        return _open(name, data_root, camera, options, download, progress)
+    except OSError as error:  # a folder that may not be looked into, a name that is too long
+        raise InputError(
+            f"{error.filename or name}: cannot be read ({error.strerror}); check its name and who may read it"
+        ) from error
+
+
+def _open(
+    name: str,
+    data_root: Path | None,
+    camera: CameraChoice,
+    options: SourceOptions,
+    download: bool,
+    progress: Progress | None,
+) -> RGBDStream:
     if name == "demo":
         # The demo is rendered on first use, with libraries that nothing else here needs.
         from v3d_torch.datasets.demo import ensure_demo
@@ -67,7 +89,10 @@ def open_source(
         reject_options(name, "a live camera", options, frozenset({"fps"}))
         return open_camera(name, camera, fps=options.fps)
     path = sequence_path(name, data_root=data_root, download=download, progress=progress)
-    return open_path(path, camera, options, progress)
+    source = open_path(path, camera, options, progress)
+    if isinstance(source, StoredFrames):
+        source.check_first_frame(path)
+    return source
 
 
 def load_sequence(

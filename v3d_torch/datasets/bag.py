@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 _MILLIMETRES = 1000.0
 """Units of 16-bit depth per metre, in ROS (REP 118)."""
 
+_REPAIRS = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex", "": "ros2 bag reindex"}
+"""What repairs a bag, by the suffix of the file; a folder has none."""
+
 _LENSES = ("plumb_bob", "rational_polynomial", "")
 """Lens models that begin with k1, k2, p1, p2, k3; the second goes on."""
 
@@ -84,13 +87,11 @@ class BagSequence(StoredFrames):
         i, j = self._pairs[index]
         image = colour_from(self._colours[i][-1], f"{self.path}: {self.topics.rgb}")
         depth = depth_from(self._depths[j][-1], self.camera.depth_scale, f"{self.path}: {self.topics.depth}")
-        if image.shape[1:] != depth.shape[1:]:
-            sizes = [f"{width}x{height}" for height, width in (depth.shape[1:], image.shape[1:])]
-            raise InputError(
-                f"{self.path}: {self.topics.depth} has {sizes[0]} pixels, {self.topics.rgb} {sizes[1]}; name depth that"
-                " is registered to colour with --depth-topic"
-            )
-        return self._sized(f"{self.path}: {self.topics.rgb}", image), depth
+        return self._registered(
+            (f"{self.path}: {self.topics.rgb}", image),
+            (f"{self.path}: {self.topics.depth}", depth),
+            "name depth that is registered to colour with --depth-topic",
+        )
 
 
 def is_bag(path: Path) -> bool:
@@ -138,7 +139,7 @@ def _opened(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, st
 def _unreadable(path: Path, error: Exception) -> InputError:
     # rosbags lets the errors of every format's library through.
     why = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return InputError(f"{path}: is no whole bag ({why}); copy it again, or repair it with rosbag reindex")
+    return InputError(f"{path}: is no whole bag ({why}); copy it again, or repair it with {_REPAIRS[path.suffix]}")
 
 
 def _messages(path: Path, *topics: str) -> Iterator[tuple[str, int, Any]]:
@@ -178,8 +179,8 @@ def _read_camera(path: Path, topics: Topics) -> PinholeCamera:
         raise InputError(f"{path}: has nothing on {topics.info}; name another with --info-topic, or give --camera")
     # ROS 1 writes the fields' names in capitals.
     K, D, P = (getattr(info, name if hasattr(info, name) else name.lower()) for name in "KDP")
-    matrix = np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)
-    fields = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
+    rows = (np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)).tolist()
+    fields = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
     lens = [] if topics.is_rectified else np.asarray(D).tolist()
     if any(lens[5:]) or (any(lens) and info.distortion_model not in _LENSES):
         raise InputError(

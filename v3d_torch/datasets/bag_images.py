@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -38,7 +39,11 @@ def colour_from(message: Any, source: str) -> Tensor:
             f" converted to one of {', '.join(COLOURS)}"
         )
     pixels = _rows(message, np.dtype((np.uint8, COLOURS[message.encoding][0])), source)
-    return to_rgb(message.encoding, pixels)
+    try:
+        return to_rgb(message.encoding, pixels)
+    except cv2.error as error:  # an odd width where two pixels share a colour
+        size = f"{message.width}x{message.height}"
+        raise InputError(f"{source}: holds no {message.encoding} image of {size} pixels; record it again") from error
 
 
 def depth_from(message: Any, depth_scale: float, source: str) -> Tensor:
@@ -64,6 +69,8 @@ def depth_from(message: Any, depth_scale: float, source: str) -> Tensor:
 def _rows(message: Any, pixel: np.dtype[Any], source: str) -> NDArray[Any]:
     """Pixels (H, W) or (H, W, C) without what pads the rows."""
     used = message.width * pixel.itemsize
+    if not used * message.height:
+        raise InputError(f"{source}: an image has no pixels; record it again")
     if used > message.step or len(message.data) < message.step * message.height:
         size = f"{message.width}x{message.height}"
         raise InputError(f"{source}: an image has less data than its {size} pixels need; record it again")
@@ -83,7 +90,8 @@ def _decompressed(message: Any, depth_scale: float, source: str) -> Tensor:
         return metres(units, depth_scale)
     _, a, b = struct.unpack("<iff", content[:_HEADER])
     inverse = units.astype(np.float32)  # depth is a / (inverse - b), and 0 no measurement
-    return _measured(np.where(inverse > 0, a / (inverse - b), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return _measured(np.where(inverse > 0, a / (inverse - b), 0.0))
 
 
 def _measured(pixels: NDArray[Any]) -> Tensor:

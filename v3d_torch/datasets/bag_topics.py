@@ -61,6 +61,8 @@ def choose_topics(
         InputError: a topic is not there or of another type, none fits, or several fit as well.
     """
     images = {topic: kind for topic, kind in types.items() if kind in (IMAGE, COMPRESSED)}
+    if not images:
+        raise InputError(f"{bag}: holds no images; record the topics of colour, of depth and of their camera")
     for option, topic in (("rgb", rgb), ("depth", depth)):
         if topic is not None and topic not in images:
             raise InputError(f"{bag}: has no images on {topic}; give --{option}-topic one of {_listed(images)}")

@@ -8,12 +8,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
+import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
 from v3d_torch.files import read_text
+from v3d_torch.plain_yaml import parse_yaml
+from v3d_torch.validation import first_error
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
 PRESETS: tuple[str, ...] = tuple(
@@ -24,7 +26,8 @@ PRESETS: tuple[str, ...] = tuple(
 CameraChoice = str | Path | PinholeCamera | None
 """What a user may say of the camera: itself, a preset's name or a file; None leaves it to the sequence."""
 
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Focal = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
+_Pixels = Annotated[int, Field(gt=0, le=1 << 13)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -33,14 +36,14 @@ class _CameraFile(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    fx: _Positive
-    fy: _Positive
+    fx: _Focal
+    fy: _Focal
     cx: _Finite
     cy: _Finite
-    width: int = Field(gt=0)
-    height: int = Field(gt=0)
+    width: _Pixels
+    height: _Pixels
     distortion: tuple[_Finite, _Finite, _Finite, _Finite, _Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    depth_scale: _Positive
+    depth_scale: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 
 
 def load_camera(path_or_name: str | Path) -> PinholeCamera:
@@ -79,6 +82,16 @@ def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera |
     """
     if isinstance(camera, PinholeCamera):
         return camera
+    chosen = _named_or_own(camera, folder, published)
+    if not _is_seen_through(chosen):
+        raise InputError(
+            f"{camera or folder}: no point is seen at some corner of the image with the lens {chosen.distortion};"
+            " correct the camera's distortion (k1, k2, p1, p2, k3) or leave it out"
+        )
+    return chosen
+
+
+def _named_or_own(camera: str | Path | None, folder: Path, published: PinholeCamera | None) -> PinholeCamera:
     if camera is not None:
         return load_camera(camera)
     for name in ("camera.yaml", "K.txt"):
@@ -96,9 +109,9 @@ def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera |
 
 def _from_yaml(text: str, source: str) -> PinholeCamera:
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{source}: is not valid YAML ({str(error).splitlines()[0]})") from error
+        tree = parse_yaml(text)
+    except ValueError as error:
+        raise InputError(f"{source}: is not valid YAML ({error}); repair it") from error
     if not isinstance(tree, dict):
         raise InputError(f"{source}: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys")
     return checked_camera(tree, source)
@@ -109,7 +122,9 @@ def _from_numbers(text: str, source: str) -> PinholeCamera:
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{source}: holds something that is not a number ({error})") from error
+        raise InputError(
+            f"{source}: holds something that is not a number ({error}); write fx fy cx cy depth_scale width height"
+        ) from error
     if len(numbers) == 7:
         fx, fy, cx, cy, depth_scale, width, height = numbers
     elif len(numbers) == 9 and numbers[1] == numbers[3] == numbers[6] == numbers[7] == 0.0 and numbers[8] == 1.0:
@@ -131,8 +146,20 @@ def checked_camera(fields: dict[Any, Any], source: str) -> PinholeCamera:
         InputError: a field is missing, unknown or no such number.
     """
     try:
-        return PinholeCamera(**_CameraFile.model_validate(fields).model_dump())
+        camera = PinholeCamera(**_CameraFile.model_validate(fields).model_dump())
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{source}: {key}: {first['msg'].lower()}, got {first['input']!r}") from error
+        raise InputError(f"{source}: {first_error(error)}; correct the camera") from error
+    if not (-camera.width <= camera.cx <= 2 * camera.width and -camera.height <= camera.cy <= 2 * camera.height):
+        raise InputError(
+            f"{source}: the centre ({camera.cx:g}, {camera.cy:g}) lies far outside of {camera.width}x{camera.height}"
+            " pixels; correct cx and cy, or the size"
+        )
+    return camera
+
+
+def _is_seen_through(camera: PinholeCamera) -> bool:
+    """Whether the lens can be undone at the corners: its polynomial bends rays back where its numbers are wrong."""
+    right, bottom = camera.width - 1.0, camera.height - 1.0
+    corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    again = camera.distort(camera.undistort(corners))
+    return bool(((again - corners).abs() < 1).all())

@@ -8,12 +8,9 @@ from pathlib import Path
 
 from v3d_torch.datasets.lists import Pair
 from v3d_torch.errors import InputError
+from v3d_torch.stamps import seconds
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
-
-_CLOCKS = ((19, 1e9), (16, 1e6), (13, 1e3))
-"""Digits of an integer stamp since 1970, and its units a second: nanoseconds, microseconds, milliseconds."""
-
 
 _PARTS = re.compile(r"(\D*)(\d*)")
 
@@ -33,10 +30,9 @@ def frame_number(path: Path) -> int | None:
 def stamp(path: Path) -> float | None:
     """Seconds, where the name is a time: ``1305031102.175304.png``, ``1403636579763555584.png``; else None."""
     if match := re.search(r"(?<!\d)(\d+\.\d+)$", path.stem):
-        return float(match[1])
-    for digits, units in _CLOCKS:
-        if match := re.search(rf"(?<!\d)(\d{{{digits}}})$", path.stem):
-            return int(match[1]) / units
+        return seconds(match[1])
+    if match := re.search(r"(?<!\d)(\d{13}|\d{16}|\d{19})$", path.stem):  # milli-, micro-, nanoseconds since 1970
+        return seconds(match[1])
     return None
 
 

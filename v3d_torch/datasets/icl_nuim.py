@@ -44,7 +44,9 @@ class ICLNUIMSequence(PairedImages):
                 f"{folder}: has several ground truths ({', '.join(path.name for path in truths)}); leave only the"
                 " sequence's own there"
             )
-        super().__init__(folder, pairs, choose_camera(camera, folder, CAMERA), camera_poses(read_trajectory(truths[0])))
+        super().__init__(
+            folder, pairs, choose_camera(camera, folder, CAMERA), lambda: camera_poses(read_trajectory(truths[0]))
+        )
 
 
 def is_icl_nuim(path: Path) -> bool:

@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import TypeVar
 
 from v3d_torch.association import associate
 from v3d_torch.datasets.images import is_depth
 from v3d_torch.errors import InputError
 from v3d_torch.files import numbered_lines
+from v3d_torch.stamps import seconds
 
 _T = TypeVar("_T")
 
 _EXPECTED = "a list has lines of a stamp and a file"
+
+_MAX_GAP = 10.0
+"""No camera that can be followed takes an image so rarely, seconds; one at 30 Hz does, by stamps in milliseconds."""
 
 MAX_DIFFERENCE = 0.02
 """Colour and depth farther apart than this are no pair, seconds (the benchmark's own choice)."""
@@ -47,7 +53,9 @@ def read_image_list(path: Path) -> list[tuple[float, str]]:
     for number, line in numbered_lines(path, _EXPECTED):
         match = re.fullmatch(r"([^\s,]+)[\s,]+(.+)", line)
         if match is None:
-            raise InputError(f"{path}: line {number} is {line[:80]!r} where a stamp and a file are expected")
+            raise InputError(
+                f"{path}: line {number} is {line[:80]!r} where a stamp and a file are expected; repair or remove it"
+            )
         entries.append((_stamp(match[1], path, number), match[2]))
     return _in_order(entries, path)
 
@@ -62,11 +70,17 @@ def read_associations(path: Path) -> list[Pair]:
     """
     rows = []
     for number, line in numbered_lines(path, _EXPECTED):
+        words = list(re.finditer(r"[^\s,]+", line))
         # The first name ends with a suffix and a number follows: names may hold spaces.
-        match = re.fullmatch(r"([^\s,]+)[\s,]+(.+?\.\w+)[\s,]+([-+\d.e]+)[\s,]+(.+)", line)
-        if match is None:
-            raise InputError(f"{path}: line {number} is {line[:80]!r} where stamp, file, stamp, file are expected")
-        rows.append((_stamp(match[1], path, number), match[2], _stamp(match[3], path, number), match[4]))
+        middle = next((i for i in range(2, len(words) - 1) if _parts_names(words[i - 1][0], words[i][0])), None)
+        if middle is None:
+            raise InputError(
+                f"{path}: line {number} is {line[:80]!r} where stamp, file, stamp, file are expected; write it so, or"
+                " leave only rgb.txt and depth.txt there"
+            )
+        first, second = words[0][0], words[middle][0]
+        names = (line[words[1].start() : words[middle - 1].end()], line[words[middle + 1].start() :])
+        rows.append((_stamp(first, path, number), names[0], _stamp(second, path, number), names[1]))
     if rows and is_depth(path.parent / rows[0][1]) and not is_depth(path.parent / rows[0][3]):
         rows = [(stamp, colour, other, depth) for other, depth, stamp, colour in rows]
     ordered = _in_order(((stamp, (colour, depth)) for stamp, colour, _, depth in rows), path)
@@ -97,13 +111,30 @@ def pair_lists(colour: Path, depth: Path) -> list[Pair]:
     return [Pair(*images[i], depths[j][1]) for i, j in indices]
 
 
+def refuse_other_units(pairs: Sequence[Pair], folder: Path) -> None:
+    """Raise InputError where frames lie so far apart that their stamps cannot be seconds."""
+    gap = median(later.stamp - earlier.stamp for earlier, later in pairwise(pairs)) if len(pairs) > 1 else 0.0
+    if gap > _MAX_GAP:
+        raise InputError(
+            f"{folder}: by their stamps its images lie {gap:g} s apart; stamps are seconds, divide them in the lists if"
+            " they are milli- or nanoseconds"
+        )
+
+
+def _parts_names(before: str, word: str) -> bool:
+    """Whether a word is the stamp between two names of files, by it and by the word before."""
+    return re.fullmatch(r"[-+\d.e]+", word) is not None and re.search(r"\.\w+$", before) is not None
+
+
 def _stamp(word: str, path: Path, number: int) -> float:
     try:
-        stamp = float(word)
+        stamp = seconds(word)
     except ValueError:
         stamp = math.nan
     if not math.isfinite(stamp):
-        raise InputError(f"{path}: line {number} has {word!r} where a stamp in seconds is expected")
+        raise InputError(
+            f"{path}: line {number} has {word[:80]!r} where a stamp in seconds is expected; repair or remove the line"
+        )
     return stamp
 
 
@@ -113,5 +144,5 @@ def _in_order(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[flo
     for stamp, value in entries:
         first.setdefault(stamp, value)
     if not first:
-        raise InputError(f"{path}: lists no images")
+        raise InputError(f"{path}: lists no images; {_EXPECTED}, copy it again")
     return sorted(first.items(), key=lambda entry: entry[0])

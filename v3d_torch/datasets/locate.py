@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from v3d_torch.datasets.names import canonical_name, download_url, short_name, unknown_name
+from v3d_torch.datasets.tum import is_tum
 from v3d_torch.download import Progress, cache_dir, fetch
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.extract import extract_tar
@@ -24,8 +27,11 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
         InputError: no such folder or file and no such sequence.
         DownloadError: the sequence is not here and cannot be downloaded; the message says how to get it by hand.
     """
-    if (path := Path(name).expanduser()).exists():
-        return path
+    if not name:
+        raise InputError("the name of the sequence is empty; give a name, a folder or a file")
+    with suppress(RuntimeError):  # ~somebody who is not known here
+        if (path := Path(name).expanduser()).exists():
+            return path
     full_name = canonical_name(name)
     search = data_folder(data_root)
     for root in (search, cache_dir()):
@@ -67,4 +73,7 @@ def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
                 extract_tar(archive, folder)
             finally:
                 archive.unlink()
+            if not is_tum(folder):
+                shutil.rmtree(folder)  # or it would be taken for the sequence from now on
+                raise InputError(f"{archive}: holds no rgb.txt and depth.txt; get the archive from another source")
     return folder

@@ -13,6 +13,12 @@ from v3d_torch.errors import InputError
 from v3d_torch.files import numbered_lines
 from v3d_torch.types import Trajectory
 
+_ROUNDED = 0.01
+"""By so much a rotation may fail to be one, as files with few digits make it."""
+
+_MAX_DISTANCE = 1e7
+"""Metres from the origin, as in trajectories."""
+
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
     """Read a square matrix, a line per row.
@@ -41,15 +47,19 @@ def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
         where no pose is left.
 
     Raises:
-        InputError: a file is no 4x4 matrix.
+        InputError: a file is no 4x4 matrix, or not that of a motion.
     """
     known = {}
     for stamp, path in files.items():
         T_wc = read_matrix(path)
         if T_wc.shape != (4, 4):
             raise InputError(f"{path}: is no 4x4 matrix, as a pose is; copy it again")
-        if np.isfinite(T_wc).all():
-            known[stamp] = T_wc
+        if not np.isfinite(T_wc).all():
+            continue
+        R = T_wc[:3, :3]
+        if np.abs(T_wc).max() > _MAX_DISTANCE or np.abs(R @ R.T - np.eye(3)).max() > _ROUNDED or np.linalg.det(R) < 0:
+            raise InputError(f"{path}: is not the motion of a camera, a rotation and a place; copy it again")
+        known[stamp] = T_wc
     if not known:
         return None
     return Trajectory(torch.tensor(list(known), dtype=torch.float64), torch.from_numpy(np.stack(list(known.values()))))

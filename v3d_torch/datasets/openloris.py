@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 from pathlib import Path
 
-import cv2
 import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
 from v3d_torch.datasets.lists import pair_lists
+from v3d_torch.datasets.opencv_yaml import matrix, read_opencv_yaml
 from v3d_torch.datasets.paired import PairedImages
 from v3d_torch.errors import InputError
 from v3d_torch.lie import invert, rigid
@@ -43,7 +43,7 @@ class OpenLORISSequence(PairedImages):
             folder,
             pairs,
             choose_camera(camera, folder, own),
-            _camera_poses(read_trajectory(truth), folder / "trans_matrix.yaml") if truth.is_file() else None,
+            lambda: _camera_poses(truth, folder / "trans_matrix.yaml") if truth.is_file() else None,
         )
 
 
@@ -53,23 +53,23 @@ def is_openloris(path: Path) -> bool:
 
 
 def _read_camera(path: Path) -> PinholeCamera:
-    storage = _open(path)  # its nodes live no longer than it does
-    node = storage.getNode(_COLOUR)
     try:
-        fx, cx, fy, cy = node.getNode("intrinsics").mat().reshape(4).tolist()  # in this order
-        bent = node.getNode("distortion_coefficients")
-        distortion = [] if bent.empty() else bent.mat().reshape(-1).tolist()
-        width, height = (int(node.getNode(name).real()) for name in ("width", "height"))
-    except (AttributeError, ValueError, cv2.error) as error:
+        node = read_opencv_yaml(path)[_COLOUR]
+        fx, cx, fy, cy = matrix(node["intrinsics"], 4).tolist()  # in this order
+        fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": node["width"], "height": node["height"]}
+        lens = node.get("distortion_coefficients", {"data": []})
+        distortion = matrix(lens, len(lens["data"])).tolist()
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: holds no {_COLOUR} with width, height, intrinsics; copy it again, or give --camera"
         ) from error
-    fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, "depth_scale": _DEPTH_SCALE}
-    return checked_camera(fields | {"distortion": distortion + [0.0] * (5 - len(distortion))}, str(path))
+    fields |= {"distortion": distortion + [0.0] * (5 - len(distortion)), "depth_scale": _DEPTH_SCALE}
+    return checked_camera(fields, str(path))
 
 
-def _camera_poses(base: Trajectory, calibration: Path) -> Trajectory:
-    """Poses of the robot's base to poses of its colour camera."""
+def _camera_poses(truth: Path, calibration: Path) -> Trajectory:
+    """Poses of the robot's base, in a file, to poses of its colour camera."""
+    base = read_trajectory(truth)
     return Trajectory(base.stamps, base.T_wc @ _between(_BASE, _COLOUR, calibration))
 
 
@@ -91,25 +91,13 @@ def _between(parent: str, child: str, path: Path) -> Tensor:
 
 def _read_links(path: Path) -> dict[tuple[str, str], Tensor]:
     """``T_ab`` by (a, b), both ways."""
-    storage = _open(path)
-    nodes = storage.getNode("trans_matrix")
     links: dict[tuple[str, str], Tensor] = {}
     try:
-        for node in (nodes.at(i) for i in range(nodes.size())):
-            parent, child = (node.getNode(name).string() for name in ("parent_frame", "child_frame"))
-            T = torch.from_numpy(node.getNode("matrix").mat().reshape(4, 4)).to(torch.float64)
+        for node in read_opencv_yaml(path).get("trans_matrix", []):
+            parent, child = str(node["parent_frame"]), str(node["child_frame"])
+            T = torch.from_numpy(matrix(node["matrix"], 4, 4))
             links[parent, child] = T
             links[child, parent] = invert(T)
-    except (AttributeError, ValueError, cv2.error) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: a link has no parent_frame, child_frame or 4x4 matrix; copy it again") from error
     return links
-
-
-def _open(path: Path) -> cv2.FileStorage:
-    """A file in OpenCV's dialect of YAML, which YAML libraries refuse."""
-    if not path.is_file():
-        raise InputError(f"{path}: is not there, and nothing else says where the robot's camera is; copy it again")
-    try:
-        return cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:  # OpenCV raises the latter for text that it cannot parse
-        raise InputError(f"{path}: is no YAML as OpenCV writes it; copy it again") from error

@@ -9,9 +9,8 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.images import read_colour, read_depth
 from v3d_torch.datasets.lists import Pair
-from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.datasets.stored import ReadTruth, StoredFrames
 from v3d_torch.errors import InputError
-from v3d_torch.types import Trajectory
 
 
 class PairedImages(StoredFrames):
@@ -21,7 +20,7 @@ class PairedImages(StoredFrames):
         folder: the sequence's folder.
         pairs: the frames' files, in order of time.
         camera: that took them.
-        groundtruth: measured poses of that camera, where there are some.
+        groundtruth: see `StoredFrames`.
         name: for tables; None takes the folder's name.
 
     Raises:
@@ -33,7 +32,7 @@ class PairedImages(StoredFrames):
         folder: Path,
         pairs: list[Pair],
         camera: PinholeCamera,
-        groundtruth: Trajectory | None = None,
+        groundtruth: ReadTruth | None = None,
         *,
         name: str | None = None,
     ) -> None:
@@ -49,10 +48,7 @@ class PairedImages(StoredFrames):
 
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         colour, depth = (self.folder / file for file in (self._pairs[index].colour, self._pairs[index].depth))
-        return self._sized(colour, self._colour(colour)), self._sized(depth, self._depth(depth))
+        return self._registered((colour, self._colour(colour)), (depth, read_depth(depth, self.camera.depth_scale)))
 
     def _colour(self, path: Path) -> Tensor:
         return read_colour(path)
-
-    def _depth(self, path: Path) -> Tensor:
-        return read_depth(path, self.camera.depth_scale)

@@ -37,7 +37,11 @@ def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -
     """
     found: dict[str, str] = {}
     for pattern in patterns:
-        for name in _matching(pattern, data_folder(data_root)):
+        try:
+            names = _matching(pattern, data_folder(data_root))
+        except (OSError, RuntimeError, ValueError) as error:  # too long a name, ~ of nobody, ** within a name
+            raise InputError(f"{pattern}: can match nothing ({error}); check the path") from error
+        for name in names:
             found.setdefault(canonical_name(name) or name, name)
     return list(found.values())
 

@@ -8,13 +8,12 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
 from v3d_torch.datasets.file_names import frame_number, images_in, numbered_pairs
-from v3d_torch.datasets.images import read_colour
+from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import Pair
 from v3d_torch.datasets.matrices import read_matrix, read_poses
 from v3d_torch.datasets.paired import PairedImages
@@ -51,11 +50,11 @@ class ScanNetSequence(PairedImages):
             frames,
             pairs,
             choose_camera(camera, frames, published),
-            read_poses({stamp: poses[number] for number, stamp in numbers.items() if number in poses}),
+            lambda: read_poses({stamp: poses[number] for number, stamp in numbers.items() if number in poses}),
             name=folder.resolve().name,
         )
         colour = _intrinsics(frames, "color")
-        self._K_colour = read_matrix(colour)[:3, :3] if colour is not None else None
+        self._K_colour = _checked(read_matrix(colour), colour)[:3, :3] if colour is not None else None
 
     def _colour(self, path: Path) -> Tensor:
         """The colour image as the depth camera would have seen it."""
@@ -97,28 +96,26 @@ def _intrinsics(frames: Path, kind: str) -> Path | None:
 
 def _depth_camera(frames: Path, pair: Pair) -> PinholeCamera | None:
     """The depth images' camera; without a file of it the colour images' one, which has the same view, scaled."""
-    width, height = _size(frames / pair.depth)
+    width, height = image_size(frames / pair.depth)
     source = _intrinsics(frames, "depth") or _intrinsics(frames, "color")
     if source is None:
         return None
-    K = read_matrix(source)
+    K = _checked(read_matrix(source), source)
     if source == _intrinsics(frames, "color"):
-        full = _size(frames / pair.colour)
+        full = image_size(frames / pair.colour)
         K = _scaled(K, width / full[0], height / full[1])
     fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
     return checked_camera(fields | {"depth_scale": _DEPTH_SCALE}, str(source))
+
+
+def _checked(K: NDArray[np.float64], source: Path) -> NDArray[np.float64]:
+    """A camera matrix, if it is one."""
+    if not (np.isfinite(K).all() and K[0, 0] >= 1 and K[1, 1] >= 1):
+        raise InputError(f"{source}: is no camera matrix, with focal lengths on its diagonal; copy it again")
+    return K
 
 
 def _scaled(K: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
     """Camera matrix of an image that is resized; pixel centres lie at integers, so its edges at -0.5."""
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     return np.diag([x, y, 1.0]) @ (K[:3, :3] + half) - half
-
-
-def _size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header."""
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except OSError as error:
-        raise InputError(f"{path}: is no image; copy it again") from error

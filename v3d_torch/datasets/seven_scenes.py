@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torch import Tensor
-
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.file_names import numbered_pairs
-from v3d_torch.datasets.images import read_depth
 from v3d_torch.datasets.matrices import read_poses
 from v3d_torch.datasets.paired import PairedImages
 
@@ -18,9 +15,6 @@ CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, depth_scale=1000.0)
 
 _RATE = 30.0
 """Frames a second: the names number the frames."""
-
-_NOTHING = 65.5
-"""From here on depth is the 65535 that the dataset writes for no measurement, metres."""
 
 
 class SevenScenesSequence(PairedImages):
@@ -41,13 +35,9 @@ class SevenScenesSequence(PairedImages):
             folder,
             pairs,
             choose_camera(camera, folder, CAMERA),
-            read_poses({stamp: path for stamp, path in poses.items() if path.is_file()}),
+            lambda: read_poses({stamp: path for stamp, path in poses.items() if path.is_file()}),
             name="/".join(folder.resolve().parts[-2:]),
         )
-
-    def _depth(self, path: Path) -> Tensor:
-        depth = read_depth(path, self.camera.depth_scale)
-        return depth.masked_fill_(depth >= _NOTHING, 0.0)
 
 
 def is_seven_scenes(path: Path) -> bool:

@@ -86,6 +86,18 @@ SOURCES = (
 """In the order in which they are tried: what could be taken for another, less special kind comes before it."""
 
 
+_UNPACK = {
+    (".tgz", ".tar", ".tar.gz", ".zip", ".7z", ".rar"): "is an archive; unpack it and give the folder",
+    (".sens",): "is a recording of ScanNet's; export it with ScanNet's SensReader and give that folder",
+}
+"""What is no source yet, by the ends of its name, and what makes one of it."""
+
+_UNKNOWN = (
+    "is no sequence of a known kind; the README lists them, the simplest is a folder with a folder rgb of colour and a"
+    " folder depth of depth images"
+)
+
+
 def is_source(path: Path) -> bool:
     """Whether a path holds anything of a known kind; opening it tells whether it is in order."""
     return any(source.holds(path) for source in SOURCES)
@@ -101,10 +113,8 @@ def open_path(path: Path, camera: CameraChoice, options: SourceOptions, progress
         if source.holds(path):
             reject_options(path, source.what, options, source.options)
             return source.open(path, camera, options, progress)
-    raise InputError(
-        f"{path}: is no sequence of a known kind; the README lists them, the simplest is a folder with a folder rgb of"
-        " colour and a folder depth of depth images"
-    )
+    how = next((how for ends, how in _UNPACK.items() if path.name.lower().endswith(ends)), _UNKNOWN)
+    raise InputError(f"{path}: {how}")
 
 
 def reject_options(source: object, what: str, options: SourceOptions, taken: frozenset[str]) -> None:

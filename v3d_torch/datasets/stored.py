@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -11,6 +11,12 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
 from v3d_torch.types import RGBDFrame, Trajectory
+
+ReadTruth = Callable[[], Trajectory | None]
+"""Reads the ground truth; None where there is none."""
+
+_DEPTHS = (0.05, 50.0)
+"""Metres between which an RGB-D camera measures, with room to spare."""
 
 
 class StoredFrames(ABC):
@@ -20,16 +26,25 @@ class StoredFrames(ABC):
         name: for tables.
         stamps: of the colour images, seconds, strictly increasing.
         camera: that took all frames.
-        groundtruth: measured poses of that camera, where there are some.
+        groundtruth: reads the measured poses of that camera.
+
+    Attributes:
+        groundtruth: these poses; None where there are none, or they cannot be read, as the frames still can.
+        groundtruth_error: why they cannot be read.
     """
 
     def __init__(
-        self, name: str, stamps: Sequence[float], camera: PinholeCamera, groundtruth: Trajectory | None = None
+        self, name: str, stamps: Sequence[float], camera: PinholeCamera, groundtruth: ReadTruth | None = None
     ) -> None:
-        self.name = name
+        self.name = name.encode(errors="replace").decode()  # a folder's name need not be text
         self.stamps: Tensor = torch.tensor(stamps, dtype=torch.float64)
         self.camera = camera
-        self.groundtruth = groundtruth
+        self.groundtruth: Trajectory | None = None
+        self.groundtruth_error: InputError | None = None
+        try:
+            self.groundtruth = groundtruth() if groundtruth is not None else None
+        except InputError as error:
+            self.groundtruth_error = error
 
     def __len__(self) -> int:
         return self.stamps.shape[0]
@@ -49,9 +64,39 @@ class StoredFrames(ABC):
         image, depth = self._read(index)
         return RGBDFrame(index=index, stamp=float(self.stamps[index]), image=image, depth=depth, camera=self.camera)
 
+    def check_first_frame(self, source: object) -> None:
+        """Decode the first frame, so that what is wrong with every frame is said before anything else is done.
+
+        Args:
+            source: of the frames, for messages.
+
+        Raises:
+            InputError: as `__getitem__`, or its depth is none that such a camera measures.
+        """
+        depth = self._read(0)[1]
+        middle = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
+        if not _DEPTHS[0] < middle < _DEPTHS[1]:
+            scale = f"{self.camera.depth_scale:g} units per metre"
+            raise InputError(
+                f"{source}: the depth of its first frame is {middle:.2g} m in the middle, at {scale}; correct the"
+                " camera's depth_scale (1000 where depth is in millimetres), or the images"
+            )
+
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         """Colour and depth of a frame that there is, as `RGBDFrame` holds them."""
+
+    def _registered(
+        self,
+        colour: tuple[object, Tensor],
+        depth: tuple[object, Tensor],
+        cure: str = "export the depth that is registered to colour, pixel by pixel",
+    ) -> tuple[Tensor, Tensor]:
+        """Colour and depth images (C, H, W), each with where it came from, if they have one size, the camera's."""
+        sizes = [f"{image.shape[2]}x{image.shape[1]}" for _, image in (depth, colour)]
+        if sizes[0] != sizes[1]:
+            raise InputError(f"{depth[0]}: has {sizes[0]} pixels, its colour image {sizes[1]}; {cure}")
+        return self._sized(*colour), depth[1]
 
     def _sized(self, source: object, image: Tensor) -> Tensor:
         """The image (C, H, W), which came from ``source``, if it has the camera's size."""

@@ -9,7 +9,8 @@ from kornia_rs import io
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.lists import Pair, pair_lists, read_associations
+from v3d_torch.datasets.images import image_size
+from v3d_torch.datasets.lists import Pair, pair_lists, read_associations, refuse_other_units
 from v3d_torch.datasets.names import short_name
 from v3d_torch.datasets.paired import PairedImages
 from v3d_torch.errors import InputError
@@ -35,12 +36,13 @@ class TUMSequence(PairedImages):
             what = "is a file" if folder.exists() else "is not there"
             raise InputError(f"{folder}: {what}; a sequence is a folder with rgb.txt and depth.txt")
         pairs = _read_pairs(folder)
+        refuse_other_units(pairs, folder)
         truth = folder / "groundtruth.txt"
         super().__init__(
             folder,
             pairs,
             choose_camera(camera, folder),
-            read_trajectory(truth) if truth.is_file() else None,
+            lambda: read_trajectory(truth) if truth.is_file() else None,
             name=short_name(folder.resolve().name) if name is None else name,
         )
 
@@ -53,6 +55,7 @@ class TUMSequence(PairedImages):
         path = (self.folder / "masks" / Path(self._pairs[index].depth).name).with_suffix(".png")
         if not path.is_file():
             return None
+        image_size(path)
         try:
             ids = io.read_image_png_u8(str(path), "mono")
         except Exception as error:  # kornia_rs raises bare Exception for every cause

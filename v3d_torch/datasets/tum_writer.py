@@ -12,6 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.datasets.images import SATURATED
 from v3d_torch.errors import OutputError
 from v3d_torch.files import write_text, written_whole
 from v3d_torch.trajectory import write_trajectory
@@ -60,10 +61,10 @@ class TUMWriter:
         return len(self._written)
 
     def add(self, frame: RGBDFrame) -> None:
-        """Write a frame's images; depth beyond 16 bits of the camera's units becomes no measurement."""
+        """Write a frame's images; depth that 16 bits of the camera's units cannot tell is no measurement."""
         stamp = f"{frame.stamp:.6f}"
         units = np.rint(frame.depth[0].numpy() * self.camera.depth_scale)
-        units[units > np.iinfo(np.uint16).max] = 0
+        units[units >= SATURATED] = 0
         colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
         _save(self.folder / "rgb" / f"{stamp}.png", colour)
         _save(self.folder / "depth" / f"{stamp}.png", units.astype(np.uint16))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -20,6 +21,13 @@ from v3d_torch.datasets.lists import MAX_DIFFERENCE
 from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.download import Progress
 from v3d_torch.errors import InputError
+from v3d_torch.types import RGBDFrame
+
+# FFmpeg, in OpenCV, writes to stderr by itself what it thinks of a broken file; what matters is raised here.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+_WHOLE = 0.9
+"""A video whose last frame comes before this share of what the file says is not whole."""
 
 _SUFFIXES = frozenset({".mkv", ".mp4", ".avi", ".mov", ".webm", ".m4v"})
 
@@ -50,7 +58,8 @@ class VideoSequence(StoredFrames):
     ) -> None:
         self._colour, self._depth = colour, depth = _files(path)
         own = choose_camera(camera, colour.parent)
-        times, depth_times = _times(colour, fps, progress), _times(depth, fps, raw=True)
+        (times, cut), (depth_times, depth_cut) = _times(colour, fps, progress), _times(depth, fps, raw=True)
+        self._cut = cut or depth_cut
         self._pairs = associate(times, depth_times, MAX_DIFFERENCE)
         if not self._pairs:
             raise InputError(
@@ -60,12 +69,22 @@ class VideoSequence(StoredFrames):
         self._colours = Cursor(lambda: _frames(colour))
         self._depths = Cursor(lambda: _frames(depth, raw=True))
 
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        """All frames.
+
+        Raises:
+            InputError: as `__getitem__`; and behind the last frame, where a video breaks off.
+        """
+        yield from super().__iter__()
+        if self._cut is not None:
+            raise InputError(self._cut)
+
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         i, j = self._pairs[index]
         pixels, units = self._colours[i].retrieve()[1], self._depths[j].retrieve()[1]
         image = torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
         depth = metres(units.squeeze(), self.camera.depth_scale)
-        return self._sized(self._colour, image), self._sized(self._depth, depth)
+        return self._registered((self._colour, image), (self._depth, depth))
 
 
 def is_video(path: Path) -> bool:
@@ -100,20 +119,26 @@ def _files(path: Path) -> tuple[Path, Path]:
     return colour[0], depth[0]
 
 
-def _times(path: Path, fps: float | None, progress: Progress | None = None, *, raw: bool = False) -> list[float]:
-    """Seconds of every frame, strictly increasing."""
+def _times(
+    path: Path, fps: float | None, progress: Progress | None = None, *, raw: bool = False
+) -> tuple[list[float], str | None]:
+    """Seconds of every frame, strictly increasing; and a sentence where there are fewer than the file says."""
     times: list[float] = []
+    end = last = 0.0
     for number, capture in enumerate(_frames(path, raw=raw)):
         if number == 0 and raw:
             _check_depth(path, capture)
-        times.append(number / fps if fps is not None else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+        last = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        end = (capture.get(cv2.CAP_PROP_FRAME_COUNT) - 1) / max(capture.get(cv2.CAP_PROP_FPS), 1e-3)
+        times.append(number / fps if fps is not None else last)
         if progress is not None:
             progress(number + 1, max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), number + 1))
     if not times:
         raise InputError(f"{path}: is no video that can be decoded; copy it again, or convert it with ffmpeg")
     if any(later <= earlier for earlier, later in pairwise(times)):
         raise InputError(f"{path}: its times do not increase; give the frames a second with --fps")
-    return times
+    cut = f"{path}: breaks off at {last:.1f} of {end:.1f} s; copy it again" if last < _WHOLE * end else None
+    return times, cut
 
 
 def _check_depth(path: Path, capture: cv2.VideoCapture) -> None:

@@ -13,6 +13,10 @@ _PLANE = 1e-3
 plane. Motion capture is no more precise; the hand that holds a camera still in fr3/s/static spreads it by 12 mm."""
 
 
+_SCALE = 1.5
+"""A trajectory of the right shape that is larger or smaller by this did not drift: its unit is another one."""
+
+
 class RotationSource(StrEnum):
     """What the rotation of an alignment was taken from."""
 
@@ -81,6 +85,25 @@ def absolute_errors(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> Tensor:
         Metres, shape :math:`(N,)`.
     """
     return ((alignment.T_ge @ T_ec)[:, :3, 3] - T_gc[:, :3, 3]).norm(dim=-1)
+
+
+def scale_error(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> float | None:
+    """By how much an estimate of the right shape has the wrong size, as where depth is read in wrong units.
+
+    Args:
+        T_gc: ground truth, shape :math:`(N, 4, 4)`.
+        T_ec: estimate at the same times, shape :math:`(N, 4, 4)`.
+        alignment: of the two, from `align`.
+
+    Returns:
+        Size of the ground truth over that of the estimate; None where that is less than `_SCALE` either way, or the
+        shape is another one: the estimate in this size leaves more than half of the ground truth's spread.
+    """
+    p_g, p_e = T_gc[:, :3, 3], (alignment.T_ge @ T_ec)[:, :3, 3]
+    p_g, p_e = p_g - p_g.mean(dim=0), p_e - p_e.mean(dim=0)
+    factor = float((p_g * p_e).sum() / p_e.square().sum())
+    left = (factor * p_e - p_g).square().sum() / p_g.square().sum()
+    return factor if factor > 0 and not 1 / _SCALE < factor < _SCALE and left < 0.25 else None
 
 
 def _nearest_rotation(M: Tensor) -> Tensor:

@@ -9,12 +9,13 @@ import torch
 
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, match
-from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align
+from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align, scale_error
 from v3d_torch.evaluation.rpe import RPE, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.types import Trajectory
 
-_MIN_PAIRS = 3
+MIN_PAIRS = 3
+"""Poses with ground truth that an alignment needs."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,10 @@ def evaluate(
         InputError: fewer than three poses of the two belong together.
     """
     matches = match(groundtruth, estimate, max_time_difference)
-    if len(matches) < _MIN_PAIRS:
+    if len(matches) < MIN_PAIRS:
         raise InputError(
             f"only {len(matches)} poses of the estimate {_span(estimate)} lie within {max_time_difference:g} s of the "
-            f"ground truth {_span(groundtruth)}, at least {_MIN_PAIRS} are needed; are they of the same sequence?"
+            f"ground truth {_span(groundtruth)}, at least {MIN_PAIRS} are needed; are they of the same sequence?"
         )
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
     oriented = is_oriented(groundtruth)
@@ -88,6 +89,9 @@ def evaluate(
     notes = []
     if alignment.source is RotationSource.ORIENTATIONS:
         notes.append("the ground truth's positions span no plane: aligned by the mean of the orientations")
+    factor = scale_error(T_gc, T_ec, alignment)
+    if factor is not None:
+        notes.append(f"the ground truth is {factor:.3g} times as large as the estimate: is depth_scale right?")
     rpe = relative_pose_error(groundtruth, estimate, matches, rpe_delta) if oriented else None
     if not oriented:
         notes.append("the ground truth moves but all its orientations are the same, placeholders: no RPE")

@@ -74,9 +74,10 @@ class Job:
 
     def _metrics(self) -> Mapping[str, Any] | None:
         try:
-            return json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
             return None
+        return metrics if isinstance(metrics, dict) else None
 
 
 def on_one_thread(config: Config) -> Config:

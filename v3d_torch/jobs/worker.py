@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import OutputError, V3DError
+from v3d_torch.earlier_results import prepare_folder
+from v3d_torch.errors import V3DError
 from v3d_torch.jobs.job import Job
 from v3d_torch.logged import log_to, run_logged
 from v3d_torch.mapping.recorder import Status
@@ -30,7 +31,7 @@ def run_job(job: Job, report: Callable[[int], None]) -> str | None:
         report(frame.index + 1)
 
     try:
-        _make_folder(job)
+        prepare_folder(job.folder)
         with log_to(job.folder / "run.log"):
             sequence = load_sequence(job.source, data_root=job.data_root)
             segment = make_segmenter(job.config.segmentation)
@@ -44,14 +45,3 @@ def sentence(error: Exception) -> str:
     """What an error says in one line; an error in the program says its type, too."""
     said = " ".join(str(error).split())
     return said if isinstance(error, V3DError) else f"{type(error).__name__}: {said}"
-
-
-def _make_folder(job: Job) -> None:
-    """Make the folder of the results; where an earlier run failed, it no longer counts for this one."""
-    try:
-        job.folder.mkdir(parents=True, exist_ok=True)
-        (job.folder / "metrics.json").unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{job.folder}: cannot be written ({error.strerror}); choose another folder with --out"
-        ) from error

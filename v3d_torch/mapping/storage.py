@@ -28,6 +28,9 @@ from v3d_torch.mapping.views import StaticViews
 
 _FORMAT, _VERSION = "v3d_torch map", 1
 
+_ROOM, _RATIO = 1 << 28, 20
+"""Bytes that any file may unpack to, and by how much a larger one may grow: maps grow threefold."""
+
 _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -96,6 +99,7 @@ def load_map(path: Path, camera: PinholeCamera, config: Config) -> StoredMap:
     stored = StoredMap(SparseMap(config.mapping, config.features, camera), StaticViews(camera, config.dense_map.stride))
     try:
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            _refuse_bomb(archive, path.stat().st_size)
             about = json.loads(_read(archive, "about").tobytes())
             if about["format"] != _FORMAT:
                 raise ValueError("it holds something else")
@@ -109,6 +113,13 @@ def load_map(path: Path, camera: PinholeCamera, config: Config) -> StoredMap:
         raise InputError(f"{path}: is a damaged map ({wrong}); give a file that --save-map wrote")
     from_columns(columns, stored.map, stored.views)
     return stored
+
+
+def _refuse_bomb(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise ValueError if the arrays take so much more than the file that it was made to fill the memory."""
+    claimed = sum(member.file_size for member in archive.infolist())
+    if claimed > _ROOM + _RATIO * size:
+        raise ValueError(f"it claims to hold {claimed} bytes in {size}")
 
 
 def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:

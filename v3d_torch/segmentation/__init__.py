@@ -48,10 +48,16 @@ def make_source(config: SegmentationConfig, weights: Path | None = None, masks_d
         masks_dir: folder of id images, see `StoredMasks`.
 
     Raises:
-        ConfigError: if masks are to be read but no folder is given.
+        ConfigError: if masks are to be read but no folder is given, or what is given is not what is to be used.
         WeightsError: if the network's weights cannot be had.
         InputError: if the folder holds no masks.
     """
+    for option, given, source in (("weights", weights, "yolo"), ("masks", masks_dir, "masks")):
+        if given is not None and config.source != source:
+            raise ConfigError(
+                f"--{option} {given}: means nothing to segmentation.source={config.source}; leave it out, or give"
+                f" --segmenter {source}"
+            )
     if config.source == "none":
         return NoSegmentation()
     if config.source == "masks":

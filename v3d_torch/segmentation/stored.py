@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -16,6 +17,9 @@ from v3d_torch.types import Instances, RGBDFrame
 
 _MAX_GAP = 0.02
 """Longest time between a mask and its frame, seconds: what TUM's tools allow between colour and depth."""
+
+_MAX_IDS = 255
+"""Most instances in an image: depth taken for ids would make thousands, and a mask of the image's size for each."""
 
 _STAMP = re.compile(r"\d+\.\d+")
 
@@ -35,7 +39,9 @@ class StoredMasks:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._paths = sorted(folder.glob("*.png"))
+        self._paths: list[Path] = []
+        with suppress(OSError):  # a name that is too long
+            self._paths = sorted(folder.glob("*.png"))
         if not self._paths:
             raise InputError(f"{folder}: holds no PNG files; name the folder of the id images with --masks")
         self._stamps: Tensor | None = None
@@ -59,11 +65,17 @@ class StoredMasks:
         path = self._path(frame)
         values = _read_ids(path)
         if values.shape != frame.image.shape[1:]:
+            sizes = [f"{width}x{height}" for height, width in (values.shape, frame.image.shape[1:])]
             raise InputError(
-                f"{path}: is {tuple(values.shape)} pixels, but the frame is {tuple(frame.image.shape[1:])}"
+                f"{path}: has {sizes[0]} pixels, its frame {sizes[1]}; write id images of the size of the frames"
             )
         present = values.unique()
         ids = present[present > 0]
+        if len(ids) > _MAX_IDS:
+            raise InputError(
+                f"{path}: has {len(ids)} different values; an id image has one for each instance and 0 for the rest,"
+                " name the folder of such images with --masks"
+            )
         masks = values == ids[:, None, None]
         instances = Instances(
             masks=masks,
@@ -90,12 +102,12 @@ class StoredMasks:
 def _read_ids(path: Path) -> Tensor:
     """Values of an id image, int64, shape :math:`(H, W)`; of an image with a palette, the indices."""
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=["PNG"]) as image:
             values = np.asarray(image)
-    except (OSError, UnidentifiedImageError, SyntaxError) as error:
+    except Exception as error:  # a decoder that meets nonsense raises whatever that leads to
         raise InputError(f"{path}: cannot be read as an image; write it again") from error
     if values.ndim != 2:
-        raise InputError(f"{path}: has {values.shape[2]} channels; an id image has one, 8 or 16 bit")
+        raise InputError(f"{path}: has {values.shape[2]} channels, an id image has one of 8 or 16 bit; write it so")
     return torch.from_numpy(values.astype(np.int64))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import onnxruntime
 import torch
 from torch import Tensor
@@ -42,6 +43,7 @@ class YOLOSegmenter:
             if config.precision == "int8" and is_worth_it():
                 path = quantised(path)
         self.config = config
+        self._path = path
         self._session = _open_session(path, config.threads)
         self._input = self._session.get_inputs()[0].name
         self.height, self.width = _check_layout(self._session, path)
@@ -60,9 +62,17 @@ class YOLOSegmenter:
         Returns:
             Masks of shape :math:`(N, H, W)`, best score first; boxes are the edges of pixels: pixel u lies in a box
             where left <= u < right.
+
+        Raises:
+            WeightsError: if the network breaks, or gives what is no number.
         """
         canvas, window = letterbox(image, self.height, self.width)
-        predictions, prototypes = self._session.run(None, {self._input: canvas.numpy()})
+        try:
+            predictions, prototypes = self._session.run(None, {self._input: canvas.numpy()})
+        except Exception as error:  # onnxruntime's exceptions have no common base of their own
+            raise WeightsError(f"{self._path}: onnxruntime cannot run it; export it again") from error
+        if not (np.isfinite(predictions).all() and np.isfinite(prototypes).all()):
+            raise WeightsError(f"{self._path}: gives what is no number; train or export it again")
         instances = decode(
             torch.from_numpy(predictions)[0],
             torch.from_numpy(prototypes)[0],

@@ -101,7 +101,8 @@ def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title:
         axes.plot([], [], color="tab:red", linewidth=0.9, label=f"difference (ATE RMSE {error:.4f} m)")
     axes.plot([], [], "o", color="gray", label="start")
     _frame(axes, torch.cat([positions[:, plane] for _, positions, _, _ in curves]))
-    axes.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]", title=title)
+    axes.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[up]} [m]")
+    axes.set_title(title, parse_math=False)  # a folder's name may hold dollars
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure

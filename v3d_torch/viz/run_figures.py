@@ -21,15 +21,13 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
     """Draw the trajectory, the masks, and of the liveliest frame the votes and the clouds, where it has any.
 
     Args:
-        folder: for the images; of another run's those that this one has not are removed.
+        folder: for the images.
         pipeline: that has run.
         trajectory: of all frames.
 
     Raises:
         OutputError: when an image cannot be written.
     """
-    for name in ("masks.png", "voting.png", "clusters.png"):
-        (folder / name).unlink(missing_ok=True)
     trajectory_figure(pipeline.sequence.groundtruth, trajectory, folder / "trajectory.png", pipeline.sequence.name)
     if snapshots := pipeline.run.snapshots:
         overlays = [[_overlay(judged) for judged in shot.scene.objects] for shot in snapshots]

@@ -1,0 +1,155 @@
+"""Every broken sequence of the corpus through the command: a right result, or one sentence and what was computed."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from corpus import CATEGORIES
+from corpus.base import write_base
+from corpus.case import Case, Place, Right, Says
+from typer.testing import CliRunner
+
+from v3d_torch import report, run
+
+CASES = [
+    pytest.param(category, case, id=f"{category}: {case.name}")
+    for category, cases in CATEGORIES.items()
+    for case in cases
+]
+DRAWN = {"what the images show", "what --seq names", "results and rights"}
+"""Categories whose figures are drawn, which takes most of the time of a run so short."""
+
+SHELL = {
+    "ground truth": "words",
+    "what --seq names": "a folder with a line break in its name",
+}
+"""Cases that also run as a user starts them."""
+
+_MEMORY = 2 << 30
+"""Bytes that a case may take on top: a bomb takes more."""
+
+
+@pytest.fixture(scope="session")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("corpus") / "seq"
+    write_base(folder)
+    return folder
+
+
+@pytest.fixture
+def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    """The whole sequence, to be broken, in an empty folder that is the working directory."""
+    shutil.copytree(base, tmp_path / "seq")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("V3D_DATA", raising=False)
+    place = Place(tmp_path)
+    place.seq = str(place.folder)
+    yield place
+    for path in tmp_path.rglob("*"):  # so that pytest can remove what a case has closed
+        if path.is_dir() and not path.is_symlink():
+            path.chmod(0o700)
+
+
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """Let no more than `_MEMORY` be taken, where the system tells how much there is already."""
+    status = Path("/proc/self/statm")
+    if not status.is_file():
+        yield
+        return
+    taken = int(status.read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (taken + _MEMORY, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def arguments(place: Place) -> list[str]:
+    return ["--seq", place.seq, "--out", str(place.out), *place.options]
+
+
+def assert_ends(place: Place, ends: Right | Says, code: int, stdout: str, stderr: str) -> None:
+    if isinstance(ends, Right):
+        assert (code, stderr) == (0, "")
+        metrics = json.loads((place.out / "metrics.json").read_text())
+        assert (metrics["processed"], metrics["lost"], metrics["failure"]) == (ends.frames, ends.lost, None)
+        assert kept(place) == ends.frames
+        assert (metrics["ate"] is None) == (ends.ate is None)
+        assert ends.ate is None or metrics["ate"]["rmse"] < ends.ate
+        assert ends.note in stdout
+    else:
+        assert code == 2, stderr
+        assert stderr.startswith("error: ") and stderr.endswith("\n") and stderr.count("\n") == 1, stderr
+        assert ends.fits(stderr.removeprefix("error: ").removesuffix("\n"), place), stderr
+        assert kept(place) == ends.kept
+
+
+def kept(place: Place) -> int | None:
+    """Poses in the results; None where there are no results."""
+    trajectory = place.out / "trajectory.txt"
+    return len(trajectory.read_text().splitlines()) if trajectory.is_file() else None
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
+@pytest.mark.parametrize(("category", "case"), CASES)
+def test_a_broken_sequence(
+    category: str, case: Case, place: Place, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if category not in DRAWN:
+        monkeypatch.setattr("v3d_torch.results.draw_run", lambda *_: None)
+    case.make(place)
+    with case.during(place), little_memory():
+        done = CliRunner().invoke(run.app, arguments(place))
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exc_info
+    assert_ends(place, case.ends, done.exit_code, done.stdout, done.stderr)
+    assert capfd.readouterr().err == ""  # nor does a library write there by itself
+    assert not list(place.root.glob("**/*.part*"))
+
+
+@pytest.mark.parametrize(("category", "name"), SHELL.items(), ids=SHELL)
+def test_a_broken_sequence_from_a_shell(category: str, name: str, place: Place) -> None:
+    case = next(case for case in CATEGORIES[category] if case.name == name)
+    case.make(place)
+    command = [sys.executable, "-m", "v3d_torch.run", *arguments(place)]
+    environment = os.environ | {"PYTHONPATH": str(Path(run.__file__).parents[1]), "COLUMNS": "200", "NO_COLOR": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)  # noqa: S603
+    assert_ends(place, case.ends, done.returncode, done.stdout, done.stderr)
+
+
+def test_every_case_has_a_name_of_its_own() -> None:
+    for cases in CATEGORIES.values():
+        assert len({case.name for case in cases}) == len(cases)
+    assert sum(len(cases) for cases in CATEGORIES.values()) >= 60
+
+
+def test_results_of_an_earlier_run_are_replaced_and_other_files_stay(place: Place) -> None:
+    (case,) = (case for case in CATEGORIES["results and rights"] if case.name == "results of an earlier run")
+    case.make(place)
+    assert CliRunner().invoke(run.app, arguments(place)).exit_code == 0
+    assert (place.out / "notes.txt").read_text() == "of an earlier run"
+    stamps = [f"{float(line.split()[0]):.6f}.png" for line in (place.out / "trajectory.txt").read_text().splitlines()]
+    assert sorted(path.name for path in (place.out / "masks").iterdir()) == stamps
+
+
+def test_nothing_that_a_run_writes_is_left_for_the_next(place: Place) -> None:
+    """Whoever adds a file to the results adds it to what `prepare_folder` removes."""
+    from v3d_torch.earlier_results import prepare_folder
+
+    assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks", "--mesh"]).exit_code == 0
+    assert CliRunner().invoke(report.app, [str(place.out)]).exit_code == 0
+    assert len(list(place.out.iterdir())) > 10
+    prepare_folder(place.out)
+    assert [path.name for path in place.out.iterdir()] == ["run.log"]

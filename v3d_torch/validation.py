@@ -1,0 +1,15 @@
+"""What a model refuses, in words."""
+
+from __future__ import annotations
+
+import reprlib
+
+from pydantic import ValidationError
+
+
+def first_error(error: ValidationError) -> str:
+    """The first of the values that a model refuses: its key, the rule and the value, cut where it is long."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"]) or "the whole"
+    rule = "input should be a valid dictionary of keys" if first["type"] == "model_type" else first["msg"].lower()
+    return f"{key}: {rule}, got {reprlib.repr(first['input'])}"
