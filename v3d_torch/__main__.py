@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from v3d_torch import ablate, batch, evaluate, record, report, run
+from v3d_torch import ablate, batch, evaluate, record, report, reproduce, run
 
-COMMANDS: tuple[ModuleType, ...] = (run, batch, evaluate, ablate, record, report)
+COMMANDS: tuple[ModuleType, ...] = (run, batch, evaluate, ablate, reproduce, record, report)
 """Modules with one command each, which ``python -m v3d_torch.run`` and so on call as well."""
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, no_args_is_help=True)
