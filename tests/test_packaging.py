@@ -23,6 +23,7 @@ PACKAGE = Path(v3d_torch.__file__).parent
 ROOT = PACKAGE.parent
 SOURCES = (
     *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "constraints.txt"),
+    "mkdocs.yml",
     *("v3d_torch", "tests", "benchmarks", "notebooks", "docs"),
 )
 """What a source archive is made of: a checkout without what builds and runs have left in it."""
