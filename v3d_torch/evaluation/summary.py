@@ -66,16 +66,20 @@ def latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
 
 
 def csv_text(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """All figures, unrounded, a line per metric, sequence and method; see `error_tables`."""
+    """All figures, unrounded, a line per metric, sequence and method; see `error_tables`.
+
+    The last column is the standard deviation that the paper gives as well: the median over the seeds.
+    """
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["metric", "sequence", "method", "median", "lowest", "highest", "seeds", "failed"])
+    writer.writerow(["metric", "sequence", "method", "median", "lowest", "highest", "seeds", "failed", "sd"])
     for metric, place in PLACES.items():
         for result in _results(outcomes, metric, None, absent):
             values = result.values
             figures = [median(values), min(values), max(values)] if values else [None] * 3
             counts = [result.seeds, result.failed] if result.seeds else [None] * 2
-            writer.writerow([place, result.sequence, result.method, *figures, *counts])
+            deviation = median(result.deviations) if result.deviations else None
+            writer.writerow([place, result.sequence, result.method, *figures, *counts, deviation])
     return text.getvalue()
 
 
@@ -86,7 +90,10 @@ def screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> li
 
 @dataclass(frozen=True)
 class _Result:
-    """One metric of a method on a sequence; ``seeds`` is 0 for what the paper says and where there is no sequence."""
+    """One metric of a method on a sequence; ``seeds`` is 0 for what the paper says and where there is no sequence.
+
+    ``values`` are root mean squares, ``deviations`` the standard deviations of the same errors.
+    """
 
     sequence: str
     method: str
@@ -94,6 +101,7 @@ class _Result:
     seeds: int = 0
     failed: int = 0
     absent: bool = False
+    deviations: Sequence[float] = ()
 
     @property
     def text(self) -> str:
@@ -115,12 +123,13 @@ def _results(
             runs = [run for run in outcomes if (run.sequence, run.config) == (sequence, config)]
             failed = sum(run.failure is not None for run in runs)
             values = values_of(runs, PLACES[metric])
-            results.append(_Result(sequence, config, values, len(runs), failed, absent=sequence in absent))
+            sds = values_of(runs, PLACES[metric].replace("rmse", "std"))
+            results.append(_Result(sequence, config, values, len(runs), failed, sequence in absent, sds))
         if (named := paper_sequence(sequence)) is not None:
             for method, score in paper_scores()[metric][named].items():
                 if papers is None or method in papers:
-                    values = [score.rmse] if score.rmse is not None else []
-                    results.append(_Result(sequence, f"{method} (paper)", values))
+                    values, sds = ([figure] if figure is not None else [] for figure in score)
+                    results.append(_Result(sequence, f"{method} (paper)", values, deviations=sds))
     return results
 
 
