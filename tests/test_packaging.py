@@ -97,7 +97,7 @@ def test_the_source_archive_can_be_tested(built: tuple[Path, Path, Path]) -> Non
     with tarfile.open(built[0]) as archive:
         held = {name.partition("/")[2] for name in archive.getnames()}
     tests = {f"tests/{path.name}" for path in (ROOT / "tests").glob("*.py")}
-    assert tests | {"constraints.txt", "CITATION.cff", "CHANGELOG.md", "LICENSE"} <= held
+    assert tests | {"constraints.txt", "CITATION.cff", "CHANGELOG.md", "LICENSE", "mkdocs.yml", "docs/index.md"} <= held
     assert not [name for name in held if re.search(r"__pycache__|\.pyc$|^results|^build", name)]
 
 
