@@ -189,6 +189,9 @@ def test_the_study_has_all_variants_and_the_tables_the_three_that_were_asked_for
     for name in ("summary.tex", "ablation.tex"):
         text = (out / name).read_text()
         assert text.startswith("% \\usepackage{booktabs}") and "not here" in text
+    assert (
+        "geometric mean" in (out / "ablation.md").read_text() and "geometric mean" in (out / "ablation.tex").read_text()
+    )
     rows = list(csv.DictReader((out / "ablation.csv").open(newline="")))
     assert len(rows) == len(pretended) and {row["variant"] for row in rows} == set(VARIANTS)
     assert "times full" in result.stdout

@@ -34,6 +34,12 @@ PAPER_SAYS = (
 PAPER_TIMES_FULL: Mapping[str, float] = {"baseline": 4 / 0.92, "no_voting": 4.0, "no_chamfer": 1.06, FULL: 1.0}
 """How many times the full system's ATE a variant has, by what the paper says."""
 
+TIMES_FULL = (
+    "Times full: the ATE as a multiple of the full system's, geometric mean over the sequences that both were run on;"
+    " (paper): by what it says."
+)
+"""What is to be known to read the last rows of `overview`."""
+
 
 class Column(NamedTuple):
     """A figure of the tables: its heading, how a value is written, and whether it is an error, the lowest the best."""

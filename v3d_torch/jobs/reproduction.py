@@ -107,9 +107,10 @@ class Reproduction(Record):
         write_text(self.folder / "summary.tex", latex(self._in_tables, self._absent))
         write_text(self.folder / "summary.csv", csv_text(self._in_tables, self._absent))
         if (table := ablation.overview(self._in_study, self._absent)) is not None:
-            document = [ablation.markdown(self._in_study), *markdown_table(table)]
+            document = [ablation.markdown(self._in_study), *markdown_table(table), "", ablation.TIMES_FULL]
+            legend = f"{LEGEND} {ablation.TIMES_FULL}"
             write_text(self.folder / "ablation.md", "\n".join(document) + "\n")
-            write_text(self.folder / "ablation.tex", "\n".join([PACKAGES, *latex_table(table, LEGEND)]) + "\n")
+            write_text(self.folder / "ablation.tex", "\n".join([PACKAGES, *latex_table(table, legend)]) + "\n")
             write_text(self.folder / "ablation.csv", ablation.csv_text(self._in_study))
 
     def tables(self) -> list[Table]:
