@@ -21,7 +21,7 @@ def runs(sequence: str, config: str, *ates: float | None) -> list[Outcome]:
     def metrics(ate: float | None) -> dict[str, Any]:
         if ate is None:
             return {}
-        return {"ate": {"rmse": ate}, "rpe": {"trans": {"rmse": ate / 10}, "rot": {"rmse": ate * 100}}}
+        return {"ate": {"rmse": ate, "std": ate / 2}, "rpe": {"trans": {"rmse": ate / 10}, "rot": {"rmse": ate * 100}}}
 
     return [
         Outcome(sequence, config, seed, metrics(ate), "it | broke" if ate is None else None)
@@ -119,13 +119,14 @@ def test_csv_has_the_figures_unrounded() -> None:
     assert len(ours) == len(table) == 3 * (2 * 2 + 8)
     row = ours["ate.rmse", "fr3/w/xyz", "full"]
     assert [float(row[name]) for name in ("median", "lowest", "highest")] == [0.012, 0.010, 0.0151]
-    assert (row["seeds"], row["failed"]) == ("3", "0")
+    assert (row["seeds"], row["failed"], float(row["sd"])) == ("3", "0", 0.006)
     row = ours["rpe.rot.rmse", "fr3/w/xyz", "base_line"]
     assert [float(row[name]) for name in ("median", "lowest", "highest")] == [40, 30, 50]
     assert (row["seeds"], row["failed"]) == ("3", "1")
     assert ours["ate.rmse", "my & [own]", "base_line"]["median"] == ""
     paper = ours["ate.rmse", "fr3/w/xyz", "V3D-SLAM (paper)"]
-    assert float(paper["median"]) == 0.0153 and paper["seeds"] == ""
+    assert float(paper["median"]) == 0.0153 and float(paper["sd"]) == 0.0080 and paper["seeds"] == ""
+    assert ours["ate.rmse", "fr3/w/xyz", "TRS (paper)"]["sd"] == ""  # the paper has a dash
 
 
 def test_the_screen_fits_and_brackets_are_no_markup() -> None:

@@ -17,9 +17,12 @@ class PinholeCamera:
     """Intrinsics of an RGB-D camera whose depth is registered to its colour image.
 
     Args:
-        fx, fy: focal lengths, pixels.
-        cx, cy: principal point, pixels; pixel centres lie at integers.
-        width, height: image size, pixels.
+        fx: focal length along u, pixels.
+        fy: focal length along v, pixels.
+        cx: u of the principal point, pixels; pixel centres lie at integers.
+        cy: v of the principal point, pixels.
+        width: columns of the images, pixels.
+        height: rows of the images, pixels.
         distortion: k1, k2, p1, p2, k3 of the Brown model in OpenCV's order.
         depth_scale: units of the depth image per metre (TUM: 5000).
     """

@@ -23,6 +23,11 @@ from v3d_torch.files import write_text
 from v3d_torch.segmentation import held_upright, make_source
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
+_NOTE = (
+    "The network ran once for each sequence and all runs were in one process: the times and the memory in their"
+    " metrics.json are not those of a run alone."
+)
+
 
 class SegmentOnce:
     """Keeps what a segmenter says of each frame of a sequence, and says the same, bit for bit, when asked again.
@@ -82,7 +87,7 @@ def run_study(
                 metrics, failure = _run(sequence, segment, config, place, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 console.print(str(outcomes[-1]), markup=False)
-                write_text(folder / "ablation.md", markdown(outcomes))
+                write_text(folder / "ablation.md", markdown(outcomes, _NOTE))
                 write_text(folder / "ablation.csv", csv_text(outcomes))
             console.print(screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
     except KeyboardInterrupt as interrupt:

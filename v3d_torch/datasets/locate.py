@@ -29,14 +29,9 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
     """
     if not name:
         raise InputError("the name of the sequence is empty; give a name, a folder or a file")
-    with suppress(RuntimeError):  # ~somebody who is not known here
-        if (path := Path(name).expanduser()).exists():
-            return path
-    full_name = canonical_name(name)
-    search = data_folder(data_root)
-    for root in (search, cache_dir()):
-        if found := _find(root, name, full_name):
-            return found
+    if (found := stored_path(name, data_root)) is not None:
+        return found
+    full_name, search = canonical_name(name), data_folder(data_root)
     if full_name is None:
         raise unknown_name(name)
     put = f"by hand, unpack it and put the folder {full_name} into {search}"
@@ -46,6 +41,15 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
         return _download(full_name, data_root or cache_dir(), progress)
     except DownloadError as error:
         raise DownloadError(f"{short_name(full_name)} is not in {search}: {error}; get that file {put}") from error
+
+
+def stored_path(name: str, data_root: Path | None) -> Path | None:
+    """The folder or file of a sequence that is here, looked for as `sequence_path` does; None where there is none."""
+    with suppress(RuntimeError):  # ~somebody who is not known here
+        if (path := Path(name).expanduser()).exists():
+            return path
+    found = (_find(root, name, canonical_name(name)) for root in (data_folder(data_root), cache_dir()))
+    return next((path for path in found if path is not None), None)
 
 
 def data_folder(data_root: Path | None) -> Path:

@@ -27,7 +27,9 @@ class SourceOptions:
     """What a user may say of a source that does not say it itself.
 
     Args:
-        rgb_topic, depth_topic, info_topic: of a bag: its colour images, depth images and camera; None guesses.
+        rgb_topic: of a bag's colour images; None guesses.
+        depth_topic: of its depth images; None guesses.
+        info_topic: of its camera; None guesses.
         fps: frames a second, of images whose names are no times, or asked of a live camera.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
-from statistics import median
+from statistics import geometric_mean, median
 from typing import NamedTuple
 
 from rich.markup import escape
@@ -13,7 +13,10 @@ from rich.table import Table
 
 from v3d_torch.config_file import FULL
 from v3d_torch.evaluation.cells import Cell, row, shown_lowest, spread
+from v3d_torch.evaluation.layout import ErrorTable
 from v3d_torch.evaluation.outcome import Outcome, values_of
+from v3d_torch.evaluation.summary import error_tables
+from v3d_torch.evaluation.tables import HEADINGS
 
 VARIANTS = ("baseline", "no_voting", "no_chamfer", "no_bridging", "no_unnamed", "as_held", "paper", FULL)
 """Names of the configurations that are compared (`v3d_torch.config_file.CONFIGS`), the whole system last."""
@@ -27,6 +30,15 @@ PAPER_SAYS = (
     "The paper (Sec. IV-D) gives no table but says of the ATE: without voting 8 % better than the baseline and four"
     " times that of the full system; without the intra-object stage (Chamfer) 6 % worse than the full system."
 )
+
+PAPER_TIMES_FULL: Mapping[str, float] = {"baseline": 4 / 0.92, "no_voting": 4.0, "no_chamfer": 1.06, FULL: 1.0}
+"""How many times the full system's ATE a variant has, by what the paper says."""
+
+TIMES_FULL = (
+    "Times full: the ATE as a multiple of the full system's, geometric mean over the sequences that both were run on;"
+    " (paper): by what it says."
+)
+"""What is to be known to read the last rows of `overview`."""
 
 
 class Column(NamedTuple):
@@ -64,17 +76,14 @@ def screen_table(outcomes: Sequence[Outcome]) -> Table:
     return table
 
 
-def markdown(outcomes: Sequence[Outcome]) -> str:
-    """All outcomes as a document: a table for each sequence, the best of each error in bold, and what failed."""
-    lines = [
-        "# Ablation",
-        LEGEND,
-        "",
-        PAPER_SAYS,
-        "",
-        "The network ran once for each sequence and all runs were in one process: the times and the memory in their"
-        " metrics.json are not those of a run alone.",
-    ]
+def markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
+    """All outcomes as a document: a table for each sequence, the best of each error in bold, and what failed.
+
+    Args:
+        outcomes: of the runs.
+        note: on how they were made.
+    """
+    lines = ["# Ablation", LEGEND, "", PAPER_SAYS, "", *([note] if note else [])]
     for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
         headings, rows = _summary(runs)
@@ -84,6 +93,39 @@ def markdown(outcomes: Sequence[Outcome]) -> str:
             lines.append(row([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
         lines += ["", *(f"- {run}" for run in runs if run.failure is not None)]
     return "\n".join(lines) + "\n"
+
+
+def overview(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTable | None:
+    """The ATE of all variants on all sequences, and how many times the full system's that is, beside the paper's word.
+
+    Args:
+        outcomes: of the runs.
+        absent: sequences of the paper that nothing could be run on, but that have their row.
+
+    Returns:
+        A column per variant. The last rows are the geometric mean, over the sequences that have both, of the ratio to
+        the full system's, and what the paper says of it. None where no run has an ATE.
+    """
+    tables = [table for table in error_tables(outcomes, papers=(), absent=absent) if table.heading == HEADINGS["ate"]]
+    if not tables:
+        return None
+    (ate,) = tables
+    paper = {variant: f"{PAPER_TIMES_FULL[variant]:.2f}" for variant in ate.methods if variant in PAPER_TIMES_FULL}
+    times = {
+        "times full": tuple(Cell(_times_full(outcomes, variant), best=False) for variant in ate.methods),
+        "times full (paper)": tuple(Cell(paper.get(variant, "-"), best=False) for variant in ate.methods),
+    }
+    return ErrorTable(f"Ablation: {ate.heading}", ate.methods, {**ate.rows, **times})
+
+
+def _times_full(outcomes: Sequence[Outcome], variant: str) -> str:
+    ratios = []
+    for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
+        measured = dict(_by_variant([run for run in outcomes if run.sequence == sequence], "ate.rmse"))
+        values, full = measured.get(variant), measured.get(FULL)
+        if values and full:
+            ratios.append(median(values) / median(full))
+    return f"{geometric_mean(ratios):.2f}" if ratios else "-"
 
 
 def csv_text(outcomes: Sequence[Outcome]) -> str:

@@ -11,7 +11,6 @@ from rich.console import Console
 from v3d_torch.console import interrupts_between_frames, open_sequences, progress_bars, result_folder, wide_console
 from v3d_torch.datasets.patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
-from v3d_torch.evaluation.summary import screen_tables
 from v3d_torch.jobs.bars import Bars
 from v3d_torch.jobs.cluster import Cluster
 from v3d_torch.jobs.executor import Ended, Executor
@@ -37,8 +36,7 @@ def run_batch(
         V3DError: on bad input, before the first run; or when the batch was interrupted or a run failed. What the others
             gave is written.
     """
-    if resume and out is None:
-        raise InputError("--resume: say with --out in which folder to go on")
+    refuse_resume_of_nothing(resume, out)
     console = wide_console()
     configs = read_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
     names = matching_sequences(patterns, data_root)
@@ -48,11 +46,33 @@ def run_batch(
     make_sure_of_networks(configs)
     folder = result_folder(out, "batch")
     record = Record(plan(sequences, configs, seeds=seeds, data_root=data_root, folder=folder), folder.absolute())
+    complete(record, executor, console, resume=resume)
+
+
+def refuse_resume_of_nothing(resume: bool, out: Path | None) -> None:
+    """Raise `InputError` where it is not said which folder to go on in."""
+    if resume and out is None:
+        raise InputError("--resume: say with --out in which folder to go on")
+
+
+def complete(record: Record, executor: Executor, console: Console, *, resume: bool) -> None:
+    """Carry out the runs that a record lacks, with everything shown and written.
+
+    Args:
+        record: of all runs, in the folder of the results.
+        executor: carries them out.
+        console: shows how far they are, and the tables at the end.
+        resume: whether the folder may hold runs.
+
+    Raises:
+        V3DError: the folder holds runs or cannot be written, the user interrupted, or a run failed.
+    """
+    folder = record.folder
     if record.outcomes and not resume:
         raise InputError(f"{folder}: holds runs of an earlier batch; go on with --resume, or choose another folder")
     record.write()  # a folder that cannot be written is told of now
     interrupted = _carry_out(record, executor, console)
-    for table in screen_tables(record.outcomes):
+    for table in record.tables():
         console.print(table)
     if record.failed:
         console.print("failed:", *map(str, record.failed), sep="\n", markup=False)

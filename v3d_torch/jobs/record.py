@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from rich.table import Table
+
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.summary import csv_text, latex, markdown
+from v3d_torch.evaluation.summary import csv_text, latex, markdown, screen_tables
 from v3d_torch.files import write_text
 from v3d_torch.jobs.executor import Ended
 from v3d_torch.jobs.job import Job
@@ -57,6 +59,14 @@ class Record:
         """
         ended = [(job, self._outcomes[job.folder]) for job in self.jobs if job.folder in self._outcomes]
         write_runs(self.folder / "runs.parquet", ended)
+        self.summarise()
+
+    def summarise(self) -> None:
+        """Write the summaries alone; errors as `write`."""
         write_text(self.folder / "summary.md", markdown(self.outcomes))
         write_text(self.folder / "summary.tex", latex(self.outcomes))
         write_text(self.folder / "summary.csv", csv_text(self.outcomes))
+
+    def tables(self) -> list[Table]:
+        """The summary for the screen."""
+        return screen_tables(self.outcomes)

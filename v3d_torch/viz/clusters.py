@@ -43,15 +43,28 @@ class Cluster:
 
 
 def clusters_figure(clusters: Sequence[Cluster], path: Path, title: str = "") -> None:
-    """Draw clouds before outlier rejection, what it rejects in black, and after it, seen from above the camera.
+    """Draw clouds before and after outlier rejection to a file, see `draw_clusters`.
 
     Args:
         clusters: at least one.
-        path: image to write.
+        path: image to write; the suffix (.png, .pdf, .svg) chooses the format.
         title: printed above.
 
     Raises:
         OutputError: when the file cannot be written.
+        ValueError: there is no cluster.
+    """
+    save(draw_clusters(clusters, title), path)
+
+
+def draw_clusters(clusters: Sequence[Cluster], title: str = "") -> Figure:
+    """Draw clouds before outlier rejection, what it rejects in black, and after it, seen from above the camera.
+
+    Args:
+        clusters: at least one.
+        title: printed above.
+
+    Raises:
         ValueError: there is no cluster.
     """
     if not clusters:
@@ -75,7 +88,7 @@ def clusters_figure(clusters: Sequence[Cluster], path: Path, title: str = "") ->
         for text, colour in zip([*(cluster.text for cluster in clusters), "rejected"], [*colours, BLACK], strict=True)
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
-    save(figure, path)
+    return figure
 
 
 def _scatter(axes: Axes3D, points: Tensor, colour: tuple[float, float, float, float], size: float) -> None:

@@ -27,6 +27,29 @@ def voting_figure(
     path: Path,
     title: str = "",
 ) -> None:
+    """Draw who voted for whom to a file, see `draw_voting`.
+
+    Args:
+        image: uint8 RGB, shape :math:`(3, H, W)`.
+        objects: by id: mask, text, verdict.
+        centres: by id: the centroid's pixel.
+        ballots: ids of who voted and for whom.
+        path: image to write; the suffix (.png, .pdf, .svg) chooses the format.
+        title: printed above.
+
+    Raises:
+        OutputError: when the file cannot be written.
+    """
+    save(draw_voting(image, objects, centres, ballots, title), path)
+
+
+def draw_voting(
+    image: Tensor,
+    objects: Mapping[int, Overlay],
+    centres: Mapping[int, Tensor],
+    ballots: Sequence[tuple[int, int]],
+    title: str = "",
+) -> Figure:
     """Draw who voted for whom: lines between centroids, which are coloured by verdict.
 
     Votes for what is dynamic are bold, red lines; votes for others, which came to nothing, are thin.
@@ -36,11 +59,7 @@ def voting_figure(
         objects: by id: mask (bool, shape :math:`(H, W)`), text, verdict (`VERDICT_COLOURS`).
         centres: by id: the centroid's pixel, (u, v), shape :math:`(2,)`; an object without one has no lines.
         ballots: ids of who voted and for whom; a vote that both gave each other is one line.
-        path: image to write.
         title: printed above.
-
-    Raises:
-        OutputError: when the file cannot be written.
     """
     height, width = image.shape[1:]
     figure = Figure(figsize=(8.0, 8.0 * height / width + 0.6), dpi=120, layout="constrained")
@@ -60,7 +79,7 @@ def voting_figure(
         axes.plot(*centre.tolist(), "o", color=colour, markeredgecolor="white", markersize=8, zorder=2.7)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), title=title)
     figure.legend(handles=_legend(objects, some_thin=bool(thin)), loc="outside lower center", ncols=6, frameon=False)
-    save(figure, path)
+    return figure
 
 
 def _legend(objects: Mapping[int, Overlay], *, some_thin: bool) -> list[Line2D]:

@@ -1,0 +1,101 @@
+"""The pages of the documentation: they are built without a warning, hold every public name, and need no network."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+import v3d_torch
+from v3d_torch.__main__ import COMMANDS
+
+ROOT = Path(v3d_torch.__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages; links that lead nowhere and references to names that are not there are warnings, and so errors."""
+    folder = tmp_path_factory.mktemp("docs") / "site"
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+class Page(HTMLParser):
+    """Ids, words, and what a browser fetches to show a page."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.ids: set[str] = set()
+        self.fetched: list[str] = []
+        self.words: list[str] = []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = {name: value or "" for name, value in attrs}
+        self.ids |= {given["id"]} if "id" in given else set()
+        where = given.get("href", "") if tag == "link" else given.get("src", "")
+        self.fetched += [where] if where else []
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join("".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def pages(site: Path) -> dict[str, Page]:
+    return {path.relative_to(site).as_posix(): Page(path) for path in site.rglob("*.html")}
+
+
+def test_every_public_name_is_described(pages: dict[str, Page]) -> None:
+    described = set().union(*(page.ids for page in pages.values()))
+    for name in v3d_torch.__all__:
+        thing = getattr(v3d_torch, name)
+        assert f"{thing.__module__}.{thing.__qualname__}" in described, name
+
+
+def test_nothing_is_fetched_from_elsewhere(pages: dict[str, Page]) -> None:
+    assert len(pages) > 20
+    for name, page in pages.items():
+        assert [where for where in page.fetched if re.match(r"(https?:)?//", where)] == [], name
+
+
+def test_formulas_are_drawn(site: Path, pages: dict[str, Page]) -> None:
+    for name, page in pages.items():
+        assert not re.search(r":math:|\.\. math::|\\frac|\\\(|\\\[|\$\$", page.text), name
+    for stage in ("depth", "voting", "chamfer", "evaluation"):
+        assert '<math xmlns="http://www.w3.org/1998/Math/MathML" display="block">' in (
+            site / "stages" / f"{stage}.html"
+        ).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__.rpartition(".")[2])
+def test_every_command_has_its_page_with_all_options(module: object, pages: dict[str, Page]) -> None:
+    name = module.__name__.rpartition(".")[2]
+    text = pages[f"commands/{name}.html"].text
+    for parameter in get_command(module.app).params:
+        if parameter.name != "help":
+            assert (max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else "") in text
+            assert " ".join((parameter.help or "").split()) in text
+
+
+def test_every_stage_of_the_system_is_linked(pages: dict[str, Page]) -> None:
+    stages = {path.stem for path in (ROOT / "docs" / "stages").glob("*.md")} - {"index"}
+    text = (ROOT / "docs" / "stages" / "index.md").read_text(encoding="utf-8")
+    assert {match[1] for match in re.finditer(r"\]\((\w+)\.md\)", text)} == stages
