@@ -201,6 +201,12 @@ def test_convention_the_correction_maps_the_old_world_to_the_new() -> None:
     assert (old[:3, 3] - new[:3, 3]).norm() > 0.05
 
 
+def test_a_place_that_shows_little_of_what_it_should_is_no_loop(closed: Walker) -> None:
+    """Nobody finds nearly all: of the landmarks some look away, some descriptors are worn."""
+    assert closed.closer.count > 0
+    assert walk_twice("loop.min_share=0.99").closer.count == 0
+
+
 def test_two_rooms_make_no_loop() -> None:
     walker = Walker()
     for room in (Room(seed=1), Room(seed=2)):

@@ -364,6 +364,9 @@ class LoopConfig(Section):
     """Keyframes nearer in time than this are no loop; nor is one looked for so soon after another."""
     min_inliers: int = Field(40, gt=0)
     """Inliers of the geometric verification."""
+    min_share: float = Field(0.15, ge=0, le=1)
+    """Share of the landmarks that the place should show of which so many must be inliers: with fewer a pose is less
+    sure than the drift that it would correct. A camera that is lost takes what there is."""
 
 
 class Config(Section):

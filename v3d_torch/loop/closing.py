@@ -104,7 +104,10 @@ class LoopCloser:
             return None
         near = sparse_map.shared(keyframe.landmarks[keyframe.landmarks >= 0]).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_gap, keyframe.index + 1)
-        return self.recognise(keyframe.features, sparse_map, {*near, *recent})
+        place = self.recognise(keyframe.features, sparse_map, {*near, *recent})
+        if place is None or place.tracking.count < self._config.min_share * len(place.tracking.visible):
+            return None
+        return place
 
     def _correct(self, sparse_map: SparseMap) -> None:
         T_cw = sparse_map.T_cw
