@@ -9,9 +9,10 @@ import sys
 import time
 from pathlib import Path
 
+from replay import Replay
+
 from contenders import OURS, PEERS
 from contenders.base import Contender
-from replay import Replay
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.trajectory import write_trajectory
 
