@@ -1,7 +1,7 @@
 """How fast the whole system is, beside other systems on the same frames, as Markdown.
 
-``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` lets all contenders take turns, in random order, each in
-a process of its own. What the times hold is said above the tables (`ABOUT`).
+``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` lets all contenders take turns, in random order, each
+in a process of its own. What the times hold is said above the tables (`ABOUT`).
 """
 
 from __future__ import annotations

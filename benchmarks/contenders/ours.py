@@ -8,7 +8,7 @@ import torch
 
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline import FrameCallback, Pipeline
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Trajectory
@@ -27,30 +27,37 @@ class Ours:
         sequence: to run on.
         name: one of `OVERRIDES`.
         seed: of every random choice.
+
+    Attributes:
+        slam: the system.
+        pipeline: that runs it.
     """
 
     def __init__(self, sequence: RGBDSequence, name: str, seed: int) -> None:
         config = load_config(overrides=[f"seed={seed}", *OVERRIDES[name]])
         torch.set_num_threads(config.threads)
         torch.manual_seed(seed)
-        self._slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
-        self._pipeline = Pipeline(sequence, self._slam)
+        self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
+        self.pipeline = Pipeline(sequence, self.slam)
 
     @property
     def stages(self) -> Mapping[str, float]:
         """Seconds by stage; of two that run side by side, each has its own."""
-        return self._slam.clock.seconds
+        return self.slam.clock.seconds
 
-    def __call__(self) -> None:
+    def __call__(self, on_frame: FrameCallback | None = None) -> None:
         """Take in all frames.
+
+        Args:
+            on_frame: called after each.
 
         Raises:
             RuntimeError: the run ended before the sequence did.
         """
-        failure = self._pipeline().failure
+        failure = self.pipeline(on_frame).failure
         if failure is not None:
             raise RuntimeError(failure)
 
     def trajectory(self) -> Trajectory:
         """A pose for every frame."""
-        return self._slam.poses.trajectory()
+        return self.slam.poses.trajectory()
