@@ -50,20 +50,22 @@ class TestReplay:
         assert torch.allclose(replay.stamps, sequence.stamps[:2], atol=1e-6, rtol=0)
 
 
+@pytest.fixture(scope="module")
+def patterns() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (60, 32), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def levels(patterns: np.ndarray) -> list[vocabulary.Level]:
+    """Of 60 patterns, each seen 30 times with about eight bits in error, the i-th in every (1 + i % 5)-th image."""
+    generator = np.random.default_rng(1)
+    seen = np.repeat(patterns, 30, axis=0)
+    flips = np.packbits(generator.random((len(seen), 256)) < 1 / 32, axis=1)
+    images = np.concatenate([np.arange(30) % (1 + i % 5) for i in range(60)])
+    return vocabulary.train(seen ^ flips, images)
+
+
 class TestVocabulary:
-    @pytest.fixture(scope="class")
-    def patterns(self) -> np.ndarray:
-        return np.random.default_rng(0).integers(0, 256, (60, 32), dtype=np.uint8)
-
-    @pytest.fixture(scope="class")
-    def levels(self, patterns: np.ndarray) -> list[vocabulary.Level]:
-        """Of 60 patterns, each seen 30 times with about eight bits in error, the i-th in every (1 + i % 5)-th image."""
-        generator = np.random.default_rng(1)
-        seen = np.repeat(patterns, 30, axis=0)
-        flips = np.packbits(generator.random((len(seen), 256)) < 1 / 32, axis=1)
-        images = np.concatenate([np.arange(30) % (1 + i % 5) for i in range(60)])
-        return vocabulary.train(seen ^ flips, images)
-
     def test_text_is_a_tree_as_dbow2_reads_it(self, levels: list[vocabulary.Level]) -> None:
         text = vocabulary.text(levels)
         assert not text.endswith("\n")  # the reader would take an empty line for a node
@@ -73,9 +75,7 @@ class TestVocabulary:
         for line in lines:
             parent, leaf, *numbers, weight = line.split(" ")
             assert len(numbers) == 32 and all(0 <= int(number) < 256 for number in numbers)
-            assert (
-                int(parent) < len(depth) and not leaves[int(parent)]
-            )  # the reader has seen it, and it may have children
+            assert int(parent) < len(depth) and not leaves[int(parent)]  # known to the reader, and no word
             children[int(parent)] += 1
             depth.append(depth[int(parent)] + 1)
             children.append(0)
@@ -135,13 +135,12 @@ def test_orbslam3_settings_hold_the_camera() -> None:
     from contenders.orbslam3 import settings
 
     camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
-    read = cv2.FileStorage(settings(camera, 30), cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
+    in_memory = cv2.FileStorage_READ | cv2.FileStorage_MEMORY
+    read = cv2.FileStorage(settings(camera, 30), in_memory)
     values = [read.getNode(f"Camera1.{name}").real() for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")]
     assert values == pytest.approx([517.3, 516.5, 318.6, 255.3, *camera.distortion])
     assert read.getNode("Camera.RGB").real() == 1 and read.getNode("RGBD.DepthMapFactor").real() == 1
-    ideal = cv2.FileStorage(
-        settings(PinholeCamera(500, 500, 320, 240), 5), cv2.FileStorage_READ | cv2.FileStorage_MEMORY
-    )
+    ideal = cv2.FileStorage(settings(PinholeCamera(500, 500, 320, 240), 5), in_memory)
     assert ideal.getNode("Camera1.k1").empty() and ideal.getNode("Camera.fps").real() == 5
 
 

@@ -14,6 +14,7 @@ from replay import Replay
 from contenders import OURS, PEERS
 from contenders.base import Contender
 from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.errors import V3DError
 from v3d_torch.trajectory import write_trajectory
 
 
@@ -58,9 +59,11 @@ def main() -> None:
         "stages": dict(contender.stages),
     }
     (options.out / "measured.json").write_text(json.dumps(figures), encoding="utf-8")
-    sys.stdout.flush()
     os._exit(0)  # without destructors: ORB-SLAM3's may crash, when all is done
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (V3DError, ImportError, RuntimeError) as error:
+        sys.exit(f"error: {error}")
