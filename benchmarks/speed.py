@@ -25,8 +25,9 @@ from v3d_torch.files import write_text
 REFERENCE = "pyorbslam3"
 CONTENDERS = (*OURS, *PEERS)
 ABOUT = (
-    "Each run is a process of its own. Times are from before the first frame is read until all is done: reading and"
-    " decoding of the images are in them; imports, loading of network or vocabulary, and writing of results are not."
+    "Each run is a process of its own. Times are from before the first frame is read until the last has a pose: reading"
+    " and decoding of the images are in them; imports, loading of network or vocabulary, what ORB-SLAM3's threads still"
+    " map after the last frame, and writing of results are not."
     " CPU time is that of all threads of the process, user and system. Ratios are to pyorbslam3's run of the same turn:"
     " above 1, more frames a second, or more CPU time. Values are the median [lowest-highest] of the turns."
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -18,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import accuracy
 import growth
 import speed
-from contenders import OURS, PEERS, vocabulary
+from contenders import OURS, vocabulary
 from contenders.process import ContenderError, Measured, measure
 from replay import Replay, forth_and_back
 
@@ -117,17 +118,16 @@ class TestProcess:
         assert torch.allclose(run.trajectory.T_wc[0], torch.eye(4, dtype=torch.float64))
 
     def test_a_failure_is_one_sentence(self, tmp_path: Path) -> None:
-        with pytest.raises(ContenderError, match="nowhere"):
+        with pytest.raises(ContenderError, match=r"^\S*nowhere: "):
             measure("v3d_torch --segmenter none", str(tmp_path / "nowhere"), tmp_path)
 
-    @pytest.mark.parametrize("peer", PEERS)
     def test_a_peer_that_is_not_installed_fails_with_its_name(
-        self, peer: str, moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        (tmp_path / f"{peer}.py").write_text(f"raise ImportError('no {peer} here')\n")
-        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-        with pytest.raises(ContenderError, match=f"no {peer} here"):
-            measure(peer, str(moment), moment.parent)
+        (tmp_path / "pyorbslam3.py").write_text("raise ImportError('no pyorbslam3 here')\n")
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+        with pytest.raises(ContenderError, match=r"^no pyorbslam3 here$"):
+            measure("pyorbslam3", str(moment), moment.parent)
 
 
 def test_orbslam3_settings_hold_the_camera() -> None:

@@ -16,7 +16,7 @@ class Contender(Protocol):
         """Seconds by stage, where the system tells them."""
 
     def __call__(self) -> None:
-        """Read and take in all frames of the sequence. This is what is timed."""
+        """Read and take in all frames of the sequence, until the last has a pose. This is what is timed."""
 
     def trajectory(self) -> Trajectory:
         """The poses it found, as they are after the last frame; frames that it lost may be left out."""

@@ -5,6 +5,7 @@ It runs as fast as it goes, without a window. Its threads make it give another t
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -42,10 +43,9 @@ class OrbSlam3:
             self._slam = pyorbslam3.Slam(vocabulary, path, pyorbslam3.Sensor.RGBD)
 
     def __call__(self) -> None:
-        """Track all frames, and wait for the threads that map and close loops."""
+        """Track all frames. What its threads still map then is not waited for."""
         for frame in self._sequence:
             self._slam.track_rgbd(frame.image.permute(1, 2, 0).numpy(), frame.depth[0].numpy(), frame.stamp)
-        self._slam.shutdown()
 
     def trajectory(self) -> Trajectory:
         """Poses of the frames in its largest map, after all its corrections.
@@ -53,6 +53,8 @@ class OrbSlam3:
         Where it loses the camera it begins a map with a world of its own. EuRoC's format leaves out all maps but the
         largest, TUM's mixes the worlds. No map makes no poses.
         """
+        self._slam.shutdown()
+        wait_for_threads()
         with TemporaryDirectory() as folder:
             path = Path(folder) / "trajectory.txt"
             self._slam.save_trajectory_euroc(str(path))
@@ -60,6 +62,15 @@ class OrbSlam3:
                 return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
             found = read_trajectory(path)
         return Trajectory(found.stamps / 1e9, found.T_wc)
+
+
+def wait_for_threads(pause: float = 0.5) -> None:
+    """Return when this process no longer computes: ``shutdown`` only asks the threads to end."""
+    busy = True
+    while busy:
+        before = time.process_time()
+        time.sleep(pause)
+        busy = time.process_time() - before > 0.02 * pause
 
 
 def frames_a_second(sequence: RGBDSequence) -> int:
