@@ -18,6 +18,7 @@ from contenders.process import ContenderError, Measured, measure
 from heading import heading
 from sequences import DATA_ROOT, located, trained_vocabulary
 
+from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import OutputError, V3DError
 from v3d_torch.evaluation.cells import row, spread
 from v3d_torch.files import write_text
@@ -130,6 +131,8 @@ def main() -> None:
     if options.runs < 1 or (options.frames is not None and options.frames < 2):
         parser.error("give at least --runs 1 and --frames 2")
     try:
+        for name in options.seqs:  # better now than as a failure of every contender
+            load_sequence(located(name, options.data_root), data_root=options.data_root)
         vocabulary = options.vocabulary or trained_vocabulary(options.seqs, options.data_root)
     except V3DError as error:
         parser.error(str(error))
