@@ -130,13 +130,13 @@ def main() -> None:
     options = parser.parse_args()
     if options.runs < 1 or (options.frames is not None and options.frames < 2):
         parser.error("give at least --runs 1 and --frames 2")
+    lines = [*heading(PEERS), "", ABOUT]
     try:
         for name in options.seqs:  # better now than as a failure of every contender
             load_sequence(located(name, options.data_root), data_root=options.data_root)
         vocabulary = options.vocabulary or trained_vocabulary(options.seqs, options.data_root)
     except V3DError as error:
         parser.error(str(error))
-    lines = [*heading(PEERS), "", ABOUT]
     order = random.Random(0)  # noqa: S311 (no secret)
     for sequence in dict.fromkeys(options.seqs):
         turns = [take_turn(sequence, options, vocabulary, order) for _ in range(options.runs)]
