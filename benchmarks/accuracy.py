@@ -20,17 +20,17 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import yaml
+from command import command_line, publish, takes_vocabulary
 from contenders import PEERS
 from contenders.process import ContenderError, failure, measure
 from heading import heading
-from sequences import DATA_ROOT, listed, located, trained_vocabulary
+from sequences import listed, located, trained_vocabulary
 
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import InputError, OutputError, V3DError
+from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.cells import row, spread
 from v3d_torch.evaluation.tables import paper_scores, paper_sequence
-from v3d_torch.files import write_text
 from v3d_torch.mapping.recorder import Status
 
 CONFIGURATIONS = {
@@ -178,20 +178,12 @@ def unique(items: Iterable[T]) -> list[T]:
 
 def arguments() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description="Accuracy on sequences in TUM layout, beside other systems, as Markdown."
-    )
-    parser.add_argument(
-        "--data-root", type=Path, default=DATA_ROOT, help="folder of sequences [$V3D_DATA, else ../shared/data]"
-    )
+    parser = command_line("Accuracy on sequences in TUM layout, beside other systems, as Markdown.")
     parser.add_argument("--seqs", nargs="+", help="names of sequences [every folder in --data-root that holds one]")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each, with seeds from 0 [3]")
     parser.add_argument("--configs", nargs="+", choices=CONFIGURATIONS, default=["full", "baseline"])
     parser.add_argument("--peers", nargs="+", choices=PEERS, default=[], help="other systems to run, too [none]")
-    parser.add_argument(
-        "--vocabulary", type=Path, help="of pyorbslam3, in DBoW2's text format [trained on the sequences]"
-    )
-    parser.add_argument("--out", type=Path, help="Markdown file to write, too")
+    takes_vocabulary(parser)
     return parser
 
 
@@ -233,13 +225,7 @@ def main() -> None:
         "",
         *notes(outcomes, known),
     ]
-    text = "\n".join(lines) + "\n"
-    print(text, end="")
-    if options.out is not None:
-        try:
-            write_text(options.out, text)
-        except OutputError as error:
-            parser.error(str(error))
+    publish(lines, options, parser)
 
 
 if __name__ == "__main__":

@@ -17,17 +17,17 @@ from statistics import fmean, median
 from typing import TypeVar
 
 import torch
+from command import command_line, publish
 from contenders.ours import Ours
 from heading import heading
 from replay import Replay, forth_and_back
-from sequences import DATA_ROOT, located
+from sequences import located
 from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.datasets import RGBDSequence, load_sequence
-from v3d_torch.errors import OutputError, V3DError
+from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.cells import row
-from v3d_torch.files import write_text
 from v3d_torch.lie import invert, se3_exp
 from v3d_torch.loop.places import PlaceIndex
 from v3d_torch.loop.pose_graph import optimise_pose_graph
@@ -152,14 +152,10 @@ def clocked(make: Callable[[], Made]) -> tuple[float, Made]:
 
 def arguments() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(description="Time and memory of a long run and of many keyframes, as Markdown.")
-    parser.add_argument(
-        "--data-root", type=Path, default=DATA_ROOT, help="folder of sequences [$V3D_DATA, else ../shared/data]"
-    )
+    parser = command_line("Time and memory of a long run and of many keyframes, as Markdown.")
     parser.add_argument("--seq", default="demo", help="sequence to play forth and back [demo]")
     parser.add_argument("--frames", type=int, default=5000, help="frames of the run [5000]")
     parser.add_argument("--keyframes", type=int, default=5000, help="most keyframes that are made up [5000]")
-    parser.add_argument("--out", type=Path, help="Markdown file to write, too")
     return parser
 
 
@@ -176,13 +172,7 @@ def main() -> None:
     except V3DError as error:
         parser.error(str(error))
     lines += ["", "## Keyframes that are made up", "", *many_keyframes(options.keyframes)]
-    text = "\n".join(lines) + "\n"
-    print(text, end="")
-    if options.out is not None:
-        try:
-            write_text(options.out, text)
-        except OutputError as error:
-            parser.error(str(error))
+    publish(lines, options, parser)
 
 
 if __name__ == "__main__":

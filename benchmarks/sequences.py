@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from contenders.vocabulary import vocabulary
 
 from v3d_torch.datasets import load_sequence
-
-DATA_ROOT = Path(os.environ.get("V3D_DATA", "../shared/data"))
 
 
 def listed(data_root: Path) -> list[str]:

@@ -13,15 +13,15 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from command import command_line, publish, takes_vocabulary
 from contenders import OURS, PEERS
 from contenders.process import ContenderError, Measured, measure
 from heading import heading
-from sequences import DATA_ROOT, located, trained_vocabulary
+from sequences import located, trained_vocabulary
 
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import OutputError, V3DError
+from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.cells import row, spread
-from v3d_torch.files import write_text
 
 REFERENCE = "pyorbslam3"
 CONTENDERS = (*OURS, *PEERS)
@@ -110,17 +110,11 @@ def failures(turns: Sequence[Turn]) -> Iterator[str]:
 
 def arguments() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(description="Speed of the whole system beside others', as Markdown.")
-    parser.add_argument(
-        "--data-root", type=Path, default=DATA_ROOT, help="folder of sequences [$V3D_DATA, else ../shared/data]"
-    )
+    parser = command_line("Speed of the whole system beside others', as Markdown.")
     parser.add_argument("--seqs", nargs="+", required=True, help="names of sequences")
     parser.add_argument("--runs", type=int, default=5, help="turns of all contenders on each sequence [5]")
     parser.add_argument("--frames", type=int, help="frames of each sequence, from the first [all]")
-    parser.add_argument(
-        "--vocabulary", type=Path, help="of pyorbslam3, in DBoW2's text format [trained on the sequences]"
-    )
-    parser.add_argument("--out", type=Path, help="Markdown file to write, too")
+    takes_vocabulary(parser)
     return parser
 
 
@@ -141,13 +135,7 @@ def main() -> None:
     for sequence in dict.fromkeys(options.seqs):
         turns = [take_turn(sequence, options, vocabulary, order) for _ in range(options.runs)]
         lines += ["", f"## {sequence}", "", *speed_table(turns), "", *stage_table(turns), "", *failures(turns)]
-    text = "\n".join(lines).rstrip() + "\n"
-    print(text, end="")
-    if options.out is not None:
-        try:
-            write_text(options.out, text)
-        except OutputError as error:
-            parser.error(str(error))
+    publish(lines, options, parser)
 
 
 if __name__ == "__main__":
