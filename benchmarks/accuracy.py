@@ -1,36 +1,36 @@
 """Accuracy of the whole system on sequences in TUM layout, beside other systems' figures, as Markdown.
 
 ``python benchmarks/accuracy.py`` runs ``python -m v3d_torch.run`` for each sequence, configuration and seed, one after
-the other, so that no run slows another. A run that fails is shown with its sentence. The other systems' figures are
-those of ``peers.yaml`` and, on the paper's sequences, those of its tables.
+the other, so that no run slows another. A run that fails is shown with its sentence. ``--peers`` runs other systems on
+the same frames. The figures of those that are not rerun come from ``peers.yaml`` and, on the paper's sequences, from
+its tables.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import re
-import shlex
-import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import yaml
+from command import command_line, publish, takes_vocabulary
+from contenders import PEERS
+from contenders.process import ContenderError, failure, measure
+from heading import heading
+from sequences import listed, located, trained_vocabulary
 
-import v3d_torch
-from v3d_torch.errors import OutputError
+from v3d_torch.datasets import load_sequence
+from v3d_torch.errors import InputError, V3DError
+from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.cells import row, spread
 from v3d_torch.evaluation.tables import paper_scores, paper_sequence
-from v3d_torch.files import write_text
 from v3d_torch.mapping.recorder import Status
 
 CONFIGURATIONS = {
@@ -38,7 +38,6 @@ CONFIGURATIONS = {
     "baseline": ["--segmenter", "none"],
     "paper": ["--config", "paper"],
 }
-LIBRARIES = ("torch", "kornia", "onnxruntime")
 
 T = TypeVar("T")
 
@@ -56,7 +55,8 @@ class Outcome:
     @property
     def ate(self) -> float | None:
         """RMSE in metres; None where the run failed or could not be scored."""
-        return self.metrics["ate"]["rmse"] if self.metrics and "ate" in self.metrics else None
+        score = self.metrics.get("ate") if self.metrics else None
+        return score["rmse"] if score else None
 
     def __str__(self) -> str:
         """One line for whoever waits."""
@@ -69,8 +69,7 @@ class Outcome:
 
 def run(sequence: str, configuration: str, seed: int, data_root: Path) -> Outcome:
     """Run the system once, in a process and a temporary folder of its own."""
-    folder = data_root / sequence
-    source = ["--seq", str(folder) if folder.is_dir() else sequence, "--data-root", str(data_root)]
+    source = ["--seq", located(sequence, data_root), "--data-root", str(data_root)]
     with TemporaryDirectory() as out:
         # -P: the package imported here, whose commit heads the table, not one that the working folder may hold.
         command = [sys.executable, "-P", "-m", "v3d_torch.run", *source, "--seed", str(seed), "--out", out]
@@ -82,46 +81,30 @@ def run(sequence: str, configuration: str, seed: int, data_root: Path) -> Outcom
     return Outcome(sequence, configuration, seed, metrics)
 
 
-def failure(done: subprocess.CompletedProcess[str]) -> str:
-    """The sentence that a failed run ended with."""
-    if done.returncode < 0:
-        return f"killed by {signal.Signals(-done.returncode).name}"
-    lines = done.stderr.strip().splitlines()
-    return lines[-1].removeprefix("error: ") if lines else f"exit code {done.returncode} without a word"
-
-
-def heading() -> Iterator[str]:
-    """What was run, of which commit, when and on what."""
-    yield f"`{shlex.join(['python', 'benchmarks/accuracy.py', *sys.argv[1:]])}`"
-    yield ""
-    yield f"- commit {commit()}, {datetime.now().astimezone():%Y-%m-%d}"
-    yield f"- {processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the first run"
-    yield f"- Python {platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in LIBRARIES)
-
-
-def commit() -> str:
-    """Of the package's checkout, with ``-dirty`` when tracked files differ from it."""
-    # --exclude: no tag instead of the hash. No optional locks: someone may be about to commit.
-    command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--exclude", "*"]
+def run_peer(sequence: str, peer: str, turn: int, data_root: Path, vocabulary: Path | None) -> Outcome:
+    """Run another system once on the same frames, and score it as ours is."""
     try:
-        folder = Path(v3d_torch.__file__).parent
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown (not a git checkout)"
-
-
-def processor() -> str:
-    """Model of the processor."""
-    cpuinfo = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.is_file() else None
-    return found[1] if found else platform.processor() or platform.machine()
+        measured = measure(peer, located(sequence, data_root), data_root, vocabulary=vocabulary)
+        truth = load_sequence(located(sequence, data_root), data_root=data_root).groundtruth
+    except (ContenderError, V3DError) as error:
+        return Outcome(sequence, peer, turn, None, str(error))
+    poses = 0 if measured.trajectory is None else len(measured.trajectory)
+    metrics: dict[str, Any] = {
+        "frames": measured.frames,
+        "fps": measured.frames / measured.seconds,
+        "coverage": poses / measured.frames,
+    }
+    if truth is not None and measured.trajectory is not None:
+        with suppress(InputError):  # too few poses to score
+            metrics |= evaluate(truth, measured.trajectory, frames=measured.frames).to_dict()
+    return Outcome(sequence, peer, turn, metrics)
 
 
 def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root: Path) -> Iterator[str]:
-    """A row per sequence: ATE of each configuration, then of the peers that have a figure for any sequence."""
+    """A row per sequence: ATE of each configuration and peer that ran, then the known figures of those that did not."""
     sequences = unique(outcome.sequence for outcome in outcomes)
     configurations = unique(outcome.configuration for outcome in outcomes)
-    peers = {sequence: peer_scores(sequence, known) for sequence in sequences}
+    peers = {sequence: known_scores(sequence, known) for sequence in sequences}
     columns = unique(name for scores in peers.values() for name in scores)
     yield row(["sequence", "what", "frames", *configurations, *columns])
     yield row(["---"] * 2 + ["---:"] * (1 + len(configurations) + len(columns)))
@@ -141,7 +124,7 @@ def runs_table(outcomes: Sequence[Outcome]) -> Iterator[str]:
         runs = [o for o in outcomes if (o.sequence, o.configuration) == (sequence, configuration)]
         metrics = [outcome.metrics for outcome in runs if outcome.metrics is not None]
         failed = f"{len(runs) - len(metrics)} of {len(runs)}"
-        statuses = [spread([m[status] for m in metrics], ".0f") for status in Status]
+        statuses = [spread([m[status] for m in metrics if status in m], ".0f") for status in Status]
         coverage = spread([m["coverage"] for m in metrics if "coverage" in m], ".1%")
         fps = spread([m["fps"] for m in metrics], ".1f")
         yield row([sequence, configuration, failed, *statuses, coverage, fps])
@@ -161,12 +144,13 @@ def notes(outcomes: Sequence[Outcome], known: dict[str, Any]) -> Iterator[str]:
         yield f"- {known['about']}"
 
 
-def peer_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
-    """ATE RMSE in metres by system."""
+def known_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
+    """ATE RMSE in metres by system, as it was measured elsewhere."""
     if (paper := paper_sequence(sequence)) is not None:
         scores = paper_scores()["ate"][paper]
         return {f"{name} (paper)": f"{score.rmse:.4f}" for name, score in scores.items() if score.rmse is not None}
-    return known["sequences"].get(Path(sequence).name, {}).get("ate", {})
+    scores = known["sequences"].get(Path(sequence).name, {}).get("ate", {})
+    return {f"{name} (not rerun)": score for name, score in scores.items()}
 
 
 def description(sequence: str, known: dict[str, Any], data_root: Path) -> str:
@@ -194,17 +178,12 @@ def unique(items: Iterable[T]) -> list[T]:
 
 def arguments() -> argparse.ArgumentParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description="Accuracy on sequences in TUM layout, beside other systems, as Markdown."
-    )
-    data = Path(os.environ.get("V3D_DATA", "../shared/data"))
-    parser.add_argument(
-        "--data-root", type=Path, default=data, help="folder of sequences [$V3D_DATA, else ../shared/data]"
-    )
+    parser = command_line("Accuracy on sequences in TUM layout, beside other systems, as Markdown.")
     parser.add_argument("--seqs", nargs="+", help="names of sequences [every folder in --data-root that holds one]")
     parser.add_argument("--seeds", type=int, default=3, help="runs of each, with seeds from 0 [3]")
     parser.add_argument("--configs", nargs="+", choices=CONFIGURATIONS, default=["full", "baseline"])
-    parser.add_argument("--out", type=Path, help="Markdown file to write, too")
+    parser.add_argument("--peers", nargs="+", choices=PEERS, default=[], help="other systems to run, too [none]")
+    takes_vocabulary(parser)
     return parser
 
 
@@ -212,10 +191,7 @@ def main() -> None:
     """Run everything that the command line asks for, and print the tables."""
     parser = arguments()
     options = parser.parse_args()
-    listed = {
-        path.parent.name for name in ("rgb.txt", "associations.txt") for path in options.data_root.glob(f"*/{name}")
-    }
-    sequences = unique(options.seqs or sorted(listed))
+    sequences = unique(options.seqs or listed(options.data_root))
     if options.seeds < 1:
         parser.error("--seeds: at least one run is needed")
     if not sequences:
@@ -223,12 +199,22 @@ def main() -> None:
             f"{options.data_root}: holds no sequence (a folder with rgb.txt or associations.txt); see --data-root"
         )
 
-    lines = [*heading(), ""]
+    lines = [*heading(options.peers), ""]
+    vocabulary = options.vocabulary
+    if vocabulary is None and "pyorbslam3" in options.peers:
+        try:
+            vocabulary = trained_vocabulary(sequences, options.data_root)
+        except V3DError as error:
+            parser.error(str(error))
     outcomes = []
     for sequence in sequences:
         for configuration in unique(options.configs):
             for seed in range(options.seeds):
                 outcomes.append(run(sequence, configuration, seed, options.data_root))
+                print(outcomes[-1], file=sys.stderr)
+        for peer in unique(options.peers):
+            for turn in range(options.seeds):
+                outcomes.append(run_peer(sequence, peer, turn, options.data_root, vocabulary))
                 print(outcomes[-1], file=sys.stderr)
     known = yaml.safe_load(Path(__file__).with_name("peers.yaml").read_text(encoding="utf-8"))
     lines += ["ATE RMSE in metres; of several seeds, the median [lowest-highest].", ""]
@@ -239,13 +225,7 @@ def main() -> None:
         "",
         *notes(outcomes, known),
     ]
-    text = "\n".join(lines) + "\n"
-    print(text, end="")
-    if options.out is not None:
-        try:
-            write_text(options.out, text)
-        except OutputError as error:
-            parser.error(str(error))
+    publish(lines, options, parser)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,69 @@
+"""One contender on one sequence: ``python -m contenders.child pyorbslam3 --seq ... --out FOLDER``, see `process`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from replay import Replay
+
+from contenders import OURS, PEERS
+from contenders.base import Contender
+from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.errors import V3DError
+from v3d_torch.trajectory import write_trajectory
+
+
+def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> Contender:
+    """Load a contender; only its own libraries are imported."""
+    if name in OURS:
+        from contenders.ours import Ours
+
+        return Ours(sequence, name, seed)
+    if name == "pyorbslam3":
+        from contenders.orbslam3 import OrbSlam3
+
+        return OrbSlam3(sequence, vocabulary)
+    from contenders.open3d_odometry import Open3DOdometry
+
+    return Open3DOdometry(sequence)
+
+
+def main() -> None:
+    """Run it, and write its trajectory and its times."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("contender", choices=[*OURS, *PEERS])
+    parser.add_argument("--seq", required=True)
+    parser.add_argument("--data-root", type=Path)
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--vocabulary", type=Path)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+
+    sequence = load_sequence(options.seq, data_root=options.data_root)
+    sequence = Replay(sequence, range(min(options.frames or len(sequence), len(sequence))))
+    contender = prepare(options.contender, sequence, options.seed, options.vocabulary)
+    start, cpu_start = time.perf_counter(), time.process_time()
+    contender()
+    seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
+    write_trajectory(options.out / "trajectory.txt", contender.trajectory())
+    figures = {
+        "frames": len(sequence),
+        "seconds": seconds,
+        "cpu_seconds": cpu_seconds,
+        "stages": dict(contender.stages),
+    }
+    (options.out / "measured.json").write_text(json.dumps(figures), encoding="utf-8")
+    os._exit(0)  # without destructors: ORB-SLAM3's may crash, when all is done
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (V3DError, ImportError, RuntimeError) as error:
+        sys.exit(f"error: {error}")

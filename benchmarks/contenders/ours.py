@@ -1,0 +1,63 @@
+"""This package, as ``python -m v3d_torch.run`` runs it, without what it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+
+from v3d_torch.config_file import load_config
+from v3d_torch.datasets import RGBDSequence
+from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import Trajectory
+
+OVERRIDES = {
+    "v3d_torch": [],
+    "v3d_torch --serial": ["lookahead=false", "segmentation.threads=1"],  # as in v3d_torch/run.py
+    "v3d_torch --segmenter none": ["segmentation.source=none"],
+}
+
+
+class Ours:
+    """A contender.
+
+    Args:
+        sequence: to run on.
+        name: one of `OVERRIDES`.
+        seed: of every random choice.
+
+    Attributes:
+        slam: the system.
+        pipeline: that runs it.
+    """
+
+    def __init__(self, sequence: RGBDSequence, name: str, seed: int) -> None:
+        config = load_config(overrides=[f"seed={seed}", *OVERRIDES[name]])
+        torch.set_num_threads(config.threads)
+        torch.manual_seed(seed)
+        self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
+        self.pipeline = Pipeline(sequence, self.slam)
+
+    @property
+    def stages(self) -> Mapping[str, float]:
+        """Seconds by stage; of two that run side by side, each has its own."""
+        return self.slam.clock.seconds
+
+    def __call__(self, on_frame: FrameCallback | None = None) -> None:
+        """Take in all frames.
+
+        Args:
+            on_frame: called after each.
+
+        Raises:
+            RuntimeError: the run ended before the sequence did.
+        """
+        failure = self.pipeline(on_frame).failure
+        if failure is not None:
+            raise RuntimeError(failure)
+
+    def trajectory(self) -> Trajectory:
+        """A pose for every frame."""
+        return self.slam.poses.trajectory()

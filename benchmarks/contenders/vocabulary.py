@@ -1,0 +1,182 @@
+"""A vocabulary of ORB descriptors for ORB-SLAM3, in DBoW2's text format, trained on the sequences at hand.
+
+The tree of Galvez-Lopez and Tardos (Bags of Binary Words for Fast Place Recognition in Image Sequences, T-RO 2012): the
+descriptors under a node are split by k-majority into up to ten children. All nodes of a level are split at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from v3d_torch.datasets import RGBDSequence
+from v3d_torch.download import cache_dir
+from v3d_torch.files import one_process_makes, write_text
+
+BRANCHES, DEPTH = 10, 6
+"""As in ORB-SLAM3's own vocabulary: it compares features within the nodes four levels above the leaves of a tree that
+is so deep, and with a lower tree it would compare them all."""
+
+Descriptors = NDArray[np.uint8]  # (N, 32)
+
+
+@dataclass(frozen=True)
+class Level:
+    """Nodes at one distance from the root.
+
+    Attributes:
+        parent: index of the node above among those of its level, int64, shape (M,).
+        centre: descriptors, uint8, shape (M, 32).
+        leaf: whether a node is a word, bool, shape (M,).
+        weight: inverse document frequency of the words, 0 for other nodes, float64, shape (M,).
+    """
+
+    parent: NDArray[np.int64]
+    centre: Descriptors
+    leaf: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+
+
+def vocabulary(sequences: Iterable[RGBDSequence], images: int = 200, features: int = 1000) -> Path:
+    """The file of a vocabulary trained on sequences; made where the cache does not hold it.
+
+    Args:
+        sequences: whose images to take, evenly over all of them.
+        images: how many, at most about.
+        features: ORB features of each.
+
+    Raises:
+        InputError: an image cannot be read.
+        OutputError: the cache cannot be written.
+    """
+    sequences = list(sequences)
+    contents = [(s.name, len(s), float(s.stamps[0])) for s in sequences]
+    key = sha256(repr((contents, images, features, BRANCHES, DEPTH)).encode()).hexdigest()[:12]
+    path = cache_dir() / f"orb_vocabulary_{key}.txt"
+    with one_process_makes(path):
+        if not path.is_file():
+            write_text(path, text(train(*collect(sequences, images, features))))
+    return path
+
+
+def collect(sequences: list[RGBDSequence], images: int, features: int) -> tuple[Descriptors, NDArray[np.int64]]:
+    """Descriptors, shape (N, 32), and the number of the image that each is from, shape (N,)."""
+    orb = cv2.ORB_create(features)
+    step = -(-sum(map(len, sequences)) // images)
+    found = []
+    for sequence in sequences:
+        for index in range(0, len(sequence), step):
+            grey = cv2.cvtColor(sequence[index].image.permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
+            descriptors = orb.detectAndCompute(grey, None)[1]
+            if descriptors is not None:
+                found.append(descriptors)
+    return np.concatenate(found), np.repeat(np.arange(len(found)), [len(d) for d in found])
+
+
+def train(descriptors: Descriptors, image: NDArray[np.int64], smallest: int = 20, seed: int = 0) -> list[Level]:
+    """Grow the tree from the root down.
+
+    Args:
+        descriptors: uint8, shape (N, 32).
+        image: that each is from, shape (N,).
+        smallest: nodes with fewer descriptors are not split any more.
+        seed: of the centres that the clusterings begin with.
+
+    Returns:
+        The levels, without the root.
+    """
+    order = np.random.default_rng(seed).permutation(len(descriptors))
+    descriptors, image = descriptors[order], image[order]
+    images = len(np.unique(image))
+    levels: list[Level] = []
+    node = np.zeros(len(descriptors), dtype=np.int64)  # that each descriptor lies under, among those of its level
+    for depth in range(1, DEPTH + 1):
+        split, family = np.unique(node, return_inverse=True)
+        cluster, centre = k_majority(descriptors, family)
+        used, node = np.unique(cluster, return_inverse=True)  # clusters without members are no nodes
+        leaf = (np.bincount(node) < smallest) | (depth == DEPTH)
+        shown = np.bincount(np.unique(np.stack([node, image]), axis=1)[0])  # images that show each node
+        levels.append(Level(split[used // BRANCHES], centre[used], leaf, np.where(leaf, np.log(images / shown), 0.0)))
+        left = ~leaf[node]
+        descriptors, image, node = descriptors[left], image[left], node[left]
+        if not len(node):
+            break
+    return levels
+
+
+def k_majority(
+    descriptors: Descriptors, family: NDArray[np.int64], rounds: int = 6
+) -> tuple[NDArray[np.int64], Descriptors]:
+    """Split each of several families of descriptors by Hamming distance (Grana et al., VISAPP 2013).
+
+    Args:
+        descriptors: in random order, uint8, shape (N, 32).
+        family: that each belongs to, from 0, none empty, shape (N,).
+        rounds: most assignments.
+
+    Returns:
+        cluster of each descriptor, ``BRANCHES * family`` and up, shape (N,), and the centres of all clusters.
+    """
+    sizes = np.bincount(family)
+    member = np.minimum(np.arange(BRANCHES), sizes[:, None] - 1)  # one taken twice: the second centre gets no members
+    start = np.cumsum(sizes) - sizes
+    centre = descriptors[np.argsort(family, kind="stable")[start[:, None] + member]].reshape(-1, 32)
+    cluster = np.full(len(family), -1)
+    for _ in range(rounds):
+        before, cluster = cluster, nearest(descriptors, centre, family)
+        if (before == cluster).all():
+            break
+        centre = majority(descriptors, cluster, centre)
+    return cluster, centre
+
+
+def nearest(descriptors: Descriptors, centre: Descriptors, family: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cluster of each descriptor's family whose centre differs in the fewest bits."""
+    words, centres = descriptors.view(np.uint64), centre.view(np.uint64).reshape(-1, BRANCHES, 4)
+    found = [
+        np.bitwise_count(words[part, None] ^ centres[family[part]]).sum(axis=-1, dtype=np.int64).argmin(axis=1)
+        for part in parts(len(words))
+    ]
+    return BRANCHES * family + np.concatenate(found)
+
+
+def majority(descriptors: Descriptors, cluster: NDArray[np.int64], centre: Descriptors) -> Descriptors:
+    """Centres whose every bit is that of most members; those without members stay."""
+    ones = torch.zeros(len(centre), 256, dtype=torch.int32)
+    for part in parts(len(descriptors)):
+        bits = torch.from_numpy(np.unpackbits(descriptors[part], axis=1).astype(np.int32))
+        ones.index_add_(0, torch.from_numpy(cluster[part]), bits)
+    members = np.bincount(cluster, minlength=len(centre))[:, None]
+    return np.where(members > 0, np.packbits(2 * ones.numpy() >= members, axis=1), centre)
+
+
+def parts(count: int, size: int = 1 << 15) -> Iterator[slice]:
+    """Slices that bound the memory of what is computed for each of ``count`` descriptors."""
+    return (slice(start, start + size) for start in range(0, count, size))
+
+
+def text(levels: list[Level]) -> str:
+    """The tree as DBoW2's ``loadFromTextFile`` reads it.
+
+    Branches, depth, scoring (0 = L1) and weighting (0 = TF-IDF); then a line per node, which gets the next number: its
+    parent's number (0 = the root), whether it is a word, the bytes of its descriptor and its weight. No line break
+    ends the file, since the reader would take what follows for one more node.
+    """
+    lines = [f"{BRANCHES} {DEPTH} 0 0"]
+    above, below = 0, 1  # numbers of the first node of the level above and of this one
+    for level in levels:
+        lines += [
+            f"{above + parent} {int(leaf)} {' '.join(map(str, centre))} {weight:.6g}"
+            for parent, leaf, centre, weight in zip(
+                level.parent, level.leaf, level.centre.tolist(), level.weight, strict=True
+            )
+        ]
+        above, below = below, below + len(level.parent)
+    return "\n".join(lines)
