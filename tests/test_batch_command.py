@@ -308,10 +308,11 @@ def test_ctrl_c_keeps_what_was_computed_and_resume_goes_on(moment: Path, tmp_pat
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
 def test_ctrl_c_while_the_first_process_starts_and_no_other_is_started(moment: Path, tmp_path: Path) -> None:
-    arguments = ("--seqs", moment, "--configs", "baseline", "--seeds", "2", "--out", tmp_path / "out")
+    sequence = repeated(moment, tmp_path / "long", frames=80)
+    arguments = ("--seqs", sequence, "--configs", "baseline", "--seeds", "2", "--out", tmp_path / "out")
     done = struck(arguments, (tmp_path / "out" / "summary.csv").exists)
     assert_one_sentence(done.returncode, done.stderr, "interrupted with 0 of 2 runs done")
-    assert not (tmp_path / "out" / "moment" / "baseline" / "seed1").exists()
+    assert not (tmp_path / "out" / "long" / "baseline" / "seed1").exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGSEGV to other processes")
