@@ -158,24 +158,7 @@ def track(
     viewer: Viewer = NULL_VIEWER,
     known: StoredMap | None = None,
 ) -> tuple[Pipeline, Evaluation | None]:
-    """Run a sequence through a new system, show a bar, and write the log and all results.
-
-    Args:
-        sequence: frames.
-        segment: gives the instances of a frame.
-        config: of the system.
-        folder: for the results, there already.
-        console: for the bar.
-        save_masks: whether to write what is left out of tracking.
-        viewer: looks on.
-        known: map to find the camera in.
-
-    Returns:
-        What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
-
-    Raises:
-        OutputError: when the results cannot be written.
-    """
+    """`run_logged` with a bar on a console and a log in the folder; see there for arguments, results and errors."""
     total = len(sequence) if isinstance(sequence, Sized) else None
     prepare_folder(folder)
     with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log_to(folder / "run.log"):

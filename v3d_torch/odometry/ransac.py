@@ -61,8 +61,8 @@ def pnp_ransac(
     if count < 6:
         return None
     found = None
-    for enough in (_SOME, count):
-        some = torch.linspace(0, count - 1, min(enough, count)).round().to(torch.int64)
+    for enough in sorted({min(_SOME, count), count}):
+        some = torch.linspace(0, count - 1, enough).round().to(torch.int64)
         T_cw = _sampled(points[some], uv[some], camera.K, threshold=threshold, iterations=iterations, seed=seed)
         if T_cw is not None:
             no_depth = uv.new_zeros(count)  # of the camera's own: the points' depths have told what they can

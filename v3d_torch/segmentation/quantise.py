@@ -12,18 +12,19 @@ import platform
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import onnx
 import torch
 from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from torch import Tensor
 
-from v3d_torch.datasets.demo.sequence import FRAMES, write_sequence
 from v3d_torch.datasets.images import read_colour
 from v3d_torch.files import one_process_makes, written_whole
 from v3d_torch.segmentation.letterbox import letterbox
+
+if TYPE_CHECKING:
+    import onnx
 
 _VERSION = 1
 """Of what this file makes of a network: raised with every change, so that older files in the cache are not used."""
@@ -54,14 +55,23 @@ def quantised(path: Path) -> Path:
         OutputError: if the folder cannot be written.
     """
     target = path.with_name(f"{path.stem}-int8-v{_VERSION}.onnx")
-    if not target.is_file():
-        with one_process_makes(target):
-            if not target.is_file():
-                with tempfile.TemporaryDirectory() as folder, written_whole(target) as draft:
-                    write_sequence(Path(folder), range(0, FRAMES, _EVERY))
-                    images = [read_colour(image) for image in sorted((Path(folder) / "rgb").iterdir())]
-                    quantise(path, images, draft)
+    if target.is_file():
+        return target
+    with one_process_makes(target):
+        if not target.is_file():
+            images = _calibration_images()
+            with written_whole(target) as draft:
+                quantise(path, images, draft)
     return target
+
+
+def _calibration_images() -> list[Tensor]:
+    # Imported where it is needed, once on a machine: half a second of every start else.
+    from v3d_torch.datasets.demo.sequence import FRAMES, write_sequence
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_sequence(Path(folder), range(0, FRAMES, _EVERY))
+        return [read_colour(image) for image in sorted((Path(folder) / "rgb").iterdir())]
 
 
 def quantise(path: Path, images: Iterable[Tensor], target: Path) -> None:
@@ -72,6 +82,9 @@ def quantise(path: Path, images: Iterable[Tensor], target: Path) -> None:
         images: that tell the range of every activation, uint8 RGB, each of shape :math:`(3, H, W)`.
         target: to be written.
     """
+    import onnx
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+
     model = onnx.load(path)
     given = model.graph.input[0]
     _, _, height, width = (size.dim_value for size in given.type.tensor_type.shape.dim)
