@@ -48,12 +48,18 @@ def test_all_convolutions_but_the_first_and_the_last_have_eight_bits(exact: Path
     weights = {node.name: made.get(node.input[1]) for node in after.node if node.op_type == "Conv"}
     exact_ones = [name for name, source in weights.items() if source is None or source.op_type != "DequantizeLinear"]
     assert exact_ones[:5] == convolutions[:5]
-    # Boxes, classes and masks at three scales, and the sum over the distribution of distances.
-    assert len(exact_ones) == 5 + 3 * 3 + 1 and all(
-        name.endswith(".2/Conv") or "dfl" in name for name in exact_ones[5:]
-    )
+    # Boxes, classes and masks at three scales.
+    assert len(exact_ones) == 5 + 3 * 3 and all(name.endswith(".2/Conv") for name in exact_ones[5:])
     assert Counter(node.op_type for node in after.node)["Conv"] == len(convolutions)
     assert small.stat().st_size < 0.4 * exact.stat().st_size
+
+
+def test_each_activation_is_one_operation(exact: Path, small: Path) -> None:
+    before, after = (Counter(node.op_type for node in onnx.load(path).graph.node) for path in (exact, small))
+    assert before["Sigmoid"] > 60 and not before["QuickGelu"]
+    assert after["Sigmoid"] == 1  # of the scores
+    assert after["QuickGelu"] == before["Sigmoid"] - 1
+    assert after["Mul"] == before["Mul"] - after["QuickGelu"]
 
 
 def test_the_same_frames_give_the_same_bytes(exact: Path, small: Path, tmp_path: Path) -> None:

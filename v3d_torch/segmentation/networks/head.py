@@ -28,8 +28,9 @@ class DFL(nn.Module):
     def forward(self, logits: Tensor) -> Tensor:
         """Logits of shape :math:`(B, 4 bins, N)` to distances of shape :math:`(B, 4, N)`."""
         batch, _, cells = logits.shape
-        distribution = logits.view(batch, 4, self.bins, cells).transpose(1, 2).softmax(dim=1)
-        return self.conv(distribution)[:, 0]
+        # Bins side by side in memory: onnxruntime takes eight times as long over any other dimension.
+        distribution = logits.view(batch, 4, self.bins, cells).transpose(2, 3).softmax(dim=3)
+        return distribution @ self.conv.weight.view(self.bins)
 
 
 def dense_branch(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
