@@ -50,15 +50,7 @@ def view(count: int, outliers: float = 0.0, seed: int = 1) -> tuple[Tensor, Tens
 
 
 def refine(T_cw: Tensor, points: Tensor, measured: Measurements) -> PoseRefinement:
-    return refine_pose(
-        T_cw,
-        points,
-        measured.uv,
-        measured.inverse_depth,
-        measured.pixel_sigma,
-        CAMERA,
-        inverse_depth_sigma=measured.inverse_depth_sigma,
-    )
+    return refine_pose(T_cw, points, measured, CAMERA)
 
 
 def nearby(T_cw: Tensor, scale: float = 0.03) -> Tensor:
@@ -172,15 +164,13 @@ def test_outliers_are_found_and_do_not_matter(outliers: float) -> None:
 
 def test_depth_alone_gives_the_distance() -> None:
     points = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
-    refined = refine_pose(
-        torch.eye(4, dtype=torch.float64),
-        points,
-        torch.tensor([[CAMERA.cx, CAMERA.cy]], dtype=torch.float64),
-        torch.tensor([1 / 1.9], dtype=torch.float64),
-        torch.ones(1, dtype=torch.float64),
-        CAMERA,
+    seen_at = Measurements(
+        uv=torch.tensor([[CAMERA.cx, CAMERA.cy]], dtype=torch.float64),
+        inverse_depth=torch.tensor([1 / 1.9], dtype=torch.float64),
+        pixel_sigma=torch.ones(1, dtype=torch.float64),
         inverse_depth_sigma=DEPTH_SIGMA,
     )
+    refined = refine_pose(torch.eye(4, dtype=torch.float64), points, seen_at, CAMERA)
     seen = refined.T_cw[:3, :3] @ points[0] + refined.T_cw[:3, 3]
     assert abs(float(seen[2]) - 1.9) < 1e-3
     assert refined.inliers.tolist() == [True]

@@ -323,6 +323,10 @@ class MappingConfig(Section):
     """A camera lost for so long maps on from where it is guessed to be, seconds; its poses are flagged as adrift."""
     landmarks_per_keyframe: int = Field(1000, gt=0)
     """Landmarks that a keyframe sees at most, old and new (ORB-SLAM2's number of features)."""
+    fuse_keyframes: int = Field(10, ge=0)
+    """Neighbours in which the landmarks of a new keyframe are looked for (ORB-SLAM2, which takes 10 for RGB-D)."""
+    fuse_radius: float = Field(3.0, gt=0)
+    """Radius of that search, pixels at level 0 (ORB-SLAM2): both poses are known by then."""
     bundle_keyframes: int = Field(15, ge=0)
     """Keyframes that move in a local bundle adjustment, as many as make up the local map; 0 turns it off. With 8 the
     map of fr1_rpy bends by a fifth more."""

@@ -13,8 +13,9 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import FeaturesConfig, MappingConfig
 from v3d_torch.lie import invert
 from v3d_torch.mapping.table import Table
+from v3d_torch.odometry.guided import LocalMap
 from v3d_torch.odometry.orb import Features, spread
-from v3d_torch.odometry.tracker import LocalMap, Tracking
+from v3d_torch.odometry.tracker import Tracking
 
 
 @dataclass
@@ -43,6 +44,11 @@ class Keyframe:
     def known(self) -> bool:
         """Whether an earlier run made it."""
         return self.frame < 0
+
+    @property
+    def seen(self) -> Tensor:
+        """Ids of the landmarks that it sees, int64, shape :math:`(L,)`."""
+        return self.landmarks[self.landmarks >= 0]
 
 
 @dataclass(frozen=True)
@@ -115,18 +121,9 @@ class SparseMap:
         landmarks = landmarks.clone()
         fresh = self._fresh(features, landmarks)
         landmarks[fresh] = self._create(index, T_cw, features[fresh])
-        keyframe = Keyframe(index, frame, stamp, T_cw, features, landmarks)
+        keyframe = Keyframe(index, frame, stamp, T_cw, features, torch.full_like(landmarks, -1))
         self.keyframes.append(keyframe)
-        matched = landmarks >= 0
-        self.observations.append(
-            keyframe=torch.full((int(matched.sum()),), index),
-            landmark=landmarks[matched],
-            feature=torch.nonzero(matched)[:, 0],
-            uv=features.uv[matched],
-            inverse_depth=features.inverse_depth[matched],
-            octave=features.octave[matched],
-            valid=torch.ones(int(matched.sum()), dtype=torch.bool),
-        )
+        self._observe(keyframe, torch.nonzero(landmarks >= 0)[:, 0], landmarks)
         return keyframe
 
     def record(self, tracking: Tracking) -> None:
@@ -165,7 +162,15 @@ class SparseMap:
         chosen[self.covisible(landmarks, count)] = True
         seen = torch.zeros(len(self.landmarks), dtype=torch.bool)
         seen[self.observations["landmark"][chosen[self.observations["keyframe"]]]] = True
-        ids = torch.nonzero(seen & self.landmarks["alive"])[:, 0]
+        return self.look_up(torch.nonzero(seen)[:, 0])
+
+    def look_up(self, landmarks: Tensor) -> LocalMap:
+        """Landmarks as a frame looks for them, those that are still alive.
+
+        Args:
+            landmarks: ids, ascending, int64, shape :math:`(L,)`.
+        """
+        ids = landmarks[self.landmarks["alive"][landmarks]]
         return LocalMap(
             ids=ids,
             points=self.landmarks["point"][ids],
@@ -207,20 +212,57 @@ class SparseMap:
             keyframe.T_cw = pose
 
     def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> None:
-        """Let the landmarks of a keyframe become others that turned out to be the same.
+        """Let features of a keyframe show landmarks that turned out to be behind them.
+
+        A feature without a landmark becomes an observation of it. Where it has another, the two become one, unless some
+        keyframe sees both, side by side.
 
         Args:
             keyframe: whose features were found again.
             landmarks: id of the known landmark behind each of its features, -1 for none, int64, shape :math:`(N,)`.
         """
-        same = (keyframe.landmarks >= 0) & (landmarks >= 0)
-        same &= ~torch.isin(keyframe.landmarks, landmarks)  # what others become stays itself
+        known = (landmarks >= 0) & ~torch.isin(landmarks, keyframe.landmarks)
+        self._observe(keyframe, torch.nonzero(known & (keyframe.landmarks < 0))[:, 0], landmarks)
+        double = known & ~torch.isin(landmarks, keyframe.landmarks)
+        one, other = keyframe.landmarks[double], landmarks[double]
+        self._merge(torch.minimum(one, other), torch.maximum(one, other))
+
+    def _observe(self, keyframe: Keyframe, features: Tensor, landmarks: Tensor) -> None:
+        """Note which landmarks, given for all features of a keyframe, are behind some of them, given by indices."""
+        seen = keyframe.features[features]
+        keyframe.landmarks[features] = landmarks[features]
+        self.observations.append(
+            keyframe=torch.full_like(features, keyframe.index),
+            landmark=landmarks[features],
+            feature=features,
+            uv=seen.uv,
+            inverse_depth=seen.inverse_depth,
+            octave=seen.octave,
+            valid=torch.ones_like(features, dtype=torch.bool),
+        )
+
+    def _merge(self, kept: Tensor, gone: Tensor) -> None:
+        """Let landmarks become others that they turned out to be; the ids are all different, shape (L,) each."""
         becomes = torch.arange(len(self.landmarks))
-        becomes[keyframe.landmarks[same]] = landmarks[same]
-        self.landmarks["alive"][keyframe.landmarks[same]] = False
-        self.observations["landmark"][:] = becomes[self.observations["landmark"]]
-        for other in self.keyframes:
-            other.landmarks = torch.where(other.landmarks >= 0, becomes[other.landmarks.clamp(min=0)], -1)
+        becomes[gone] = kept
+        touched = torch.zeros_like(becomes, dtype=torch.bool)
+        touched[kept] = touched[gone] = True
+        rows = torch.nonzero(self.observations["valid"] & touched[self.observations["landmark"]])[:, 0]
+        keyframe, landmark = self.observations["keyframe"][rows], self.observations["landmark"][rows]
+        places, times = (keyframe * len(becomes) + becomes[landmark]).unique(return_counts=True)
+        apart = ~torch.isin(kept, places[times > 1] % len(becomes))
+        kept, gone = kept[apart], gone[apart]
+
+        moves = torch.isin(landmark, gone)
+        rows, keyframe, landmark = rows[moves], keyframe[moves], becomes[landmark[moves]]
+        self.observations["landmark"][rows] = landmark
+        feature = self.observations["feature"][rows]
+        for index in keyframe.unique().tolist():
+            own = keyframe == index
+            self.keyframes[index].landmarks[feature[own]] = landmark[own]
+        for counted in ("found", "visible"):
+            self.landmarks[counted][kept] += self.landmarks[counted][gone]
+        self.landmarks["alive"][gone] = False
 
     def forget(self, rows: Tensor) -> None:
         """Take back observations that do not fit, given by their rows in the table."""

@@ -6,6 +6,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.mapping.adjust import adjust_locally
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.neighbours import NeighbourSearch
 from v3d_torch.mapping.recorder import Estimate, Status
 from v3d_torch.odometry.orb import Features
 from v3d_torch.types import RGBDFrame
@@ -25,6 +26,7 @@ class Mapper:
         self._camera = camera
         self._most_tracked = 0  # landmarks found by a frame since the last keyframe
         self._untracked_since: float | None = None
+        self._search_neighbours = NeighbourSearch(config, camera)
         self.map = SparseMap(config.mapping, config.features, camera) if known is None else known
 
     def __call__(
@@ -46,6 +48,7 @@ class Mapper:
         keyframe = self.map.insert(frame.index, frame.stamp, estimate.T_cw, static, estimate.landmarks)
         keyframe.adrift = reference is not None and (estimate.status is Status.LOST or reference.adrift)
         self._most_tracked, self._untracked_since = 0, None
+        self._search_neighbours(self.map, keyframe)
         adjust_locally(self.map, keyframe, self._config, self._camera)
         self.map.cull()
         return keyframe

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.lie import rigid
-from v3d_torch.odometry.refine import INLIER_LIMIT, refine_pose
+from v3d_torch.odometry.refine import INLIER_LIMIT, Measurements, refine_pose
 
 _SOME = 100
 """Points that RANSAC looks at first, evenly taken from all: kornia-rs takes 30 microseconds for each. Where no pose
@@ -65,9 +65,10 @@ def pnp_ransac(
         some = torch.linspace(0, count - 1, enough).round().to(torch.int64)
         T_cw = _sampled(points[some], uv[some], camera.K, threshold=threshold, iterations=iterations, seed=seed)
         if T_cw is not None:
-            no_depth = uv.new_zeros(count)  # of the camera's own: the points' depths have told what they can
-            sigma = torch.full_like(no_depth, threshold / math.sqrt(INLIER_LIMIT))
-            refined = refine_pose(T_cw, points, uv, no_depth, sigma, camera, inverse_depth_sigma=1.0, rounds=2)
+            sigma = uv.new_full((count,), threshold / math.sqrt(INLIER_LIMIT))
+            # Without the camera's own depth: the points' depths have told what they can.
+            seen = Measurements(uv=uv, inverse_depth=uv.new_zeros(count), pixel_sigma=sigma, inverse_depth_sigma=1.0)
+            refined = refine_pose(T_cw, points, seen, camera, rounds=2)
             found = refined.T_cw, refined.inliers
             if 2 * int(refined.inliers.sum()) > count:
                 break

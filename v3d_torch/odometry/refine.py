@@ -15,8 +15,10 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import FeaturesConfig, TrackingConfig
 from v3d_torch.levenberg import huber, levenberg_marquardt
 from v3d_torch.lie import rigid, se3_exp
+from v3d_torch.odometry.orb import Features
 
 INLIER_LIMIT = 5.991
 """Squared error of (u, v) in sigmas that 95 % of good observations stay below: chi-square with 2 degrees of freedom."""
@@ -47,6 +49,16 @@ class Measurements:
     def limit(self) -> Tensor:
         """Squared error in sigmas that 95 % of good observations stay below, :math:`(M,)`."""
         return torch.full_like(self.inverse_depth, INLIER_LIMIT).masked_fill_(self.inverse_depth > 0, _LIMIT_WITH_DEPTH)
+
+
+def measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
+    """Features as measurements: a place is as sure as its level of the scale pyramid is fine."""
+    return Measurements(
+        uv=features.uv,
+        inverse_depth=features.inverse_depth,
+        pixel_sigma=config.pixel_sigma * pyramid.scale ** features.octave.to(torch.float64),
+        inverse_depth_sigma=config.inverse_depth_sigma,
+    )
 
 
 def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
@@ -113,12 +125,9 @@ class PoseRefinement:
 def refine_pose(
     T_cw: Tensor,
     points: Tensor,
-    uv: Tensor,
-    inverse_depth: Tensor,
-    pixel_sigma: Tensor,
+    measured: Measurements,
     camera: PinholeCamera,
     *,
-    inverse_depth_sigma: float,
     rounds: int = 4,
     iterations: int = 5,
 ) -> PoseRefinement:
@@ -127,20 +136,14 @@ def refine_pose(
     Args:
         T_cw: predicted world-to-camera pose, shape :math:`(4, 4)`.
         points: landmarks, world frame, metres, float64, shape :math:`(N, 3)`.
-        uv: where they are seen, undistorted pixels, float64, shape :math:`(N, 2)`.
-        inverse_depth: measured, 1/m, float64, shape :math:`(N,)`; 0 = not measured.
-        pixel_sigma: standard deviation of ``uv``, pixels, shape :math:`(N,)`.
+        measured: where each is seen.
         camera: intrinsics.
-        inverse_depth_sigma: standard deviation of ``inverse_depth``, 1/m.
         rounds: of optimisation and judgement; Huber's kernel guards the first half, the rest polishes the inliers.
         iterations: most steps in a round.
 
     Returns:
         The pose; the prediction itself, without inliers, where nothing supports any pose.
     """
-    measured = Measurements(
-        uv=uv, inverse_depth=inverse_depth, pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma
-    )
 
     def linearise(T_cw: Tensor, kept: Tensor, limit: Tensor | float) -> tuple[float, _PoseSystem]:
         in_camera = points @ T_cw[:3, :3].T + T_cw[:3, 3]
