@@ -312,8 +312,9 @@ class MappingConfig(Section):
     """Off: the camera is localised in a map that was loaded, and the map stays as it is."""
     max_gap: int = Field(20, gt=0)
     """At the latest after so many frames there is a new keyframe, frames."""
-    min_tracked_ratio: float = Field(0.7, gt=0, le=1)
-    """A frame that finds fewer landmarks than this share of its reference keyframe's becomes a keyframe."""
+    min_tracked_ratio: float = Field(0.75, gt=0, le=1)
+    """A frame that finds fewer landmarks than this share of what was found since the last keyframe becomes a keyframe
+    (ORB-SLAM2's share for RGB-D)."""
     min_tracked: int = Field(100, gt=0)
     """So does one that finds fewer landmarks than this."""
     odometry_after: float = Field(0.5, ge=0)
