@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 import rerun_cli
 import torch
@@ -380,9 +381,7 @@ def server(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
         f"#!{sys.executable}\n"
         "import os, sys\n"
         f"open({str(pid)!r}, 'w').write(str(os.getpid()))\n"
-        "port = [word.partition('=')[2] for word in sys.argv if word.startswith('--port=')][0]\n"
-        f"arguments = ['--serve-grpc', '--bind', '127.0.0.1', '--port', port, '--save', {str(saved)!r}]\n"
-        f"os.execv({program!r}, ['rerun', *arguments])\n"
+        f"os.execv({program!r}, ['rerun', '--serve-grpc', '--save', {str(saved)!r}, *sys.argv[1:]])\n"
     )
     script.chmod(0o755)
     yield script, saved
@@ -400,6 +399,9 @@ def test_a_viewer_is_started_and_is_sent_the_run(
     file = tmp_path / "file.rrd"
     viewer = RerunViewer(open_stream(live=True, file=file, port=port), CAMERA, None, "wall")
     pipeline = Pipeline(Wall(broken=3), V3DSLAM(CAMERA, squares), viewer=viewer)
+    (viewer_process,) = [child for child in psutil.Process().children() if f"--port={port}" in child.cmdline()]
+    listening = [at.laddr.ip for at in viewer_process.net_connections() if at.status == psutil.CONN_LISTEN]
+    assert listening == ["127.0.0.1"]  # what a camera sees at home is nobody else's
     pipeline()
     assert list(Recording(file).at("/world/camera")) == [0, 1, 2]
     deadline = time.monotonic() + 20
