@@ -20,11 +20,13 @@ import pytest
 import torch
 from test_results import FRAMES, Wall, square
 from torch import Tensor
+from typer.testing import CliRunner, Result
 
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError
 from v3d_torch.files import write_text
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.report import app
 from v3d_torch.results import write_results
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.stored_run import read_run
@@ -99,6 +101,11 @@ def copy(results: Path, tmp_path: Path) -> Path:
 def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "v3d_torch.report", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=120)  # noqa: S603
+
+
+def call_here(*arguments: str | Path) -> Result:
+    """In this process, which has loaded everything already."""
+    return CliRunner().invoke(app, list(map(str, arguments)))
 
 
 def page_of(folder: Path, groundtruth: Path | None = None) -> Page:
@@ -208,8 +215,8 @@ def test_no_results_and_broken_ones_are_a_sentence_each(copy: Path, tmp_path: Pa
         ([tmp_path / (300 * "x")], "cannot be used (File name too long); check the path"),
         ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 poses"),
     ):
-        done = call(*arguments)
-        assert done.returncode == 2 and done.stdout == ""
+        done = call_here(*arguments)
+        assert done.exit_code == 2 and done.stdout == ""
         assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and words in done.stderr
     assert not (copy / "report.html").exists()
 
