@@ -212,6 +212,12 @@ def test_a_broken_ground_truth_costs_no_frame(folder: Path) -> None:
     assert str(sequence.groundtruth_error).startswith(f"{folder / 'groundtruth.txt'}: line 1 is 'a b c'")
 
 
+def test_the_folder_around_sequences_is_answered_with_one_of_them(folder: Path) -> None:
+    message = rf"^{folder.parent}: is no sequence itself but holds 1, such as {folder.name}; give {folder}$"
+    with pytest.raises(InputError, match=message):
+        load_sequence(str(folder.parent))
+
+
 def test_a_file_is_no_sequence(folder: Path) -> None:
     with pytest.raises(InputError, match="is a file"):
         tum.TUMSequence(folder / "rgb.txt")
