@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -157,9 +156,9 @@ def test_the_scores_are_those_of_the_run(results: Path) -> None:
 
 
 def test_help_is_instant() -> None:
-    start = time.monotonic()
+    before = os.times()
     assert "--groundtruth" in call("--help").stdout
-    assert time.monotonic() - start < 3
+    assert os.times().children_user - before.children_user < 3  # of the processor, which others may use too
 
 
 # --- results that are not whole

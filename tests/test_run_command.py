@@ -265,7 +265,7 @@ def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
     start = time.monotonic()
     nobody = dict.fromkeys(("https_proxy", "http_proxy", "HTTPS_PROXY", "HTTP_PROXY"), "http://127.0.0.1:9")
     variables = {"V3D_DATA": str(tmp_path / "data"), "V3D_CACHE": str(tmp_path / "cache"), "no_proxy": "", **nobody}
-    done = call("--seq", "fr3/w/xyz", cwd=tmp_path, **variables)
+    done = call_here("--seq", "fr3/w/xyz", cwd=tmp_path, **variables)
     assert time.monotonic() - start < 20
     name = "rgbd_dataset_freiburg3_walking_xyz"
     assert_one_sentence(done, "fr3/w/xyz", f"{name}.tgz", "https://", str(tmp_path / "data"))
@@ -293,11 +293,11 @@ def test_ctrl_c_keeps_what_was_computed(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_help_is_instant_and_names_every_option() -> None:
-    start = time.monotonic()
+    before = os.times()
     done = subprocess.run(
         [sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, env=environment(), check=True
     )
-    assert time.monotonic() - start < 3
+    assert os.times().children_user - before.children_user < 3  # of the processor, which others may use too
     for option in (
         "seq",
         "data-root",
