@@ -12,6 +12,15 @@ from v3d_torch.datasets.demo.sequence import write_sequence
 
 torch.set_num_threads(1)
 
+SLOWEST = ("test_real_sequences.py", "test_run_command.py", "test_corpus.py", "test_ablate_command.py")
+"""Begin with these, so that with several workers (``-n 2``) none is left alone with one of them in the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take long first, each with its tests in their order."""
+    items.sort(key=lambda item: SLOWEST.index(item.path.name) if item.path.name in SLOWEST else len(SLOWEST))
+
+
 collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
 """Full disks and little memory are made with the limits of Unix."""
 

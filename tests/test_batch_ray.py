@@ -41,7 +41,7 @@ def nodes() -> Iterator[Nodes]:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'v3d-torch[ray]'")
     from ray.cluster_utils import Cluster as Nodes
 
-    cluster = Nodes(initialize_head=True, head_node_args={"num_cpus": 1})
+    cluster = Nodes(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     cluster.add_node(num_cpus=1)
     yield cluster
     cluster.shutdown()

@@ -17,7 +17,7 @@ from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
 from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.images import read_colour, read_depth
 from v3d_torch.datasets.names import download_url
-from v3d_torch.errors import DownloadError, InputError
+from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
 
 WALKING_XYZ = "rgbd_dataset_freiburg3_walking_xyz"
 WIDTH, HEIGHT = 32, 24
@@ -204,10 +204,18 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
 
 def test_a_broken_ground_truth_costs_no_frame(folder: Path) -> None:
     (folder / "groundtruth.txt").write_text("a b c")
-    sequence = load_sequence(str(folder))
+    with pytest.warns(GroundTruthWarning, match="line 1 is 'a b c'.*no true poses") as told:
+        sequence = load_sequence(str(folder))
+    assert [Path(warning.filename) for warning in told] == [Path(__file__)]  # at the line that asked for it
     assert len(list(sequence)) == len(sequence) and sequence.groundtruth is None
     assert isinstance(sequence, tum.TUMSequence)
     assert str(sequence.groundtruth_error).startswith(f"{folder / 'groundtruth.txt'}: line 1 is 'a b c'")
+
+
+def test_the_folder_around_sequences_is_answered_with_one_of_them(folder: Path) -> None:
+    message = rf"^{folder.parent}: is no sequence itself but holds 1, such as {folder.name}; give {folder}$"
+    with pytest.raises(InputError, match=message):
+        load_sequence(str(folder.parent))
 
 
 def test_a_file_is_no_sequence(folder: Path) -> None:

@@ -18,7 +18,6 @@ from v3d_torch.trajectory import write_trajectory
 FRAMES = 14
 RUNS = {
     "by default": (),
-    "again": (),
     "one by one": ("lookahead=false",),
     "one thread for the network": ("segmentation.threads=1",),
     "one by one, two threads": ("lookahead=false", "threads=2"),

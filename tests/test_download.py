@@ -155,7 +155,7 @@ def test_a_stalled_connection_times_out(server: str, target: Path) -> None:
     start = time.monotonic()
     with pytest.raises(DownloadError, match=r"broke off .*timed out"):
         fetch(f"{server}/stalled", target, timeout=0.3)
-    assert time.monotonic() - start < 1.2
+    assert time.monotonic() - start < 4  # the usual is 5
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_refused_connection_fails_at_once(target: Path, monkeypatch: pytest.Monk
     start = time.monotonic()
     with pytest.raises(DownloadError, match=r"cannot be reached .*refused"):
         fetch(f"http://127.0.0.1:{port}/file", target)
-    assert time.monotonic() - start < 2.0
+    assert time.monotonic() - start < 4
 
 
 def test_a_folder_that_cannot_be_written(server: str, tmp_path: Path) -> None:

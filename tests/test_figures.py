@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from v3d_torch.errors import InputError, OutputError
@@ -20,7 +21,7 @@ from v3d_torch.evaluation import evaluate
 from v3d_torch.lie import se3_exp
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.clusters import Cluster, clusters_figure
-from v3d_torch.viz.figures import VERDICT_COLOURS, Overlay, mask_strip, trajectory_figure
+from v3d_torch.viz.figures import VERDICT_COLOURS, Overlay, draw_objects, mask_strip, trajectory_figure
 from v3d_torch.viz.inline import inline_image, inline_svg
 from v3d_torch.viz.objects_over_time import ObjectRow, draw_objects_over_time
 from v3d_torch.viz.stage_times import draw_stage_bars, draw_stages_over_time
@@ -375,3 +376,10 @@ def test_images_for_a_page_are_data_and_a_broken_one_is_named(tmp_path: Path) ->
     (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:30])
     with pytest.raises(InputError, match=r"b\.png: is truncated or no image"):
         inline_image(tmp_path / "b.png")
+
+
+def test_names_of_what_moves_are_drawn_over_those_of_what_stands_still() -> None:
+    axes, mask = Figure().add_subplot(), torch.ones(12, 16, dtype=torch.bool)
+    words = {"a": "dynamic", "b": "static", "c": "unknown", "d": "static"}
+    draw_objects(axes, torch.zeros(3, 12, 16, dtype=torch.uint8), [(mask, name, said) for name, said in words.items()])
+    assert [text.get_text() for text in axes.texts] == ["b", "d", "a", "c"]  # later over earlier

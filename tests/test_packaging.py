@@ -118,6 +118,12 @@ def test_a_command_says_the_same_under_both_names(module: object) -> None:
     assert f"{name} [OPTIONS]" in together.partition("\n")[0]
 
 
+def test_the_list_of_commands_fits_a_terminal() -> None:
+    lines = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output.split("Commands:")[1].splitlines()
+    assert [line for line in lines if "..." in line or len(line) > 80] == []
+    assert len([line for line in lines if line.strip()]) == len(COMMANDS)
+
+
 def test_several_values_to_one_option_stay_those_of_the_option() -> None:
     result = CliRunner().invoke(app, ["batch", "--seqs", "no_such_a", "no_such_b", "--configs", "papper"])
     assert result.exit_code == 2 and "papper" in result.stderr

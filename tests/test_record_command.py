@@ -14,11 +14,13 @@ import pytest
 import torch
 from bags import DEPTH, INFO, RGB, Messages
 from tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
+from typer.testing import CliRunner, Result
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.errors import OutputError
+from v3d_torch.record import app
 from v3d_torch.types import RGBDFrame
 
 K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
@@ -33,8 +35,13 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=100)  # noqa: S603
 
 
-def assert_one_sentence(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    assert done.returncode == 2, done.stderr
+def call_here(*arguments: str | Path) -> Result:
+    """In this process, which has loaded everything already."""
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def assert_one_sentence(done: Result, *words: str) -> None:
+    assert done.exit_code == 2, done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
     assert all(word in done.stderr for word in words), done.stderr
 
@@ -68,8 +75,8 @@ def test_ground_truth_is_saved_and_not_transformed_twice(tmp_path: Path) -> None
     (folder / "rgb.txt").write_text("10.0 rgb/0.png\n")
     (folder / "depth.txt").write_text("10.0 depth/0.png\n")
     (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0.6 0.8\n")
-    done = call("--seq", folder, "--out", tmp_path / "rgbd_bonn_copy")
-    assert (done.returncode, done.stderr) == (0, "")
+    done = call_here("--seq", folder, "--out", tmp_path / "rgbd_bonn_copy")
+    assert (done.exit_code, done.stderr) == (0, "")
     source, saved = load_sequence(str(folder)), load_sequence(str(tmp_path / "rgbd_bonn_copy"))
     assert_equal(saved, source)
     assert source.groundtruth is not None and saved.groundtruth is not None
@@ -84,7 +91,7 @@ def test_a_broken_ground_truth_costs_no_frame(tmp_path: Path) -> None:
         (folder / f"{kind}.txt").write_text(f"10.0 {kind}/0.png\n")
     (folder / "camera.yaml").write_text(CAMERA_YAML)
     (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0 nan\n")
-    done = call("--seq", folder, "--out", tmp_path / "out")
+    done = call_here("--seq", folder, "--out", tmp_path / "out")
     assert_one_sentence(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite", "frames")
     assert len(load_sequence(str(tmp_path / "out"))) == 1
 
@@ -117,9 +124,9 @@ def test_what_users_get_wrong(tmp_path: Path) -> None:
     save(tmp_path / "rgb" / "1.png", colour_of(0))
     save(tmp_path / "depth" / "1.png", depth_of(0))
     (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
-    done = call("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
+    done = call_here("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
     assert_one_sentence(done, str(tmp_path / "full"), "holds something already; choose another")
-    assert_one_sentence(call("--out", tmp_path / "new"), "realsense: ")
+    assert_one_sentence(call_here("--out", tmp_path / "new"), "realsense: ")
     assert not (tmp_path / "new").exists()
 
 

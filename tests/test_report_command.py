@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,11 +19,13 @@ import pytest
 import torch
 from test_results import FRAMES, Wall, square
 from torch import Tensor
+from typer.testing import CliRunner, Result
 
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError
 from v3d_torch.files import write_text
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.report import app
 from v3d_torch.results import write_results
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.stored_run import read_run
@@ -101,6 +102,11 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120)  # noqa: S603
 
 
+def call_here(*arguments: str | Path) -> Result:
+    """In this process, which has loaded everything already."""
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
 def page_of(folder: Path, groundtruth: Path | None = None) -> Page:
     return Page(render_page(read_run(folder, groundtruth)))
 
@@ -150,9 +156,9 @@ def test_the_scores_are_those_of_the_run(results: Path) -> None:
 
 
 def test_help_is_instant() -> None:
-    start = time.monotonic()
+    before = os.times()
     assert "--groundtruth" in call("--help").stdout
-    assert time.monotonic() - start < 3
+    assert os.times().children_user - before.children_user < 3  # of the processor, which others may use too
 
 
 # --- results that are not whole
@@ -208,8 +214,8 @@ def test_no_results_and_broken_ones_are_a_sentence_each(copy: Path, tmp_path: Pa
         ([tmp_path / (300 * "x")], "cannot be used (File name too long); check the path"),
         ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 poses"),
     ):
-        done = call(*arguments)
-        assert done.returncode == 2 and done.stdout == ""
+        done = call_here(*arguments)
+        assert done.exit_code == 2 and done.stdout == ""
         assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and words in done.stderr
     assert not (copy / "report.html").exists()
 

@@ -9,6 +9,7 @@ import torch
 from v3d_torch import V3DSLAM, RGBDFrame, Tracked, load_sequence
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets import RGBDSequence
+from v3d_torch.depth import DepthSmoother
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.lie import invert
 from v3d_torch.mapping.recorder import Status
@@ -83,10 +84,16 @@ def test_without_any_camera_it_says_so(demo: RGBDSequence) -> None:
         V3DSLAM(config=NO_NETWORK)(RGBDFrame(0, 0.0, frame.image, frame.depth))
 
 
-def test_a_stage_can_be_replaced(demo: RGBDSequence) -> None:
-    slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
+@pytest.mark.parametrize("known", [True, False], ids=["camera given", "camera in the frames"])
+def test_a_stage_can_be_replaced_at_any_time(demo: RGBDSequence, known: bool) -> None:
+    slam = V3DSLAM(demo.camera if known else None, NoSegmentation(), NO_NETWORK)
     seen = []
-    smooth = slam.smooth
+    smooth = slam.smooth if known else DepthSmoother(5, 1.0, 0.05)
     slam.smooth = lambda depth: seen.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
     slam(demo[0])
     assert seen == [(1, 1, 480, 640)]
+
+
+def test_arrays_instead_of_a_frame_are_refused(demo: RGBDSequence) -> None:
+    with pytest.raises(InputError, match=r"this is a ndarray; .* RGBDFrame\.of"):
+        V3DSLAM(demo.camera, config=NO_NETWORK)(np.zeros((480, 640, 3), np.uint8))

@@ -14,7 +14,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.openloris import OpenLORISSequence
 from v3d_torch.datasets.stored import StoredFrames
-from v3d_torch.errors import InputError
+from v3d_torch.errors import GroundTruthWarning, InputError
 
 SENSORS = f"""%YAML:1.0
 t265_fisheye1_optical_frame:
@@ -130,6 +130,7 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
 def test_without_the_place_of_the_camera_there_is_no_truth(folder: Path, links: str | None, message: str) -> None:
     file = folder / "trans_matrix.yaml"
     file.unlink() if links is None else file.write_text(links)
-    sequence = load_sequence(str(folder))
+    with pytest.warns(GroundTruthWarning):
+        sequence = load_sequence(str(folder))
     assert isinstance(sequence, StoredFrames) and sequence.groundtruth is None
     assert str(sequence.groundtruth_error).startswith(f"{file}: {message}")

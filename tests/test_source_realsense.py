@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -36,11 +37,18 @@ BASELINE = 0.1
 
 
 class Simulated:
-    """A `Device`: librealsense's `software_device` with a thread that takes frames 0, 1, 2 ... as long as it runs."""
+    """A `Device`: librealsense's `software_device` with a thread that takes frames 0, 1, 2 ... as long as it runs.
+
+    Args:
+        record_to: file.
+        enlarged: how many pixels make one of the small images.
+        still: whether frame 0 is taken again and again.
+    """
 
     depth_unit = 0.001
 
-    def __init__(self, record_to: Path | None = None) -> None:
+    def __init__(self, record_to: Path | None = None, *, enlarged: int = 1, still: bool = False) -> None:
+        self._enlarged, self._still = enlarged, still
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "Simulated")
         self.device.register_info(rs.camera_info.serial_number, "1")
@@ -61,8 +69,10 @@ class Simulated:
     def _profile(self, sensor: str, uid: int, kind: Any, form: Any, K: tuple[float, ...]) -> Any:
         stream = rs.video_stream()
         stream.type, stream.fmt, stream.uid, stream.index = kind, form, uid, 0
-        stream.width, stream.height, stream.fps, stream.bpp = WIDTH, HEIGHT, FPS, 2 if sensor == "Depth" else 3
-        stream.intrinsics = intrinsics(K)
+        stream.width, stream.height = WIDTH * self._enlarged, HEIGHT * self._enlarged
+        stream.fps, stream.bpp = FPS, 2 if sensor == "Depth" else 3
+        stream.intrinsics = intrinsics(tuple(self._enlarged * value for value in K))
+        stream.intrinsics.width, stream.intrinsics.height = stream.width, stream.height
         return self._sensors[sensor].add_video_stream(stream).as_video_stream_profile()
 
     def start(self) -> None:
@@ -91,15 +101,17 @@ class Simulated:
 
     def _feed(self) -> None:
         while not self.stopped.wait(1 / FPS):
-            self._send("Depth", self.depth, depth_image(self.sent))
-            self._send("Color", self.colour, colour_of(self.sent, WIDTH, HEIGHT))
+            number, larger = 0 if self._still else self.sent, {"fx": self._enlarged, "fy": self._enlarged}
+            depth, colour = depth_image(number), colour_of(number, WIDTH, HEIGHT)
+            self._send("Depth", self.depth, cv2.resize(depth, None, **larger, interpolation=cv2.INTER_NEAREST))
+            self._send("Color", self.colour, cv2.resize(colour, None, **larger, interpolation=cv2.INTER_CUBIC))
             self.sent += 1
 
     def _send(self, sensor: str, profile: Any, pixels: NDArray[Any]) -> None:
         frame = rs.software_video_frame()
         frame.pixels, frame.profile = pixels, profile
-        frame.bpp = pixels.nbytes // (WIDTH * HEIGHT)
-        frame.stride = frame.bpp * WIDTH
+        frame.bpp = pixels.nbytes // (pixels.shape[0] * pixels.shape[1])
+        frame.stride = frame.bpp * pixels.shape[1]
         frame.timestamp, frame.domain = self.first + self.sent * 1000 / FPS, rs.timestamp_domain.global_time
         frame.frame_number = self.sent
         if sensor == "Depth":
@@ -223,7 +235,16 @@ def test_no_camera_is_connected(name: str, called: str) -> None:
 
 def test_without_pyrealsense2(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(InputError, match=r"^realsense: RealSense needs pyrealsense2 .*pip install pyrealsense2"):
+    with pytest.raises(InputError, match=r"^realsense: RealSense needs pyrealsense2 .*; pip install pyrealsense2$"):
+        open_source("realsense:")
+
+
+def test_without_libusb_which_pip_does_not_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    why = "libusb-1.0.so.0: cannot open shared object file: No such file or directory"
+    (tmp_path / "pyrealsense2.py").write_text(f"raise ImportError({why!r})")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    with pytest.raises(InputError, match=r"^realsense: .*libusb-1.0.so.0: .*apt install libusb-1.0-0$"):
         open_source("realsense:")
 
 
@@ -253,7 +274,7 @@ def test_record_saves_a_live_camera_until_ctrl_c(tmp_path: Path, monkeypatch: py
 
 
 def test_a_live_run_ends_with_ctrl_c_and_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(realsense_device, "live", lambda *wanted: Simulated())
+    monkeypatch.setattr(realsense_device, "live", lambda *wanted: Simulated(enlarged=5, still=True))
     out = tmp_path / "out"
 
     def interrupt() -> None:
@@ -267,7 +288,7 @@ def test_a_live_run_ends_with_ctrl_c_and_results(tmp_path: Path, monkeypatch: py
     assert done.exit_code == 0, done.output
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["sequence"], metrics["failure"]) == ("realsense", None)
-    assert metrics["frames"] == metrics["processed"] >= 3
+    assert metrics["frames"] == metrics["processed"] == metrics["tracked"] >= 3
     assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
 
 

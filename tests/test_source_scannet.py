@@ -14,7 +14,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.scannet import ScanNetSequence
 from v3d_torch.datasets.stored import StoredFrames
-from v3d_torch.errors import InputError
+from v3d_torch.errors import GroundTruthWarning, InputError
 
 FULL, SIZE = (260, 193), (128, 96)
 """Colour and depth images, in the proportions of ScanNet's, whose colour is cut at top and bottom."""
@@ -135,6 +135,7 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
 def test_a_broken_pose_costs_no_frame(folder: Path, pose: str, message: str) -> None:
     file = next(folder.rglob("pose/0.txt"))
     file.write_text(pose)
-    sequence = load_sequence(str(folder))
+    with pytest.warns(GroundTruthWarning):
+        sequence = load_sequence(str(folder))
     assert isinstance(sequence, StoredFrames) and sequence.groundtruth is None
     assert str(sequence.groundtruth_error).startswith(f"{file}: {message}")

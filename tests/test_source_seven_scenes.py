@@ -11,6 +11,7 @@ from tiny_images import as_rgb, colour_of, depth_of, save
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.seven_scenes import CAMERA, SevenScenesSequence
 from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.errors import GroundTruthWarning
 
 
 @pytest.fixture
@@ -39,7 +40,8 @@ def test_frames(folder: Path) -> None:
 
 def test_without_poses_and_with_a_broken_one(folder: Path) -> None:
     (folder / "frame-000000.pose.txt").write_text("no pose")
-    sequence = load_sequence(str(folder))
+    with pytest.warns(GroundTruthWarning):
+        sequence = load_sequence(str(folder))
     assert isinstance(sequence, StoredFrames) and sequence.groundtruth is None
     assert str(sequence.groundtruth_error).startswith(f"{folder / 'frame-000000.pose.txt'}: is no matrix")
     for path in folder.glob("*.pose.txt"):

@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 import rerun_cli
 import torch
@@ -22,7 +23,9 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 from test_report_command import squares
 from test_results import CAMERA, FRAMES, WALL, Wall
+from typer.testing import CliRunner, Result
 
+from v3d_torch import run
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.errors import ConfigError, OutputError, ViewerError
@@ -380,9 +383,7 @@ def server(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
         f"#!{sys.executable}\n"
         "import os, sys\n"
         f"open({str(pid)!r}, 'w').write(str(os.getpid()))\n"
-        "port = [word.partition('=')[2] for word in sys.argv if word.startswith('--port=')][0]\n"
-        f"arguments = ['--serve-grpc', '--bind', '127.0.0.1', '--port', port, '--save', {str(saved)!r}]\n"
-        f"os.execv({program!r}, ['rerun', *arguments])\n"
+        f"os.execv({program!r}, ['rerun', '--serve-grpc', '--save', {str(saved)!r}, *sys.argv[1:]])\n"
     )
     script.chmod(0o755)
     yield script, saved
@@ -400,6 +401,9 @@ def test_a_viewer_is_started_and_is_sent_the_run(
     file = tmp_path / "file.rrd"
     viewer = RerunViewer(open_stream(live=True, file=file, port=port), CAMERA, None, "wall")
     pipeline = Pipeline(Wall(broken=3), V3DSLAM(CAMERA, squares), viewer=viewer)
+    (viewer_process,) = [child for child in psutil.Process().children() if f"--port={port}" in child.cmdline()]
+    listening = [at.laddr.ip for at in viewer_process.net_connections() if at.status == psutil.CONN_LISTEN]
+    assert listening == ["127.0.0.1"]  # what a camera sees at home is nobody else's
     pipeline()
     assert list(Recording(file).at("/world/camera")) == [0, 1, 2]
     deadline = time.monotonic() + 20
@@ -408,23 +412,23 @@ def test_a_viewer_is_started_and_is_sent_the_run(
     assert saved.stat().st_size > 10_000
 
 
-def test_without_a_screen_the_command_says_what_to_do_instead(tmp_path: Path) -> None:
+def test_without_a_screen_the_command_says_what_to_do_instead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_sequence(tmp_path / "three", range(45, 48))
-    variables = {name: value for name, value in os.environ.items() if "DISPLAY" not in name and "WAYLAND" not in name}
-    command = [sys.executable, "-m", "v3d_torch.run", "--seq", str(tmp_path / "three"), "--segmenter", "none"]
+    for name in list(os.environ):
+        if "DISPLAY" in name or "WAYLAND" in name:
+            monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
 
-    def call(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(  # noqa: S603
-            [*command, *arguments], cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=200
-        )
+    def call(*arguments: str) -> Result:
+        return CliRunner().invoke(run.app, ["--seq", str(tmp_path / "three"), "--segmenter", "none", *arguments])
 
     if sys.platform == "linux":
         done = call("--viz", "rerun", "--out", str(tmp_path / "out"))
-        assert done.returncode == 2 and not (tmp_path / "out").exists()
+        assert done.exit_code == 2 and not (tmp_path / "out").exists()
         assert done.stderr.startswith("error: --viz rerun: there is no screen") and done.stderr.count("\n") == 1
         assert "--rerun FILE.rrd" in done.stderr
     done = call("--rerun", "three.rrd", "--out", str(tmp_path / "out"))
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.exit_code, done.stderr) == (0, "")
     recording = Recording(tmp_path / "three.rrd")
     assert list(recording.at("/world/camera")) == [0, 1, 2]
     assert recording.at("/world/objects")[2]["positions"] == []

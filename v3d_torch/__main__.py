@@ -31,7 +31,7 @@ def main(
         bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Say which version this is.")
     ] = False,
 ) -> None:
-    """Track an RGB-D camera in a room where people move, and map what stands still: V3D-SLAM."""
+    """V3D-SLAM: track an RGB-D camera in a room where people move, and map what stands still."""
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def main(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/ablation/<time>].")] = None,
 ) -> None:
-    """Run the system with parts of it turned off, and set the scores side by side."""
+    """Turn off parts of the system and set the scores side by side."""
     from v3d_torch.console import exit_on_error
     from v3d_torch.study import run_study
 

@@ -68,7 +68,10 @@ def main(
         typer.Option(help="Run on a Ray cluster: auto for the one that this machine belongs to, local, or an address."),
     ] = None,
 ) -> None:
-    """Run every sequence with every configuration and seed, each in a process of its own, and set them side by side."""
+    """Run many sequences, configurations and seeds side by side.
+
+    Each run is a process of its own; tables set the scores of all beside each other.
+    """
     from v3d_torch.console import exit_on_error
     from v3d_torch.jobs.batch import run_batch
 

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence, Sized
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from v3d_torch.config_file import FULL, find_config, load_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
 from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.earlier_results import prepare_folder
-from v3d_torch.errors import ConfigError, InputError, OutputError, V3DError
+from v3d_torch.errors import ConfigError, GroundTruthWarning, InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.tables import paper_table
 from v3d_torch.files import refuse_unwritable
@@ -43,7 +44,9 @@ from v3d_torch.viz.viewer import NULL_VIEWER, Viewer, make_viewer
 def exit_on_error() -> Iterator[None]:
     """Turn an error that the user can act on into one sentence on stderr and exit code 2."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GroundTruthWarning)  # commands say it themselves, after the results
+            yield
     except V3DError as error:
         print(f"error: {_printable(error)}", file=sys.stderr)
         sys.exit(2)

@@ -27,3 +27,7 @@ class ViewerError(V3DError):
 
 class OutputError(V3DError):
     """A result cannot be written: no permission, disk full."""
+
+
+class GroundTruthWarning(UserWarning):
+    """The ground truth of a sequence cannot be read: its frames can, and are given without true poses."""

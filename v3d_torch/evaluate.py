@@ -31,7 +31,10 @@ def main(
         str | None, typer.Option(help="Sequence of the paper's tables, such as fr3/w/xyz [guessed from the paths].")
     ] = None,
 ) -> None:
-    """Score an estimated trajectory: absolute (ATE) and relative (RPE) error, as the TUM RGB-D benchmark does."""
+    """Score a trajectory by ATE and RPE, as the TUM benchmark does.
+
+    ATE is the absolute error of the aligned positions, RPE the relative one of the motion over a time.
+    """
     from rich.console import Console
 
     from v3d_torch.errors import InputError, V3DError

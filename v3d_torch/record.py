@@ -29,7 +29,10 @@ def main(
         float | None, typer.Option(help="Frames a second, of a live camera or where nothing says the times.")
     ] = None,
 ) -> None:
-    """Save RGB-D frames as PNG with their lists and camera, until the source ends or Ctrl-C."""
+    """Save any source, also a live camera, in TUM layout.
+
+    Frames become PNG with their lists and camera, until the source ends or Ctrl-C.
+    """
     from rich.console import Console
     from rich.progress import track
 

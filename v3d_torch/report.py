@@ -18,7 +18,10 @@ def main(
         typer.Option(help="True poses, stamp tx ty tz qx qy qz qw [those that the sequence brought]."),
     ] = None,
 ) -> None:
-    """Make report.html in the folder: one file, with everything in it, for any browser."""
+    """Make one HTML page of the results of a run.
+
+    It is report.html in their folder: one file with everything in it, for any browser.
+    """
     from v3d_torch.console import exit_on_error
     from v3d_torch.files import write_text
     from v3d_torch.stored_run import read_run

@@ -40,7 +40,10 @@ def main(
         bool, typer.Option("--resume", help="Run only what is missing in --out or has failed there.")
     ] = False,
 ) -> None:
-    """Fill the tables of the paper: run its eight sequences of the TUM RGB-D benchmark, as far as they are here."""
+    """Fill the tables of the paper with figures of this machine.
+
+    Runs its eight sequences of the TUM RGB-D benchmark, downloaded where they are not here.
+    """
     from v3d_torch.console import exit_on_error
     from v3d_torch.jobs.reproduction import CONFIGS, run_reproduction
 

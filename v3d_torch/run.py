@@ -59,7 +59,7 @@ def main(
     ] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: leave the map as it is.")] = False,
 ) -> None:
-    """Track an RGB-D camera in a room where people move, and map what stands still."""
+    """Track an RGB-D camera where people move; map what stands still."""
     from v3d_torch.console import exit_on_error, run_sequence
     from v3d_torch.datasets import SourceOptions
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
-from v3d_torch.errors import ConfigError
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.lie import invert, rigid
 from v3d_torch.localise import Localiser
 from v3d_torch.loop.closing import LoopCloser
@@ -102,7 +102,7 @@ class V3DSLAM:
             self._set_up(camera)
 
     def _set_up(self, camera: PinholeCamera) -> None:
-        config = self.config
+        config, given = self.config, dict(vars(self))
         self.smooth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge)
         self.detect = ORB(config.features, camera)
         self.lift = CloudLifter(config.objects.clouds, camera)
@@ -117,13 +117,18 @@ class V3DSLAM:
         for keyframe in self.mapper.map.keyframes:
             self.loops.learn(keyframe)
         self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
+        vars(self).update(given)  # a stage that the user put in place before the camera was known stays
 
     def __call__(self, frame: RGBDFrame) -> Tracked:
         """Take in the next frame.
 
         Raises:
             ConfigError: nobody said which camera took the first frame.
+            InputError: it is no frame.
         """
+        if not isinstance(frame, RGBDFrame):
+            what = type(frame).__qualname__  # type: ignore[unreachable]
+            raise InputError(f"V3DSLAM takes frames, this is a {what}; make one of arrays with RGBDFrame.of")
         percept = self.perceive(frame, self._outlook)
         self._outlook = self.outlook()
         return self.take_in(percept)

@@ -1,6 +1,6 @@
 """The data that flows between stages: frozen dataclasses of tensors.
 
-Conventions (see also README, "How it is built"): ``T_wc`` maps camera to world, ``p_w = T_wc @ p_c``; the camera looks
+Conventions (see also docs/design.md): ``T_wc`` maps camera to world, ``p_w = T_wc @ p_c``; the camera looks
 along +z with x right and y down; pixel centres lie at integers and (u, v) = (column, row); depth is in metres and 0
 means "no measurement"; stamps are seconds.
 """

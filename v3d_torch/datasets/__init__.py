@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
@@ -13,7 +14,7 @@ from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.download import Progress, cache_dir
-from v3d_torch.errors import InputError
+from v3d_torch.errors import GroundTruthWarning, InputError
 
 __all__ = [
     "PAPER_SEQUENCES",
@@ -59,8 +60,23 @@ def open_source(
     Raises:
         InputError: there is no such source, or something in it is wrong.
         DownloadError: it is not here and cannot be downloaded.
+
+    Warns:
+        GroundTruthWarning: its ground truth cannot be read; ``groundtruth`` is None then.
     """
-    options = options or SourceOptions()
+    source = _checked(name, data_root, camera, options or SourceOptions(), download, progress)
+    _warn_of_truth(source)
+    return source
+
+
+def _checked(
+    name: str,
+    data_root: Path | None,
+    camera: CameraChoice,
+    options: SourceOptions,
+    download: bool,
+    progress: Progress | None,
+) -> RGBDStream:
     if options.fps is not None and not _RATES[0] <= options.fps <= _RATES[1]:
         raise InputError(f"--fps {options.fps:g}: give frames a second, between {_RATES[0]:g} and {_RATES[1]:g}")
     try:
@@ -69,6 +85,12 @@ def open_source(
         raise InputError(
             f"{error.filename or name}: cannot be read ({error.strerror}); check its name and who may read it"
         ) from error
+
+
+def _warn_of_truth(source: RGBDStream) -> None:
+    """Say where the caller of this module stands that a source came without its ground truth."""
+    if isinstance(source, StoredFrames) and source.groundtruth_error is not None:
+        warnings.warn(f"{source.groundtruth_error}; there are no true poses", GroundTruthWarning, stacklevel=3)
 
 
 def _open(
@@ -109,13 +131,15 @@ def load_sequence(
     Raises:
         InputError: as `open_source`, or the source is a stream.
         DownloadError: as `open_source`.
+
+    Warns:
+        GroundTruthWarning: as `open_source`.
     """
-    source = open_source(
-        name, data_root=data_root, camera=camera, options=options, download=download, progress=progress
-    )
+    source = _checked(name, data_root, camera, options or SourceOptions(), download, progress)
     if not isinstance(source, RGBDSequence):
         raise InputError(
             f"{name}: is a stream, whose frames come only once and in order; save it first with"
             f" python -m v3d_torch.record --seq {name} --out FOLDER"
         )
+    _warn_of_truth(source)
     return source

@@ -17,10 +17,11 @@ def library(source: str) -> Any:
     """
     try:
         return importlib.import_module("pyrealsense2")
-    except ImportError as error:
+    except ModuleNotFoundError as error:
+        raise InputError(f"{source}: RealSense needs pyrealsense2 ({error}); pip install pyrealsense2") from error
+    except ImportError as error:  # it is there, and lacks what the system should have
         raise InputError(
-            f"{source}: RealSense needs pyrealsense2 ({error}); pip install pyrealsense2, and on Debian or Ubuntu"
-            " apt install libusb-1.0-0"
+            f"{source}: pyrealsense2 cannot be loaded ({error}); on Debian or Ubuntu apt install libusb-1.0-0"
         ) from error
 
 

@@ -116,6 +116,8 @@ def open_path(path: Path, camera: CameraChoice, options: SourceOptions, progress
             reject_options(path, source.what, options, source.options)
             return source.open(path, camera, options, progress)
     how = next((how for ends, how in _UNPACK.items() if path.name.lower().endswith(ends)), _UNKNOWN)
+    if inside := [entry for entry in sorted(path.glob("*/")) if is_source(entry)]:
+        how = f"is no sequence itself but holds {len(inside)}, such as {inside[0].name}; give {inside[0]}"
     raise InputError(f"{path}: {how}")
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.earlier_results import prepare_folder
-from v3d_torch.errors import V3DError
+from v3d_torch.errors import GroundTruthWarning, V3DError
 from v3d_torch.jobs.job import Job
 from v3d_torch.logged import log_to, run_logged
 from v3d_torch.mapping.recorder import Status
@@ -33,7 +34,9 @@ def run_job(job: Job, report: Callable[[int], None]) -> str | None:
     try:
         prepare_folder(job.folder)
         with log_to(job.folder / "run.log"):
-            sequence = load_sequence(job.source, data_root=job.data_root)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", GroundTruthWarning)  # the run ends with that sentence
+                sequence = load_sequence(job.source, data_root=job.data_root)
             segment = make_segmenter(job.config.segmentation)
             pipeline, _ = run_logged(sequence, segment, job.config, job.folder, on_frame)
     except Exception as error:  # a run that breaks must not cost the others; its log has the traceback

@@ -20,7 +20,7 @@ from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
 from v3d_torch.objects.witnesses import Witnesses
-from v3d_torch.segmentation.coco import LIVING, PERSON
+from v3d_torch.segmentation.coco import LIVING, PERSON, class_name
 from v3d_torch.types import Instances
 
 
@@ -39,7 +39,7 @@ class Judged:
 
     Attributes:
         id: number of the object.
-        label: COCO class.
+        label: COCO class; `name` has it in words.
         mask: its pixels, bool, shape :math:`(H, W)`.
         centroid: world frame, metres, float64, shape :math:`(3,)`; nan when unknown.
         votes: of the newest frame, the most over the baselines.
@@ -58,6 +58,11 @@ class Judged:
     verdict: Verdict
     missed: bool
     cloud: Tensor
+
+    @property
+    def name(self) -> str:
+        """Class and number, such as ``person 3``."""
+        return f"{class_name(self.label)} {self.id}"
 
 
 @dataclass(frozen=True)

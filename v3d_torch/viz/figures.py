@@ -192,7 +192,7 @@ def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
         LineCollection([line for line, _ in outlines], colors=[colour for _, colour in outlines], linewidths=1.2)
     )
     height, width = image.shape[1:]
-    for mask, text, verdict in objects:
+    for mask, text, verdict in sorted(objects, key=lambda overlay: overlay[2] != "static"):  # who moves on top
         if not mask.any() or not text:
             continue
         colour = VERDICT_COLOURS[known_verdict(verdict)]

@@ -10,7 +10,6 @@ from torch import Tensor
 from v3d_torch.camera import BackProjector
 from v3d_torch.objects.dynamics import Judged
 from v3d_torch.pipeline import Pipeline, Snapshot
-from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, clusters_figure
 from v3d_torch.viz.figures import Overlay, mask_strip, trajectory_figure
@@ -78,7 +77,7 @@ def _clusters(pipeline: Pipeline, shot: Snapshot) -> list[Cluster]:
 
 
 def _overlay(judged: Judged) -> Overlay:
-    return judged.mask, f"{class_name(judged.label)} {judged.id}", judged.verdict.value
+    return judged.mask, judged.name, judged.verdict.value
 
 
 def _title(shot: Snapshot) -> str:

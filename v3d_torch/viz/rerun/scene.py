@@ -11,8 +11,7 @@ import torch
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
-from v3d_torch.objects.dynamics import Judged, Scene, Verdict
-from v3d_torch.segmentation.coco import class_name
+from v3d_torch.objects.dynamics import Scene, Verdict
 from v3d_torch.viz.ballots import Pair, lines_of
 from v3d_torch.viz.figures import VERDICT_COLOURS
 from v3d_torch.viz.voting import VOTE_COLOUR
@@ -49,7 +48,7 @@ def in_words(scene: Scene) -> str:
     for judged in sorted(scene.objects, key=lambda judged: (judged.verdict is Verdict.STATIC, judged.id)):
         missed = ", missed" if judged.missed else ""
         chamfer = f"{judged.chamfer:.3f}" if math.isfinite(judged.chamfer) else ""
-        rows.append(f"| {_name(judged)} | {judged.verdict.value}{missed} | {judged.votes} | {chamfer} |")
+        rows.append(f"| {judged.name} | {judged.verdict.value}{missed} | {judged.votes} | {chamfer} |")
     return "\n".join(rows)
 
 
@@ -68,7 +67,7 @@ def _log_masks(stream: rr.RecordingStream, scene: Scene) -> None:
     boxes = rr.Boxes2D(
         mins=[sides[:2] for _, sides in in_view],
         sizes=[sides[2:] for _, sides in in_view],
-        labels=[_name(judged) for judged, _ in in_view],
+        labels=[judged.name for judged, _ in in_view],
         class_ids=[CLASS_IDS[judged.verdict] for judged, _ in in_view],
     )
     stream.log("world/camera/image/objects", boxes)
@@ -80,7 +79,7 @@ def _log_votes(stream: rr.RecordingStream, scene: Scene) -> None:
     centroids = rr.Points3D(
         np.array(list(places.values())).reshape(-1, 3),
         class_ids=[CLASS_IDS[judged.verdict] for judged in located.values()],
-        labels=[_name(judged) for judged in located.values()],
+        labels=[judged.name for judged in located.values()],
         radii=rr.Radius.ui_points(5.0),
     )
     stream.log("world/centroids", centroids)
@@ -93,7 +92,3 @@ def _log_votes(stream: rr.RecordingStream, scene: Scene) -> None:
 def _lines(pairs: list[Pair], places: dict[int, NDArray[np.float64]], colour: str, width: float) -> rr.LineStrips3D:
     strips = [np.stack([places[one], places[other]]) for one, other in pairs]
     return rr.LineStrips3D(strips, colors=[rgba(colour)], radii=rr.Radius.ui_points(width))
-
-
-def _name(judged: Judged) -> str:
-    return f"{class_name(judged.label)} {judged.id}"

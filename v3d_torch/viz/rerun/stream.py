@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -16,7 +17,7 @@ from v3d_torch.errors import OutputError, ViewerError
 PORT = 9876
 """On which rerun's viewer listens."""
 
-_PATIENCE = 5.0  # seconds
+_PATIENCE = 20.0  # seconds: a busy machine takes its time
 _SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 
@@ -37,7 +38,7 @@ def open_stream(*, live: bool, file: Path | None, port: int = PORT) -> rr.Record
     stream = rr.RecordingStream("v3d_torch", recording_id=uuid4())
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if live:
-        _reach_viewer(stream, port)
+        _reach_viewer(port)
         sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy"))
     try:
         if file is not None:
@@ -49,7 +50,7 @@ def open_stream(*, live: bool, file: Path | None, port: int = PORT) -> rr.Record
     return stream
 
 
-def _reach_viewer(stream: rr.RecordingStream, port: int) -> None:
+def _reach_viewer(port: int) -> None:
     """Make sure that a viewer listens."""
     if _listens(port):
         return
@@ -57,13 +58,16 @@ def _reach_viewer(stream: rr.RecordingStream, port: int) -> None:
     if sys.platform == "linux" and not any(os.environ.get(name) for name in _SCREENS):
         raise ViewerError(f"--viz rerun: there is no screen to open a viewer on; {instead}")
     own = Path(sys.executable).with_name("rerun")  # where an environment that is not activated has it
+    program = str(own) if own.is_file() else "rerun"
+    # rerun.spawn would do, but its viewer listens to the whole network.
+    here_alone = [f"--port={port}", "--bind=127.0.0.1", "--expect-data-soon"]
     try:
-        rr.spawn(port=port, connect=False, executable_path=str(own) if own.is_file() else None, recording=stream)
-    except RuntimeError as error:
+        viewer = subprocess.Popen([program, *here_alone], start_new_session=True)  # noqa: S603 - it outlives the run
+    except OSError as error:
         raise ViewerError(f"--viz rerun: the viewer cannot be started ({error}); {instead}") from error
     deadline = time.monotonic() + _PATIENCE
-    while not _listens(port):  # rerun has waited already; a machine that is busy may take longer
-        if time.monotonic() > deadline:
+    while not _listens(port):
+        if viewer.poll() is not None or time.monotonic() > deadline:
             raise ViewerError(f"--viz rerun: no viewer came up, its reason may stand above; {instead}")
         time.sleep(0.2)
 
