@@ -12,12 +12,16 @@ import pytest
 import torch
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.config_file import load_config
 from v3d_torch.datasets import load_sequence
+from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.types import Instances, RGBDFrame
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import accuracy
 import growth
+import segmentation
 import speed
 from contenders import OURS, vocabulary
 from contenders.process import ContenderError, Measured, measure
@@ -49,6 +53,29 @@ class TestReplay:
         replay = Replay(sequence, range(2))
         assert [frame.index for frame in replay] == [0, 1]
         assert torch.allclose(replay.stamps, sequence.stamps[:2], atol=1e-6, rtol=0)
+
+
+class TestSegmentation:
+    def test_every_variant_is_a_configuration_of_its_own(self) -> None:
+        configs = [load_config(overrides=variant.overrides) for variant in segmentation.VARIANTS.values()]
+        alike = list(zip(configs, (variant.every for variant in segmentation.VARIANTS.values()), strict=True))
+        assert all(one != other for i, one in enumerate(alike) for other in alike[:i])
+
+    def test_the_network_works_on_every_nth_frame(self, moment: Path) -> None:
+        def segment(frame: RGBDFrame) -> Instances:
+            masks = torch.zeros(2, *frame.image.shape[1:], dtype=torch.bool)
+            masks[0, : frame.index + 1], masks[1] = True, True
+            return Instances(masks, torch.tensor([PERSON, PERSON + 1]), torch.ones(2), torch.zeros(2, 4))
+
+        watched = segmentation.Watched(segment, every=2)
+        assert [len(watched(frame)) for frame, _ in zip(load_sequence(str(moment)), range(3), strict=False)] == [
+            2,
+            0,
+            2,
+        ]
+        width = watched.people[0].shape[1]
+        assert {index: int(seen.sum()) for index, seen in watched.people.items()} == {0: width, 2: 3 * width}
+        assert len(watched.seconds) == 2
 
 
 @pytest.fixture(scope="module")
