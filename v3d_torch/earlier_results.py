@@ -12,10 +12,11 @@ _LOG = "run.log"
 
 _WRITTEN = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "report.html"),
-    *("frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
+    *("checkpoint.v3d", "frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png", "masks/*.png"),
+    *(".*.part*", "figures/.*.part*", "masks/.*.part*"),
 )
-"""All else that a run, or the report of one, writes."""
+"""All else that a run, or the report of one, writes; the last are left where it is killed while it writes."""
 
 
 def prepare_folder(folder: Path) -> None:
