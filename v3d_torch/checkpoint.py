@@ -13,7 +13,7 @@ import torch
 from pydantic import ValidationError
 
 from v3d_torch.config import Config
-from v3d_torch.datasets import RGBDSequence
+from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.mapping.views import StaticView
@@ -95,6 +95,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         InputError: there is no checkpoint, or it is damaged, of another version or of a stream.
     """
     path = folder / CHECKPOINT
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; give the folder of the results of a run")
     if not path.is_file():
         raise InputError(
             f"{folder}: has no checkpoint to go on from; give the folder of a run that was killed after its first one,"
@@ -115,27 +117,38 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         raise InputError(f"{path}: is the state of something else than a run; run the sequence again") from error
 
 
+def what_changed(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
+    """How a sequence differs from the one that the frames of a checkpoint were of, in words; None where it does not.
+
+    Frames are not compared, but for the last one: nor is the ground truth, which is looked at in the end only.
+
+    Raises:
+        InputError: that frame cannot be read.
+    """
+    if not isinstance(sequence, RGBDSequence):
+        return "it is a stream"
+    then, now = checkpoint.sequence, _likeness(sequence)
+    said = {
+        "frames": f"it has {now['frames']} frames and had {then['frames']}",
+        "times": "its frames have other times",
+        "camera": "its camera is another",
+    }
+    for key, what in said.items():
+        if then[key] != now[key]:
+            return what
+    last = checkpoint.state["slam._last"].frame
+    again = sequence[last.index]
+    same = torch.equal(again.image, last.image) and torch.equal(again.depth, last.depth)
+    return None if same else f"frame {last.index} shows something else"
+
+
 def go_on(pipeline: Pipeline, checkpoint: Checkpoint) -> None:
     """Let a new pipeline be as the one was that wrote a checkpoint: called, it takes in the frames that are left.
 
     Args:
         pipeline: of the same sequence and configuration.
         checkpoint: see `read_checkpoint`.
-
-    Raises:
-        InputError: the sequence is another one, or has changed.
     """
-    sequence, last = pipeline.sequence, checkpoint.state["slam._last"].frame
-    changed = "it is a stream"
-    if isinstance(sequence, RGBDSequence):
-        changed = _what_changed(checkpoint.sequence, _likeness(sequence))
-        if not changed and not _shows(sequence, last.index, last.image, last.depth):
-            changed = f"frame {last.index} shows something else"
-    if changed:
-        raise InputError(
-            f"{checkpoint.request.seq}: is not as it was when the run in {checkpoint.folder} began, {changed}; put it"
-            " back, or run it again"
-        )
     put_back(pipeline, checkpoint.state)
     refresh(pipeline.slam)
 
@@ -145,17 +158,3 @@ def _likeness(sequence: RGBDSequence) -> dict[str, Any]:
     stamps = hashlib.sha256(sequence.stamps.numpy().tobytes()).hexdigest()
     likeness = {"frames": len(sequence), "times": stamps, "camera": asdict(sequence.camera)}
     return json.loads(json.dumps(likeness))
-
-
-def _what_changed(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    said = {
-        "frames": f"it has {now['frames']} frames and had {then['frames']}",
-        "times": "its frames have other times",
-        "camera": "its camera is another",
-    }
-    return next((what for key, what in said.items() if then[key] != now[key]), "")
-
-
-def _shows(sequence: RGBDSequence, index: int, image: torch.Tensor, depth: torch.Tensor) -> bool:
-    frame = sequence[index]
-    return torch.equal(frame.image, image) and torch.equal(frame.depth, depth)

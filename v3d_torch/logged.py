@@ -58,14 +58,13 @@ def run_logged(
         viewer: looks on.
         known: map to find the camera in.
         request: what was asked of the run, for whoever goes on with it; None for no checkpoints.
-        checkpoint: of the run, to go on from; None to begin.
+        checkpoint: of the run, with the same sequence, to go on from; None to begin.
 
     Returns:
         What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
 
     Raises:
         OutputError: when the results cannot be written.
-        InputError: the sequence is another than the checkpoint's.
     """
     write_text(folder / "config.yaml", dump_config(config))  # where this has no room, an hour's results have none
     torch.set_num_threads(config.threads)

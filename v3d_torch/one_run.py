@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.checkpoint import CHECKPOINT, Checkpoint, is_finished, read_checkpoint
+from v3d_torch.checkpoint import CHECKPOINT, Checkpoint, is_finished, read_checkpoint, what_changed
 from v3d_torch.config import Config
 from v3d_torch.config_file import FULL, changed, find_config, load_config
 from v3d_torch.console import ProgressBar, progress_bars, result_folder, track
@@ -113,6 +113,11 @@ def _carry_out(
             camera=request.camera,
             options=request.options,
             progress=ProgressBar(progress, "sequence"),
+        )
+    if checkpoint is not None and (change := what_changed(checkpoint, sequence)) is not None:
+        raise InputError(
+            f"{request.seq}: is not as it was when the run in {checkpoint.folder} began, {change}; put it back, or run"
+            " it again"
         )
     known = _known_map(request, sequence, config, checkpoint)
     segment = make_segmenter(config.segmentation, weights=_path(request.weights), masks_dir=masks)
