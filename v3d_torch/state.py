@@ -109,7 +109,8 @@ def load_state(path: Path, segment: Segmenter | None = None) -> V3DSLAM:
     """
     about, state = read_state(path, CLASSES)
     try:
-        config, camera = Config.model_validate(about["config"]), PinholeCamera(**about["camera"])
+        config = Config.model_validate(about["config"])
+        camera = PinholeCamera(**{**about["camera"], "distortion": tuple(about["camera"]["distortion"])})
         if state.keys() != set(OF_SLAM):
             raise ValueError
         known = about["known"]
