@@ -19,6 +19,7 @@ from torch import Tensor
 from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.checkpoint import CHECKPOINT, go_on, read_checkpoint, what_changed, write_checkpoint
+from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.mapping.recorder import Status
@@ -124,6 +125,8 @@ def differences(a: Any, b: Any, where: str, same: dict[int, Any]) -> Iterator[st
     """Where two objects differ, looked through to their last attributes; but for times that were measured."""
     if type(a) is not type(b):
         yield f"{where}: {type(a)} and {type(b)}"
+    elif isinstance(a, Config):  # one looks ahead, the other does not
+        pass
     elif isinstance(a, Tensor):
         if a.dtype != b.dtype or a.shape != b.shape or not torch.equal(a.nan_to_num(), b.nan_to_num()):
             yield where
@@ -205,7 +208,6 @@ def test_stopped_ever_again_it_is_as_if_it_never_was(whole: Pipeline, tmp_path: 
         assert what_changed(checkpoint, run.sequence) is None
         go_on(run, checkpoint)
     assert run().failure is None
-    run.slam.config = whole.slam.config  # apart from lookahead they are the same
     found = list(differences(whole, run, "pipeline", {}))
     assert found == []
     assert torch.equal(run.slam.poses.trajectory().T_wc, whole.slam.poses.trajectory().T_wc)

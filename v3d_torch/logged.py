@@ -16,6 +16,7 @@ from v3d_torch.checkpoint import Checkpoint, go_on
 from v3d_torch.config import Config
 from v3d_torch.config_file import dump_config
 from v3d_torch.datasets import RGBDStream
+from v3d_torch.earlier_results import remove_half_written
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.files import write_text
@@ -73,6 +74,7 @@ def run_logged(
     slam = V3DSLAM(sequence.camera, segment, config, None if known is None else known.map)
     pipeline = Pipeline(sequence, slam, masks, viewer, None if known is None else known.views)
     if checkpoint is not None:
+        remove_half_written(folder)
         go_on(pipeline, checkpoint)
         _LOG.info("goes on after %d frames", checkpoint.frames)
     autosave = Autosave(folder, pipeline, request)
