@@ -23,6 +23,10 @@ from typer.testing import CliRunner, Result
 
 from v3d_torch import run
 from v3d_torch.checkpoint import CHECKPOINT
+from v3d_torch.config import Config
+from v3d_torch.config_file import load_config
+from v3d_torch.jobs.job import Job
+from v3d_torch.jobs.worker import run_job
 from v3d_torch.stored_run import read_run
 
 FRAMES = 20
@@ -83,8 +87,8 @@ def whole(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def assert_same_results(out: Path, whole: Path) -> None:
-    for name in SAME:
+def assert_same_results(out: Path, whole: Path, files: tuple[str, ...] = SAME) -> None:
+    for name in files:
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (out, whole))
     for key in ("ate", "rpe", "status", "frames", "processed", "keyframes", "landmarks", "loops", "failure"):
@@ -343,11 +347,48 @@ def test_a_sequence_that_changed(change: Callable[[Path], str], sequence: Path, 
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 
 
+def test_where_sequences_are_by_the_environment_is_not_asked(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = ["--seq", "seq", "--data-root", str(sequence.parent), "--segmenter", "none", "--serial"]
+    with at_frame(3, lambda: os.kill(os.getpid(), signal.SIGINT)):
+        call(*named, "--out", tmp_path / "named")
+    monkeypatch.setenv("V3D_DATA", str(tmp_path / "elsewhere"))
+    done = call("--resume", tmp_path / "named")
+    assert done.exit_code == 0, done.stderr
+
+
 def test_a_sequence_that_was_moved(sequence: Path, whole: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(sequence, tmp_path / "moved")
     done = call("--resume", out, "--seq", tmp_path / "moved")
     assert done.exit_code == 0, done.stderr
     assert (out / "trajectory.txt").read_bytes() == (whole / "trajectory.txt").read_bytes()
+
+
+# --- runs of a batch
+
+
+def test_a_run_of_a_batch_goes_on_where_it_was_ended(sequence: Path, tmp_path: Path) -> None:
+    config = load_config(overrides=["segmentation.source=none", "lookahead=false"])
+
+    def job(name: str, config: Config = config) -> Job:
+        return Job("seq", str(sequence), FRAMES, None, "own", config, tmp_path / name)
+
+    def stop(frames: int) -> None:
+        if frames == 6:
+            raise KeyboardInterrupt
+
+    assert run_job(job("a"), lambda frames: None) is None
+    assert run_job(job("b"), stop) == f"interrupted after 6 of {FRAMES} frames"
+    seen: list[int] = []
+    assert run_job(job("b"), seen.append) is None
+    assert seen == list(range(7, FRAMES + 1))
+    assert_same_results(tmp_path / "b", tmp_path / "a", SAME[:-1])
+    # With other values, or a checkpoint that is damaged, it begins anew.
+    assert run_job(job("c"), stop) is not None
+    seen.clear()
+    assert run_job(job("c", config.model_copy(update={"seed": 1})), seen.append) is None
+    assert seen == list(range(1, FRAMES + 1))
 
 
 # --- a map of an earlier run, streams

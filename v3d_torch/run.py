@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 
 @app.command()
 def main(
+    context: typer.Context,
     seq: Annotated[
         str | None,
         typer.Option(
@@ -96,6 +98,8 @@ def main(
     )
     with exit_on_error():
         if resume is not None:
+            if (source := context.get_parameter_source("data_root")) is not None and source.name == "ENVIRONMENT":
+                request = replace(request, data_root=None)  # the run knows its own
             resume_run(resume, request, config_name=config, overrides=overrides, out=out, viz=viz, rerun_file=rerun)
         else:
             run_sequence(request, config_name=config, overrides=overrides, out=out, viz=viz, rerun_file=rerun)
