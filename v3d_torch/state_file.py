@@ -110,13 +110,13 @@ def _damaged(path: Path) -> InputError:
 class _Hashed:
     """Passes on what is written, and adds up its checksum.
 
-    An error is kept until `finish`: torch's archives end the program when one comes out of a write.
+    What is raised meanwhile is kept until `finish`: torch's archives make a RuntimeError of it that says nothing.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
         self._digest = hashlib.sha256()
-        self._error: OSError | None = None
+        self._error: BaseException | None = None
 
     def write(self, content: bytes) -> int:
         """Write all of it, or take no notice."""
@@ -124,7 +124,7 @@ class _Hashed:
             try:
                 self._file.write(content)
                 self._digest.update(content)
-            except OSError as error:
+            except BaseException as error:  # Ctrl-C among them
                 self._error = error
         return len(content)
 
@@ -132,7 +132,7 @@ class _Hashed:
         """Nothing is held back."""
 
     def finish(self) -> None:
-        """Raise the first OSError that there was."""
+        """Raise the first error that there was."""
         if self._error is not None:
             raise self._error
 
