@@ -137,7 +137,7 @@ def test_a_run_that_fails_costs_the_others_nothing_and_is_told_at_the_end(
     assert lines[-1] == f"results: {work / 'out'}"
     for config in ("baseline", "few"):
         folder = work / "out" / "broken" / config / "seed0"
-        assert files_in(folder) == FILES
+        assert files_in(folder) == FILES | {"checkpoint.v3d"}
         assert len((folder / "trajectory.txt").read_text().splitlines()) == BROKEN_AT
         assert str(image) in (folder / "run.log").read_text()
         assert str(image) in metrics_of(folder)["failure"]
