@@ -297,7 +297,7 @@ def test_ctrl_c_keeps_what_was_computed_and_resume_goes_on(moment: Path, tmp_pat
     metrics = metrics_of(folder)
     assert 3 <= metrics["processed"] < 80
     assert len((folder / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
-    assert files_in(folder) | {"figures/masks.png", "groundtruth.txt"} == FILES
+    assert files_in(folder) | {"figures/masks.png", "groundtruth.txt"} == FILES | {"checkpoint.v3d"}
     assert pd.read_parquet(out / "runs.parquet")["failure"].tolist() == [metrics["failure"]]
 
     repeated(moment, sequence, frames=4)  # the rest is like the beginning
