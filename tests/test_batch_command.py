@@ -137,7 +137,7 @@ def test_a_run_that_fails_costs_the_others_nothing_and_is_told_at_the_end(
     assert lines[-1] == f"results: {work / 'out'}"
     for config in ("baseline", "few"):
         folder = work / "out" / "broken" / config / "seed0"
-        assert files_in(folder) == FILES
+        assert files_in(folder) == FILES | {"checkpoint.v3d"}
         assert len((folder / "trajectory.txt").read_text().splitlines()) == BROKEN_AT
         assert str(image) in (folder / "run.log").read_text()
         assert str(image) in metrics_of(folder)["failure"]
@@ -297,7 +297,7 @@ def test_ctrl_c_keeps_what_was_computed_and_resume_goes_on(moment: Path, tmp_pat
     metrics = metrics_of(folder)
     assert 3 <= metrics["processed"] < 80
     assert len((folder / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
-    assert files_in(folder) | {"figures/masks.png", "groundtruth.txt"} == FILES
+    assert files_in(folder) | {"figures/masks.png", "groundtruth.txt"} == FILES | {"checkpoint.v3d"}
     assert pd.read_parquet(out / "runs.parquet")["failure"].tolist() == [metrics["failure"]]
 
     repeated(moment, sequence, frames=4)  # the rest is like the beginning

@@ -20,6 +20,7 @@ from .objects.tracker import InstanceTracker
 from .objects.voting import HoughVoting, Votes, hough_vote
 from .objects.voxel import VoxelPool, Voxels, voxel_pool
 from .slam import V3DSLAM, Tracked
+from .state import load_state, save_state
 from .trajectory import read_trajectory, write_trajectory
 from .types import Instances, RGBDFrame, Trajectory
 
@@ -67,10 +68,12 @@ __all__ = [
     "load_config",
     "load_map",
     "load_sequence",
+    "load_state",
     "match_instances",
     "open_source",
     "read_trajectory",
     "save_map",
+    "save_state",
     "smooth_depth",
     "surface_normals",
     "voxel_pool",

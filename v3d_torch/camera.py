@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, partial
 
 import torch
@@ -35,6 +35,10 @@ class PinholeCamera:
     height: int = 480
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: float = 5000.0
+
+    def __getstate__(self) -> dict[str, object]:
+        """What it is made of: what is cached follows from that, and takes megabytes."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def K(self) -> Tensor:

@@ -375,6 +375,15 @@ class LoopConfig(Section):
     sure than the drift that it would correct. A camera that is lost takes what there is."""
 
 
+class CheckpointConfig(Section):
+    """What is written while a run goes, so that little is lost when it is killed."""
+
+    seconds: float = Field(30.0, ge=0)
+    """So often at most, seconds: as much work is lost. 0 is after every frame, infinite never."""
+    share: float = Field(0.02, gt=0, le=1)
+    """Of the time no more than this goes into it: the longer a run, the more there is to write, and the less often."""
+
+
 class Config(Section):
     """The whole configuration of a run."""
 
@@ -394,3 +403,4 @@ class Config(Section):
     mapping: MappingConfig = MappingConfig()
     loop: LoopConfig = LoopConfig()
     dense_map: DenseMapConfig = DenseMapConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()

@@ -60,7 +60,15 @@ def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Conf
         ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
     """
     tree = _read_yaml(path) if path is not None else {}
-    config = _validated(tree, f"{path}")
+    return _overridden(tree, _validated(tree, f"{path}"), overrides)
+
+
+def changed(config: Config, overrides: Iterable[str]) -> Config:
+    """A configuration with other values, given and refused as by `load_config`."""
+    return _overridden(config.model_dump(), config, overrides)
+
+
+def _overridden(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
     for override in overrides:
         _apply_override(tree, override)
         config = _validated(tree, "--set")

@@ -12,10 +12,13 @@ _LOG = "run.log"
 
 _WRITTEN = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "report.html"),
-    *("frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
+    *("checkpoint.v3d", "frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png", "masks/*.png"),
 )
 """All else that a run, or the report of one, writes."""
+
+_HALF_WRITTEN = (".*.part*", "figures/.*.part*", "masks/.*.part*")
+"""Left where a run is killed while it writes."""
 
 
 def prepare_folder(folder: Path) -> None:
@@ -27,7 +30,7 @@ def prepare_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        earlier = [path for pattern in _WRITTEN for path in sorted(folder.glob(pattern))]
+        earlier = [path for pattern in (*_WRITTEN, *_HALF_WRITTEN) for path in sorted(folder.glob(pattern))]
         if earlier and not (folder / _LOG).is_file():
             raise OutputError(f"{earlier[0]}: is there and was left by no run; choose another folder with --out")
         for path in earlier:
@@ -39,3 +42,10 @@ def prepare_folder(folder: Path) -> None:
         raise OutputError(
             f"{folder}: cannot be written ({error.strerror}); choose another folder with --out"
         ) from error
+
+
+def remove_half_written(folder: Path) -> None:
+    """Remove what an earlier run was about to write when it was killed."""
+    for pattern in _HALF_WRITTEN:
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)

@@ -11,9 +11,12 @@ from pathlib import Path
 
 import torch
 
+from v3d_torch.autosave import Autosave
+from v3d_torch.checkpoint import Checkpoint, go_on
 from v3d_torch.config import Config
 from v3d_torch.config_file import dump_config
 from v3d_torch.datasets import RGBDStream
+from v3d_torch.earlier_results import remove_half_written
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.files import write_text
@@ -21,6 +24,7 @@ from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.storage import StoredMap
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.request import Request
 from v3d_torch.results import write_results
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
@@ -40,6 +44,8 @@ def run_logged(
     save_masks: bool = False,
     viewer: Viewer = NULL_VIEWER,
     known: StoredMap | None = None,
+    request: Request | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Pipeline, Evaluation | None]:
     """Run a sequence through a new system, note each frame in the log (`log_to`), and write all results.
 
@@ -52,6 +58,8 @@ def run_logged(
         save_masks: whether to write what is left out of tracking.
         viewer: looks on.
         known: map to find the camera in.
+        request: what was asked of the run, for whoever goes on with it; None for no checkpoints.
+        checkpoint: of the run, with the same sequence, to go on from; None to begin.
 
     Returns:
         What ran, to the end or until its ``run.failure``, and the scores where there is ground truth.
@@ -65,15 +73,23 @@ def run_logged(
     masks = folder / "masks" if save_masks else None
     slam = V3DSLAM(sequence.camera, segment, config, None if known is None else known.map)
     pipeline = Pipeline(sequence, slam, masks, viewer, None if known is None else known.views)
+    if checkpoint is not None:
+        remove_half_written(folder)
+        go_on(pipeline, checkpoint)
+        _LOG.info("goes on after %d frames", checkpoint.frames)
+    autosave = Autosave(folder, pipeline, request)
     _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "any number of")
 
     def note(frame: RGBDFrame, scene: Scene, status: Status) -> None:
         moves = what_moves(scene) or "nothing moves"
         _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, status.value, moves)
+        autosave()
         on_frame(frame, scene, status)
 
     run = pipeline(note)
+    autosave.end()
     evaluation = write_results(folder, pipeline)
+    autosave.discard()
     if run.failure:
         _LOG.error(run.failure)
     return pipeline, evaluation
@@ -86,14 +102,15 @@ def what_moves(scene: Scene) -> str:
 
 
 @contextmanager
-def log_to(path: Path) -> Iterator[None]:
-    """Write the package's log to a new file; an error that leaves the block is in it, with its traceback.
+def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
+    """Write the package's log to a new file, or go on with one; an error that leaves the block is in it, traceback too.
 
     Raises:
         OutputError: when the file cannot be written.
     """
     try:
-        path.write_text("")
+        if not append:
+            path.write_text("")
         # Appended to: what the interpreter itself says of a crash may go to the same file.
         handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
     except OSError as error:

@@ -40,10 +40,11 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
     with ThreadPoolExecutor(1, "perception") as thread:
 
         def begin() -> Callable[[], Percept | None]:
-            outlook = slam.outlook()
+            outlook = slam.next_outlook
             return thread.submit(look, outlook).result if ahead else partial(look, outlook)
 
         upcoming = begin()
         while (percept := upcoming()) is not None:
+            slam.next_outlook = slam.outlook()
             upcoming = begin()
             yield percept

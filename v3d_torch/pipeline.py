@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Iterator, Sized
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.base import KnowsWhoMoves, RGBDStream
+from v3d_torch.datasets.base import KnowsWhoMoves, RGBDSequence, RGBDStream
+from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
@@ -53,6 +55,7 @@ class Run:
         failure: why the run ended before the sequence did; None when it did not.
         interrupted: whether the user ended it.
         unscored: why masks were not evaluated although there are true ones.
+        unsaved: why what there was could not be written while the run went on.
     """
 
     frames: list[dict[str, float]] = field(default_factory=list)
@@ -64,6 +67,7 @@ class Run:
     failure: str | None = None
     interrupted: bool = False
     unscored: str | None = None
+    unsaved: str | None = None
 
 
 class Pipeline:
@@ -71,10 +75,13 @@ class Pipeline:
 
     Args:
         sequence: frames to take in, stored or as they come.
-        slam: the system, new.
+        slam: the system; of a stored sequence, the frames that it has taken in already are passed over.
         masks: folder for an image per frame of what was left out of tracking; None for none.
         viewer: looks on.
         views: of the keyframes of a known map; None for none.
+
+    Attributes:
+        whole: whether no frame is half taken in.
     """
 
     _SNAPSHOTS = 6
@@ -91,6 +98,7 @@ class Pipeline:
         self.slam = slam
         self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.run = Run()
+        self.whole = True
         self._masks = masks
         self._viewer = viewer
         self._step = 1
@@ -108,16 +116,19 @@ class Pipeline:
         Args:
             on_frame: called after each frame.
         """
-        start = time.perf_counter()
+        start = time.perf_counter() - self.run.seconds
+        self.run.failure, self.run.interrupted = None, False
         ahead = self.slam.config.lookahead
         try:
-            with closing(percepts(iter(self.sequence), self.slam, ahead=ahead)) as coming:
+            with closing(percepts(self._coming(), self.slam, ahead=ahead)) as coming:
                 for percept in coming:
+                    self.whole = False
                     frame, scene = percept.frame, self.slam.take_in(percept)
                     seconds = self.slam.clock.lap()
                     self.run.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
                     self._note(frame, scene)
                     self._viewer.show(frame, scene, self.slam, seconds)
+                    self.run.seconds, self.whole = time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, scene, self.slam.poses.statuses[-1])
         except V3DError as error:
@@ -137,6 +148,12 @@ class Pipeline:
         except V3DError as error:
             self.run.failure = self.run.failure or str(error)
         return self.run
+
+    def _coming(self) -> Iterator[RGBDFrame]:
+        done = len(self.slam.poses.statuses) if isinstance(self.sequence, RGBDSequence) else 0
+        if isinstance(self.sequence, StoredFrames):
+            return self.sequence.since(done)
+        return islice(iter(self.sequence), done, None)
 
     def _note(self, frame: RGBDFrame, scene: Scene) -> None:
         self.run.dynamics.extend(_row(frame, judged) for judged in scene.objects)

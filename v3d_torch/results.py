@@ -6,6 +6,7 @@ import json
 import platform
 import re
 import sys
+from collections.abc import Sized
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -64,6 +65,31 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
     Raises:
         OutputError: when the folder cannot be written or the disk is full.
     """
+    trajectory, evaluation = _write_tables(folder, pipeline)
+    _write_maps(folder, pipeline, trajectory)
+    draw_run(folder / "figures", pipeline, trajectory)
+    _write_metrics(folder, pipeline, evaluation, pipeline.run.failure)
+    return evaluation
+
+
+def write_so_far(folder: Path, pipeline: Pipeline) -> None:
+    """Write what a run that goes on has until now: all but maps and figures, which take seconds.
+
+    Args:
+        folder: of this run; made when it is not there.
+        pipeline: between two frames.
+
+    Raises:
+        OutputError: when the folder cannot be written or the disk is full.
+    """
+    _, evaluation = _write_tables(folder, pipeline)
+    done = len(pipeline.slam.poses.statuses)
+    known = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
+    _write_metrics(folder, pipeline, evaluation, f"killed, or still running, after {done}{known} frames")
+
+
+def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluation | None]:
+    """Poses and rows of all frames so far, and the scores where there is ground truth."""
     slam, sequence = pipeline.slam, pipeline.sequence
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
@@ -78,10 +104,11 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
     _write_table(folder / "frames.parquet", *_frames(pipeline))
     _write_table(folder / "dynamics.parquet", pipeline.run.dynamics, _DYNAMICS)
-    _write_maps(folder, pipeline, trajectory)
-    draw_run(folder / "figures", pipeline, trajectory)
-    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation), indent=2) + "\n")
-    return evaluation
+    return trajectory, evaluation
+
+
+def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> None:
+    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation, failure), indent=2) + "\n")
 
 
 def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
@@ -105,7 +132,7 @@ def _write_table(path: Path, rows: list[dict[str, object]], schema: pa.Schema) -
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
 
 
-def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, object]:
+def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> dict[str, object]:
     slam, run = pipeline.slam, pipeline.run
     statuses = slam.poses.statuses
     frames = len(statuses)
@@ -123,7 +150,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
         "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.keyframes),
         "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
         "loops": slam.loops.count,
-        "failure": run.failure,
+        "failure": failure,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,
         "seconds_per_stage": dict(slam.clock.seconds),

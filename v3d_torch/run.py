@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,13 +13,14 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 
 @app.command()
 def main(
+    context: typer.Context,
     seq: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="demo, a TUM RGB-D sequence (fr3/w/xyz), a folder, bag or video of RGB-D images, or a live camera"
             " (realsense:)."
         ),
-    ],
+    ] = None,
     data_root: Annotated[
         Path | None, typer.Option(envvar="V3D_DATA", help="Where named sequences are, or are downloaded to.")
     ] = None,
@@ -58,36 +60,53 @@ def main(
         bool, typer.Option("--serial", help="One thing after the other on one core, with the same results.")
     ] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: leave the map as it is.")] = False,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Go on with the run whose results are there, which was killed or interrupted."
+        ),
+    ] = None,
 ) -> None:
     """Track an RGB-D camera where people move; map what stands still."""
-    from v3d_torch.console import exit_on_error, run_sequence
-    from v3d_torch.datasets import SourceOptions
+    from v3d_torch.console import exit_on_error
+    from v3d_torch.one_run import resume_run, run_sequence
+    from v3d_torch.request import Request
 
-    overrides = list(set_ or [])
+    if seq is None and resume is None:
+        raise typer.BadParameter("say what to run, or which run to go on with (--resume)", param_hint="--seq")
     segmenter = segmenter or ("masks" if masks is not None else None)
+    overrides = list(set_ or [])
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
     overrides += ["mapping.enabled=false"] if localise else []
     overrides += ["lookahead=false", "segmentation.threads=1"] if serial else []
+    request = Request(
+        seq=seq or "",
+        data_root=_text(data_root),
+        camera=camera,
+        rgb_topic=rgb_topic,
+        depth_topic=depth_topic,
+        info_topic=info_topic,
+        fps=fps,
+        masks=_text(masks),
+        weights=_text(weights),
+        map_in=_text(map_in),
+        map_out=_text(map_out),
+        save_masks=save_masks,
+    )
     with exit_on_error():
-        run_sequence(
-            seq,
-            data_root=data_root,
-            camera=camera,
-            options=SourceOptions(rgb_topic, depth_topic, info_topic, fps),
-            config_name=config,
-            overrides=overrides,
-            masks=masks,
-            weights=weights,
-            out=out,
-            save_masks=save_masks,
-            viz=viz,
-            rerun_file=rerun,
-            map_in=map_in,
-            map_out=map_out,
-        )
+        if resume is not None:
+            if (source := context.get_parameter_source("data_root")) is not None and source.name == "ENVIRONMENT":
+                request = replace(request, data_root=None)  # the run knows its own
+            resume_run(resume, request, config_name=config, overrides=overrides, out=out, viz=viz, rerun_file=rerun)
+        else:
+            run_sequence(request, config_name=config, overrides=overrides, out=out, viz=viz, rerun_file=rerun)
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
 
 
 if __name__ == "__main__":

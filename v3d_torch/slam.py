@@ -28,7 +28,7 @@ from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.tracker import MapTracker
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
-from v3d_torch.types import Instances, RGBDFrame, Segmenter
+from v3d_torch.types import Instances, Remembering, RGBDFrame, Segmenter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +57,7 @@ class Percept:
         features: of the whole image.
         clouds: of the instances.
         seconds: that each stage took.
+        memory: of the segmentation after the frame, where it has one (`Remembering`).
     """
 
     frame: RGBDFrame
@@ -65,6 +66,7 @@ class Percept:
     features: Features
     clouds: ObjectClouds
     seconds: dict[str, float]
+    memory: object
 
 
 class V3DSLAM:
@@ -78,6 +80,9 @@ class V3DSLAM:
         segment: gives the instances of a frame; None takes what the configuration names.
         config: of all stages.
         known: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
+
+    Attributes:
+        next_outlook: with which the next frame is to be looked at, see `perceive`.
 
     Raises:
         WeightsError: the network's weights are not to be had.
@@ -95,8 +100,9 @@ class V3DSLAM:
         self.poses = PoseRecorder()
         self.clock = StageClock()
         self._last: View | None = None
+        self._memory: object = None
         self._known = known
-        self._outlook = self.outlook()
+        self.next_outlook = self.outlook()
         self._ready = camera is not None
         if camera is not None:
             self._set_up(camera)
@@ -129,8 +135,8 @@ class V3DSLAM:
         if not isinstance(frame, RGBDFrame):
             what = type(frame).__qualname__  # type: ignore[unreachable]
             raise InputError(f"V3DSLAM takes frames, this is a {what}; make one of arrays with RGBDFrame.of")
-        percept = self.perceive(frame, self._outlook)
-        self._outlook = self.outlook()
+        percept = self.perceive(frame, self.next_outlook)
+        self.next_outlook = self.outlook()
         return self.take_in(percept)
 
     def outlook(self) -> Outlook | None:
@@ -162,11 +168,13 @@ class V3DSLAM:
             features = self.detect(frame.image, depth)
         with clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
-        return Percept(frame, instances, depth, features, clouds, dict(clock.seconds))
+        memory = self.segment.memory if isinstance(self.segment, Remembering) else None
+        return Percept(frame, instances, depth, features, clouds, clock.seconds, memory)
 
     def take_in(self, percept: Percept) -> Tracked:
         """Follow the camera and the objects on to the next frame."""
         frame, instances, depth, features = percept.frame, percept.instances, percept.depth, percept.features
+        self._memory = percept.memory  # not as the segmentation has it now: it may be a frame ahead
         self.clock.add(percept.seconds)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             seen = View(frame, depth, features)

@@ -90,10 +90,13 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         )
     config_path = folder / "config.yaml"
     config_text = read_text(config_path, "it is a configuration in YAML") if config_path.is_file() else ""
-    metrics, trajectory = _read_metrics(folder / "metrics.json"), _read_poses(folder / "trajectory.txt")
-    if trajectory is not None and len(trajectory) != len(metrics.status):
+    metrics, trajectory = read_metrics(folder / "metrics.json"), _read_poses(folder / "trajectory.txt")
+    frames = len(metrics.status)
+    if trajectory is not None and metrics.failure is not None:  # killed between writing the two: it has more poses
+        trajectory = Trajectory(trajectory.stamps[:frames], trajectory.T_wc[:frames])
+    if trajectory is not None and len(trajectory) != frames:
         raise InputError(
-            f"{folder}: trajectory.txt has {len(trajectory)} poses, metrics.json {len(metrics.status)} frames; they are"
+            f"{folder}: trajectory.txt has {len(trajectory)} poses, metrics.json {frames} frames; they are"
             " not of the same run, run again"
         )
     truth_path = groundtruth or folder / "groundtruth.txt"
@@ -121,7 +124,12 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     )
 
 
-def _read_metrics(path: Path) -> Metrics:
+def read_metrics(path: Path) -> Metrics:
+    """Read the ``metrics.json`` of a run.
+
+    Raises:
+        InputError: it cannot be read, or is not what a run of this version writes.
+    """
     text = read_text(path, "it is written by a run")
     try:
         tree = json.loads(text)

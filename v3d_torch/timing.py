@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
@@ -16,8 +15,8 @@ class StageClock:
     """
 
     def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-        self._lap: dict[str, float] = defaultdict(float)
+        self.seconds: dict[str, float] = {}
+        self._lap: dict[str, float] = {}
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -31,10 +30,10 @@ class StageClock:
     def add(self, seconds: Mapping[str, float]) -> None:
         """Add what another clock measured, by stage."""
         for stage, elapsed in seconds.items():
-            self.seconds[stage] += elapsed
-            self._lap[stage] += elapsed
+            for total in (self.seconds, self._lap):
+                total[stage] = total.get(stage, 0.0) + elapsed
 
     def lap(self) -> dict[str, float]:
         """Seconds by stage since this was last asked: of a frame, when asked after each."""
-        lap, self._lap = dict(self._lap), defaultdict(float)
+        lap, self._lap = self._lap, {}
         return lap

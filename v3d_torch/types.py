@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -118,6 +119,18 @@ class Instances:
 
 Segmenter = Callable[[RGBDFrame], Instances]
 """Finds the instances in a frame's colour image."""
+
+
+@runtime_checkable
+class Remembering(Protocol):
+    """A segmenter that goes by the frames before.
+
+    Attributes:
+        memory: all that it remembers, of tensors and plain Python values, which it replaces and does not change. Given
+            back to another one made alike, that one goes on in its place.
+    """
+
+    memory: object
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ CASES = [
         edit(RGB[5], half),
         Says(
             "{seq}/rgb/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out})",
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -110,7 +110,7 @@ CASES = [
         edit(DEPTH[5], half),
         Says(
             "{seq}/depth/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out})",
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -119,7 +119,7 @@ CASES = [
         edit(RGB[5], flipped),
         Says(
             "{seq}/rgb/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out})",
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -128,7 +128,7 @@ CASES = [
         edit(DEPTH[5], flipped),
         Says(
             "{seq}/depth/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out})",
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -137,7 +137,7 @@ CASES = [
         write(RGB[5], ""),
         Says(
             "{seq}/rgb/1305031102.500000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it"
-            " again (the results of the 5 frames before are in {out})",
+            " again (the results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -146,7 +146,7 @@ CASES = [
         write(DEPTH[5], ""),
         Says(
             "{seq}/depth/1305031102.500000.png: is no image, or none of PNG, JPEG or TIFF; copy or export"
-            " it again (the results of the 5 frames before are in {out})",
+            " it again (the results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -155,7 +155,7 @@ CASES = [
         write(RGB[2], PAGE),
         Says(
             "{seq}/rgb/1305031102.200000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it"
-            " again (the results of the 2 frames before are in {out})",
+            " again (the results of the 2 frames before are in {out}; go on with --resume {out})",
             kept=2,
         ),
     ),
@@ -172,7 +172,7 @@ CASES = [
         write(RGB[4], png(depth())),
         Says(
             "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image where colour belongs; are colour and"
-            " depth swapped? (the results of the 4 frames before are in {out})",
+            " depth swapped? (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
     ),
@@ -181,7 +181,7 @@ CASES = [
         write(DEPTH[4], png(colour(0))),
         Says(
             "{seq}/depth/1305031102.400000.png: is a colour image where depth belongs; are colour and depth"
-            " swapped? (the results of the 4 frames before are in {out})",
+            " swapped? (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
     ),
@@ -197,7 +197,7 @@ CASES = [
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
         Says(
             "{seq}/depth/1305031102.400000.png: is 8-bit, a depth image has 16 bits; export the depth"
-            " again, unscaled (the results of the 4 frames before are in {out})",
+            " again, unscaled (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
     ),
@@ -272,7 +272,8 @@ CASES = [
         write(RGB[3], png(SMALL)),
         Says(
             "{seq}/depth/1305031102.300000.png: has 80x60 pixels, its colour image 40x30; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out})",
+            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
+            " go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -281,7 +282,8 @@ CASES = [
         write(DEPTH[3], png(depth()[::2, ::2])),
         Says(
             "{seq}/depth/1305031102.300000.png: has 40x30 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out})",
+            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
+            " go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -290,7 +292,8 @@ CASES = [
         write(DEPTH[3], png(depth().T.copy())),
         Says(
             "{seq}/depth/1305031102.300000.png: has 60x80 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out})",
+            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
+            " go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -299,7 +302,7 @@ CASES = [
         write(RGB[3], bomb(40000, 40000, 8, 2)),
         Says(
             "{seq}/rgb/1305031102.300000.png: claims more than 64 million pixels; copy or export it again"
-            " (the results of the 3 frames before are in {out})",
+            " (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -308,7 +311,7 @@ CASES = [
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
         Says(
             "{seq}/depth/1305031102.300000.png: claims more than 64 million pixels; copy or export it again"
-            " (the results of the 3 frames before are in {out})",
+            " (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),

@@ -158,7 +158,7 @@ CASES = [
         changed(seven_scenes(), "frame-000003.depth.png", half),
         Says(
             "{root}/take/frame-000003.depth.png: is truncated or broken; copy or download it again (the"
-            " results of the 3 frames before are in {out})",
+            " results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),

@@ -176,7 +176,7 @@ CASES = [
         lambda place: None,
         Says(
             "{seq}/rgb/1305031102.400000.png: is listed but not there; copy the sequence again, whole (the"
-            " results of the 4 frames before are in {out})",
+            " results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.folder)),
@@ -186,7 +186,7 @@ CASES = [
         lambda place: None,
         Says(
             "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
-            " (the results of the 4 frames before are in {out})",
+            " (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
         lambda place: at_frame(4, broke),
@@ -194,7 +194,11 @@ CASES = [
     Case(
         "Ctrl-C",
         SERIAL,
-        Says("interrupted after 5 of 8 frames (the results of the 5 frames before are in {out})", kept=5),
+        Says(
+            "interrupted after 5 of 8 frames (the results of the 5 frames before are in {out}; go on with --resume"
+            " {out})",
+            kept=5,
+        ),
         lambda place: at_frame(4, lambda: os.kill(os.getpid(), signal.SIGINT)),
     ),
     Case(
@@ -208,7 +212,7 @@ CASES = [
         unreadable(f"rgb/{STAMPS[4]}.png"),
         Says(
             "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check who may read it"
-            " (the results of the 4 frames before are in {out})",
+            " (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
         lambda place: without_root_rights(),

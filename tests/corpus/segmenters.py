@@ -81,7 +81,7 @@ CASES = [
         masks(lambda i: ids(1), STAMPS[::2]),
         Says(
             "{seq}/ids: has no id image for frame 1 at 1305031102.100000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 1 frames before are in {out})",
+            " belongs to this sequence (the results of the 1 frames before are in {out}; go on with --resume {out})",
             kept=1,
         ),
     ),
@@ -90,7 +90,7 @@ CASES = [
         masks(lambda i: ids(1), ["0", "1", "2"]),
         Says(
             "{seq}/ids: has no id image for frame 3 at 1305031102.300000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 3 frames before are in {out})",
+            " belongs to this sequence (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -126,7 +126,7 @@ CASES = [
         masks(lambda i: ids(1)[: 60 if i == 3 else None]),
         Says(
             "{seq}/ids/1305031102.300000.png: cannot be read as an image; write it again (the results of"
-            " the 3 frames before are in {out})",
+            " the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -135,7 +135,7 @@ CASES = [
         masks(lambda i: b"masks" if i == 3 else ids(1)),
         Says(
             "{seq}/ids/1305031102.300000.png: cannot be read as an image; write it again (the results of"
-            " the 3 frames before are in {out})",
+            " the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),

@@ -50,7 +50,11 @@ class StoredFrames(ABC):
         return self.stamps.shape[0]
 
     def __iter__(self) -> Iterator[RGBDFrame]:
-        return (self[index] for index in range(len(self)))
+        return self.since(0)
+
+    def since(self, index: int) -> Iterator[RGBDFrame]:
+        """The frames from one on, read as they are asked for."""
+        return (self[later] for later in range(index, len(self)))
 
     def __getitem__(self, index: int) -> RGBDFrame:
         """Decode frame ``index``, from 0.

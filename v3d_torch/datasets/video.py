@@ -69,13 +69,13 @@ class VideoSequence(StoredFrames):
         self._colours = Cursor(lambda: _frames(colour))
         self._depths = Cursor(lambda: _frames(depth, raw=True))
 
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        """All frames.
+    def since(self, index: int) -> Iterator[RGBDFrame]:
+        """See `StoredFrames.since`.
 
         Raises:
             InputError: as `__getitem__`; and behind the last frame, where a video breaks off.
         """
-        yield from super().__iter__()
+        yield from super().since(index)
         if self._cut is not None:
             raise InputError(self._cut)
 

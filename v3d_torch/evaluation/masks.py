@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -76,7 +75,7 @@ class MaskEvaluation:
     def __init__(self) -> None:
         self._frames = 0
         self._moving, self._static, self._anywhere = torch.zeros(3, 2, dtype=torch.int64)
-        self._sightings: dict[int, list[tuple[float, int]]] = defaultdict(list)
+        self._sightings: dict[int, list[tuple[float, int]]] = {}
 
     def add(self, stamp: float, truth: Tensor, depth: Tensor, left_out: Tensor, objects: Mapping[int, Tensor]) -> None:
         """Take in a frame; frames come in order of time.
@@ -97,7 +96,7 @@ class MaskEvaluation:
         self._anywhere += tally(left_out, static)
         people = people_in_view(truth, measured, round(self.IN_VIEW * truth.numel()))
         for person, id_ in zip(people.tolist(), covering_ids(truth, people, objects).tolist(), strict=True):
-            self._sightings[person].append((stamp, id_))
+            self._sightings.setdefault(person, []).append((stamp, id_))
 
     def scores(self) -> MaskScores | None:
         """What has come together; None where no frame had a true mask."""

@@ -5,19 +5,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 
+from v3d_torch.checkpoint import Checkpoint, read_checkpoint, what_changed
 from v3d_torch.datasets import load_sequence
 from v3d_torch.earlier_results import prepare_folder
-from v3d_torch.errors import GroundTruthWarning, V3DError
-from v3d_torch.jobs.job import Job
+from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
+from v3d_torch.jobs.job import Job, on_one_thread
 from v3d_torch.logged import log_to, run_logged
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Scene
+from v3d_torch.request import Request
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.types import RGBDFrame
 
 
 def run_job(job: Job, report: Callable[[int], None]) -> str | None:
-    """Run a sequence and write its log and its results.
+    """Run a sequence and write its log and its results. Where it was killed before, it goes on from its checkpoint.
 
     Args:
         job: to be carried out.
@@ -32,16 +34,39 @@ def run_job(job: Job, report: Callable[[int], None]) -> str | None:
         report(frame.index + 1)
 
     try:
-        prepare_folder(job.folder)
-        with log_to(job.folder / "run.log"):
+        checkpoint = _checkpoint(job)
+        if checkpoint is None:
+            prepare_folder(job.folder)
+        with log_to(job.folder / "run.log", append=checkpoint is not None):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", GroundTruthWarning)  # the run ends with that sentence
                 sequence = load_sequence(job.source, data_root=job.data_root)
+            if checkpoint is not None and what_changed(checkpoint, sequence) is not None:
+                prepare_folder(job.folder)
+                checkpoint = None
             segment = make_segmenter(job.config.segmentation)
-            pipeline, _ = run_logged(sequence, segment, job.config, job.folder, on_frame)
+            pipeline, _ = run_logged(
+                sequence, segment, job.config, job.folder, on_frame, request=_request(job), checkpoint=checkpoint
+            )
     except Exception as error:  # a run that breaks must not cost the others; its log has the traceback
         return sentence(error)
     return pipeline.run.failure
+
+
+def _request(job: Job) -> Request:
+    return Request(job.source, data_root=None if job.data_root is None else str(job.data_root))
+
+
+def _checkpoint(job: Job) -> Checkpoint | None:
+    """Of the same run, begun earlier; None where there is none that is whole: then it begins anew."""
+    try:
+        checkpoint = read_checkpoint(job.folder)
+    except InputError:
+        return None
+    same = checkpoint.request == _request(job).anywhere() and on_one_thread(checkpoint.config) == on_one_thread(
+        job.config
+    )
+    return checkpoint if same else None
 
 
 def sentence(error: Exception) -> str:

@@ -9,7 +9,7 @@ camera looks through the place, the point has gone; where an earlier view looked
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -40,6 +40,10 @@ class DepthView:
     shift: int = 0
 
     _SLACK: ClassVar[float] = 0.01  # of the image's width, 0.6 degrees of a Kinect's: poses are no better
+
+    def __getstate__(self) -> dict[str, object]:
+        """What it is made of, without what is cached."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def missing(self) -> Tensor:

@@ -45,8 +45,17 @@ class Upright:
         seen = [self._see(frame, turns) for turns in range(4)]
         for turns, instances in enumerate(seen):
             # Squared: what is not upright is seen as well, but as many doubtful things.
-            self._up += float(instances.scores.square().sum()) * frame.T_cw[:3, :3].T @ _edge(turns)
+            self._up = self._up + float(instances.scores.square().sum()) * frame.T_cw[:3, :3].T @ _edge(turns)
         return seen[self._turns(frame.T_cw)]
+
+    @property
+    def memory(self) -> tuple[int, Tensor]:
+        """Calls and the sum of their votes, see `Remembering`."""
+        return self._calls, self._up
+
+    @memory.setter
+    def memory(self, memory: tuple[int, Tensor]) -> None:
+        self._calls, self._up = memory
 
     def _looks_around(self) -> bool:
         """Whether to look at all turns: often at first, then after ever longer times, for the map may be corrected."""
