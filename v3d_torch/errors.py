@@ -27,3 +27,7 @@ class ViewerError(V3DError):
 
 class OutputError(V3DError):
     """A result cannot be written: no permission, disk full."""
+
+
+class NumericsError(V3DError):
+    """A stage gave a number that is NaN or infinite; raised in debug mode, see `v3d_torch.doors`."""
