@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+import sklearn.cluster
 import torch
-from sklearn.cluster import DBSCAN as SklearnDBSCAN
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
@@ -78,7 +78,7 @@ def everywhere(cloud: Tensor) -> Tensor:
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 def test_dbscan(shape: str, offset: float) -> None:
     cloud = points(shape) + offset * KILOMETRE
-    expected = SklearnDBSCAN(eps=0.1, min_samples=4).fit(points(shape).numpy()).labels_
+    expected = sklearn.cluster.DBSCAN(eps=0.1, min_samples=4).fit(points(shape).numpy()).labels_
     np.testing.assert_array_equal(dbscan(cloud[None], everywhere(cloud[None]), 0.1, 4)[0].numpy(), expected)
 
 
