@@ -39,7 +39,7 @@ HEAD = """# Licences
 The code of v3d_torch is under Apache-2.0. Below is what it asks for and what that brings, with the versions of
 `constraints.txt` and the licence that each package states. Made by `python docs/hooks/licences.py > docs/licences.md`.
 
-- **Nothing that a run needs is under a copyleft licence.** The extras `ray`, `docs` and `test` bring some under MPL-2.0.
+- **Nothing that a run needs is under a copyleft licence.** `ray`, `docs` and `test` bring some under MPL-2.0.
 - Tests compare with evo and read files with plyfile: both are under the GPL, and are in the extra `test` alone.
 - Wheels hold libraries of others under their own licences, as OpenCV's holds FFmpeg's under the LGPL-2.1: see their
   `*.dist-info` folders.
