@@ -187,11 +187,12 @@ def score(case: Case, result: Result, plain: Result, T_gc: Tensor) -> Score:
         case: that was run.
         result: of the run.
         plain: of the run without interruption, at least as long.
-        T_gc: true poses of the frames of the sequence, camera to world, shape :math:`(count, 4, 4)`.
+        T_gc: true poses of the frames of the sequence, see `true_poses`, shape :math:`(count, 4, 4)`.
     """
     shown, positions = torch.tensor(case.shown), torch.tensor(case.plain)
     truth = T_gc[shown.clamp(min=0)]
-    found = (shown != COVERED) & torch.tensor([status in FOUND for status in result.statuses])
+    seen = (shown != COVERED) & truth[:, 0, 3].isfinite()
+    found = seen & torch.tensor([status in FOUND for status in result.statuses])
     both = found & (positions != NOWHERE)
     errors = absolute_errors(truth, result.T_wc, align(truth[both], result.T_wc[both]))
     true, without = truth[both], plain.T_wc[positions[both]]
@@ -202,7 +203,7 @@ def score(case: Case, result: Result, plain: Result, T_gc: Tensor) -> Score:
             for status, index in zip(result.statuses, case.shown, strict=True)
             if index == COVERED
         ),
-        found=float(found.sum() / (shown != COVERED).sum()),
+        found=float(found.sum() / seen.sum()),
         ate=float(errors[both].square().mean().sqrt()),
         reference=float(absolute_errors(true, without, align(true, without)).square().mean().sqrt()),
         worst=float(errors[found].max()),
@@ -221,17 +222,17 @@ def recovery(case: Case, online: Sequence[Status], truth: Tensor) -> float | Non
 
 
 def true_poses(sequence: RGBDSequence) -> Tensor:
-    """Of every frame, camera to world.
+    """Of every frame, camera to world; NaN where there is none.
 
     Raises:
-        InputError: a frame has none.
+        InputError: there is no ground truth.
     """
-    truth = sequence.groundtruth
-    frames = Trajectory(sequence.stamps, torch.eye(4, dtype=torch.float64).expand(len(sequence), 4, 4))
-    matches = None if truth is None else match(truth, frames, 0.05)
-    if truth is None or matches is None or len(matches) < len(sequence):
-        raise InputError(f"{sequence.name}: not every frame has ground truth; name another sequence")
-    return truth.T_wc[matches.groundtruth]
+    if sequence.groundtruth is None:
+        raise InputError(f"{sequence.name}: has no ground truth; name another sequence")
+    T_gc = torch.full((len(sequence), 4, 4), torch.nan, dtype=torch.float64)
+    matches = match(sequence.groundtruth, Trajectory(sequence.stamps, T_gc))
+    T_gc[matches.estimate] = sequence.groundtruth.T_wc[matches.groundtruth]
+    return T_gc
 
 
 def table(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,9 @@ def test_scores_are_those_of_a_run_made_by_hand() -> None:
     off[7, 2, 3] += 0.2
     wrong = lost.score(case, lost.Result(off, online, online), exact, truth)
     assert 0.1 < wrong.worst < 0.2 and wrong.ate > 0.05 and wrong.reference == pytest.approx(0, abs=1e-12)
+    unknown = torch.cat([truth, torch.full((1, 4, 4), torch.nan)])
+    half = replace(case, shown=[0, 1, 2, -1, -1, 1, 3, 3])
+    assert lost.score(half, exact, exact, unknown).found == pytest.approx(3 / 4)
     never = lost.recovery(case, 5 * [TRACKED] + 3 * [LOST], truth[[0, 1, 2, 0, 0, 1, 1, 1]])
     assert never == torch.inf
 
