@@ -64,9 +64,10 @@ def _header(elements: dict[str, NDArray[np.void]]) -> str:
     """What the rows that follow are: an element with a property per column, or a list of vertices."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for element, rows in elements.items():
+        names = rows.dtype.names or ()
         lines.append(f"element {element} {len(rows)}")
-        for name in rows.dtype.names or ():
-            kind = _TYPES[rows.dtype[name].base.str[1:]]
+        for name in names:
             if name != _CORNERS:
-                lines.append(f"property {'list uchar ' * (_CORNERS in rows.dtype.names)}{kind} {name}")
+                several = "list uchar " if _CORNERS in names else ""
+                lines.append(f"property {several}{_TYPES[rows.dtype[name].base.str[1:]]} {name}")
     return "\n".join([*lines, "end_header", ""])
