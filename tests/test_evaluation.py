@@ -116,6 +116,12 @@ def test_rpe_pairs_are_those_of_the_benchmarks_tool() -> None:
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == expected
 
 
+@pytest.mark.parametrize(("second", "pairs"), [(0.5, [(0, 1)]), (0.625, [(0, 1)]), (0.4375, [])])
+def test_convention_a_pair_may_be_off_by_half(second: float, pairs: list[tuple[int, int]]) -> None:
+    stamps = torch.tensor([0.0, second, 5.0, 10.0], dtype=torch.float64)
+    assert list(zip(*(poses.tolist() for poses in pairs_apart(stamps, 1.0)), strict=True)) == pairs
+
+
 def test_drift_is_measured_over_a_second_unless_told_otherwise() -> None:
     groundtruth = walk(90, seed=16)
     estimate = noisy(groundtruth, seed=17)
