@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from sklearn.neighbors import KDTree
 from torch import Tensor
 
@@ -70,6 +71,13 @@ def test_equals_a_kd_tree(seed: int, n: int, m: int, shape: str, cells: int, awa
 def test_far_from_the_origin_float64_keeps_its_digits() -> None:
     p, q = random_pair(2, 300, 200)
     torch.testing.assert_close(chamfer_distance(p + 1e6, q + 1e6), chamfer_distance(p, q), rtol=1e-6, atol=0.0)
+
+
+def test_clouds_of_a_batch_may_lie_far_from_each_other() -> None:
+    """Each pair is seen from itself: from another's place its points would be one in float32."""
+    p, q = random_pair(3, 200, 150)
+    offsets = torch.tensor([0.0, 1e6, -3e6], dtype=torch.float64)[:, None, None]
+    torch.testing.assert_close(chamfer_distance(p + offsets, q + offsets), chamfer_distance(p, q), rtol=1e-5, atol=0)
 
 
 def test_memory_is_linear() -> None:
@@ -182,7 +190,7 @@ def test_refuses_other_shapes(
     p: tuple[int, ...], q: tuple[int, ...], p_valid: tuple[int, ...] | None, q_valid: tuple[int, ...] | None
 ) -> None:
     valid = [None if shape is None else torch.ones(shape, dtype=torch.bool) for shape in (p_valid, q_valid)]
-    with pytest.raises(Exception, match="shape"):
+    with pytest.raises(ShapeError):
         chamfer_distance(torch.zeros(p), torch.zeros(q), *valid)
 
 

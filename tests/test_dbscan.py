@@ -10,6 +10,7 @@ import sklearn.cluster
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from scipy.spatial import cKDTree
 from sklearn.neighbors import NearestNeighbors
 
@@ -189,5 +190,5 @@ def test_refuses_nonsense() -> None:
 
 @pytest.mark.parametrize(("points", "valid"), [((2, 3), (2, 3)), ((1, 2, 2), (1, 2)), ((1, 2, 3), (1, 3)), ((3,), ())])
 def test_refuses_other_shapes(points: tuple[int, ...], valid: tuple[int, ...]) -> None:
-    with pytest.raises(Exception, match="shape"):
+    with pytest.raises(ShapeError):
         dbscan(torch.zeros(points), torch.ones(valid, dtype=torch.bool), 0.1, 3)
