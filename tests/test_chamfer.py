@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from sklearn.neighbors import KDTree
 from torch import Tensor
 
@@ -70,6 +71,13 @@ def test_equals_a_kd_tree(seed: int, n: int, m: int, shape: str, cells: int, awa
 def test_far_from_the_origin_float64_keeps_its_digits() -> None:
     p, q = random_pair(2, 300, 200)
     torch.testing.assert_close(chamfer_distance(p + 1e6, q + 1e6), chamfer_distance(p, q), rtol=1e-6, atol=0.0)
+
+
+def test_clouds_of_a_batch_may_lie_far_from_each_other() -> None:
+    """Each pair is seen from itself: from another's place its points would be one in float32."""
+    p, q = random_pair(3, 200, 150)
+    offsets = torch.tensor([0.0, 1e6, -3e6], dtype=torch.float64)[:, None, None]
+    torch.testing.assert_close(chamfer_distance(p + offsets, q + offsets), chamfer_distance(p, q), rtol=1e-5, atol=0)
 
 
 def test_memory_is_linear() -> None:
@@ -166,5 +174,38 @@ def test_threads_change_no_byte() -> None:
 def test_refuses_points_that_are_not_finite(bad: float) -> None:
     p, q = random_pair(1, 4, 4)
     q[0, 1, 0] = bad
-    with pytest.raises(InputError, match="not finite"):
+    message = r"^A point of a cloud to be compared is not finite; mark points without depth as not valid\.$"
+    with pytest.raises(InputError, match=message):
         chamfer_distance(p, q)
+
+
+@pytest.mark.parametrize(
+    ("p", "q", "p_valid", "q_valid"),
+    [
+        *[((2, 4, 2), (2, 5, 3), None, None), ((2, 4, 3), (2, 5, 2), None, None), ((2, 4, 3), (1, 5, 3), None, None)],
+        *[((4, 3), (5, 3), None, None), ((2, 4, 3), (2, 5, 3), (2, 3), None), ((2, 4, 3), (2, 5, 3), None, (1, 5))],
+    ],
+)
+def test_refuses_other_shapes(
+    p: tuple[int, ...], q: tuple[int, ...], p_valid: tuple[int, ...] | None, q_valid: tuple[int, ...] | None
+) -> None:
+    valid = [None if shape is None else torch.ones(shape, dtype=torch.bool) for shape in (p_valid, q_valid)]
+    with pytest.raises(ShapeError):
+        chamfer_distance(torch.zeros(p), torch.zeros(q), *valid)
+
+
+def test_the_module_looks_at_both_masks() -> None:
+    p, q = random_pair(2, 6, 5)
+    masks = torch.arange(6) < torch.tensor([[4], [6]]), torch.arange(5) < torch.tensor([[5], [2]])
+    for p_valid in (masks[0], None):
+        for q_valid in (masks[1], None):
+            alone = torch.stack(
+                [
+                    chamfer_distance(
+                        p[k : k + 1] if p_valid is None else p[k : k + 1, p_valid[k]],
+                        q[k : k + 1] if q_valid is None else q[k : k + 1, q_valid[k]],
+                    )[0]
+                    for k in range(2)
+                ]
+            )
+            torch.testing.assert_close(ChamferDistance()(p, q, p_valid, q_valid), alone)

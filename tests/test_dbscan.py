@@ -10,6 +10,8 @@ import sklearn.cluster
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
+from scipy.spatial import cKDTree
 from sklearn.neighbors import NearestNeighbors
 
 from v3d_torch.errors import ConfigError, InputError
@@ -132,6 +134,18 @@ def test_memory_stays_bounded_where_all_are_neighbours(monkeypatch: pytest.Monke
     assert peak < 10e6  # two million pairs of two int64: 32 MB
 
 
+def test_blocks_hold_every_pair_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And are as large as they may be: a pair's two neighbours count, and each point itself."""
+    monkeypatch.setattr(module, "_BLOCK", 64)
+    points = np.random.default_rng(0).random((300, 3))
+    tree = cKDTree(points)
+    counts = tree.query_ball_point(points, 0.2, return_length=True)
+    blocks = list(module._pairs_in_blocks(tree, counts, 0.2))
+    pairs = [(i, j) for a, b in blocks for i, j in zip(a.tolist(), b.tolist(), strict=True)]
+    assert len(pairs) == len(set(pairs)) and set(pairs) == tree.query_pairs(0.2)
+    assert len(blocks) == len(np.unique(np.cumsum(counts[tree.indices]) // 64))
+
+
 def test_clouds_of_a_batch_do_not_touch() -> None:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(4, 300, 3, generator=generator, dtype=torch.float64)
@@ -167,5 +181,14 @@ def test_refuses_nonsense() -> None:
         with pytest.raises(ConfigError, match="eps > 0 and min_samples >= 1"):
             dbscan(points, valid, eps, min_samples)
     points[0, 1, 2] = torch.nan
-    with pytest.raises(InputError, match="not finite"):
+    message = r"^A point to be clustered is not finite; mark points without depth as not valid\.$"
+    with pytest.raises(InputError, match=message):
         dbscan(points, valid, 0.1, 3)
+    valid[0, 1] = False  # what stands there is not looked at
+    assert dbscan(points, valid, 0.1, 1).tolist() == [[0, -1]]
+
+
+@pytest.mark.parametrize(("points", "valid"), [((2, 3), (2, 3)), ((1, 2, 2), (1, 2)), ((1, 2, 3), (1, 3)), ((3,), ())])
+def test_refuses_other_shapes(points: tuple[int, ...], valid: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError):
+        dbscan(torch.zeros(points), torch.ones(valid, dtype=torch.bool), 0.1, 3)

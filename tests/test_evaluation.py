@@ -6,6 +6,7 @@ import copy
 import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,8 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.evaluation.association import match
-from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align
-from v3d_torch.evaluation.rpe import pairs_apart, relative_errors
+from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, scale_error, spans_plane
+from v3d_torch.evaluation.rpe import drift, pairs_apart, relative_errors, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.evaluation.tables import paper_scores, paper_sequence, paper_table
 from v3d_torch.lie import invert, se3_exp
@@ -113,6 +114,38 @@ def test_rpe_pairs_are_those_of_the_benchmarks_tool() -> None:
             expected.append((i, j))
     first, second = pairs_apart(torch.from_numpy(stamps), 1.0)
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == expected
+
+
+@pytest.mark.parametrize(("second", "pairs"), [(0.5, [(0, 1)]), (0.625, [(0, 1)]), (0.4375, [])])
+def test_convention_a_pair_may_be_off_by_half(second: float, pairs: list[tuple[int, int]]) -> None:
+    stamps = torch.tensor([0.0, second, 5.0, 10.0], dtype=torch.float64)
+    assert list(zip(*(poses.tolist() for poses in pairs_apart(stamps, 1.0)), strict=True)) == pairs
+
+
+def test_drift_is_measured_over_a_second_unless_told_otherwise() -> None:
+    groundtruth = walk(90, seed=16)
+    estimate = noisy(groundtruth, seed=17)
+    matches = match(groundtruth, estimate)
+    by_default = relative_pose_error(groundtruth, estimate, matches)
+    assert by_default is not None and by_default.delta == 1.0
+    assert by_default == relative_pose_error(groundtruth, estimate, matches, 1.0)
+    over_two = relative_pose_error(groundtruth, estimate, matches, 2.0)
+    assert over_two is not None and over_two.delta == 2.0 and over_two.pairs == by_default.pairs - 30
+    single = drift(groundtruth, estimate, matches)
+    assert single.first.tolist() == list(range(by_default.pairs))
+    assert Statistics.of(single.trans) == by_default.trans and Statistics.of(single.rot) == by_default.rot
+    assert relative_pose_error(groundtruth, estimate, matches, 10.0) is None
+
+
+def test_drift_of_poses_without_truth_is_not_measured() -> None:
+    """Truth for the poses from the tenth on, in a row of its own: indices of the two are not the same."""
+    groundtruth = walk(60, seed=18)
+    estimate = noisy(groundtruth, seed=19)
+    late = Trajectory(groundtruth.stamps[10:], groundtruth.T_wc[10:])
+    found = drift(late, estimate, match(late, estimate), 0.5)
+    everywhere = drift(groundtruth, estimate, match(groundtruth, estimate), 0.5)
+    assert found.first.tolist() == [first for first in everywhere.first.tolist() if first >= 10]
+    torch.testing.assert_close(found.trans, everywhere.trans[10:])
 
 
 def test_no_rpe_across_a_gap() -> None:
@@ -232,6 +265,36 @@ def test_positions_on_a_point_or_a_line_are_aligned_by_orientations(direction: t
     assert misaligned.magnitude().mean() > 0.1
     aligned = (evaluation.alignment.T_ge @ estimate.T_wc)[:, :3, 3]
     assert torch.allclose(aligned.mean(dim=0), T_wc[:, :3, 3].mean(dim=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [4, 400])
+def test_convention_a_plane_is_spanned_by_a_millimetre(count: int) -> None:
+    """Standard deviations along the axes; the least of the three says nothing."""
+    corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64)
+    corners = corners.repeat(count // 4, 1) + 5
+    for spread, plane in (([1, 1.01e-3, 0], True), ([1, 0.99e-3, 0.99e-3], False), ([0, 1.01e-3, 1.01e-3], True)):
+        assert spans_plane(corners * torch.tensor(spread, dtype=torch.float64)) is plane
+
+
+@pytest.mark.parametrize(("size", "told"), [(1.49, False), (1.51, True), (1 / 1.49, False), (1 / 1.51, True)])
+def test_convention_another_unit_is_half_as_much_again(size: float, told: bool) -> None:
+    truth = walk(40, seed=20).T_wc
+    estimate = truth.clone()
+    estimate[:, :3, 3] /= size
+    found = scale_error(truth, estimate, align(truth, estimate))
+    assert found == (pytest.approx(size) if told else None)
+
+
+def test_an_estimate_with_half_the_spread_in_another_shape_has_no_wrong_unit() -> None:
+    """What is left of the truth's spread, once the size is right: noise of so many times the signal."""
+    truth = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    truth[:, 0, 3] = torch.tensor([1.0, -1, 1, -1])
+    for noise, told in ((0.55, True), (0.6, False)):  # left is noise^2 / (1 + noise^2), a quarter at 0.577
+        estimate = truth.clone()
+        estimate[:, 1, 3] = noise * torch.tensor([1.0, 1, -1, -1])
+        estimate[:, :3, 3] /= 3
+        alignment = replace(align(truth, truth), T_ge=torch.eye(4, dtype=torch.float64))
+        assert (scale_error(truth, estimate, alignment) is not None) is told
 
 
 def test_mean_of_orientations_is_scipys() -> None:

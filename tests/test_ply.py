@@ -42,6 +42,8 @@ def test_everything_is_read_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(columns(vertex, "red", "green", "blue"), colours.numpy())
     np.testing.assert_array_equal(np.stack(read["face"]["vertex_indices"]), faces.numpy())
     np.testing.assert_array_equal(columns(read["edge"], "vertex1", "vertex2"), edges.numpy())
+    read.write(tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "all.ply").read_bytes()
 
 
 def test_what_is_not_given_is_not_written(tmp_path: Path) -> None:

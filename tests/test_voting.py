@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -145,3 +146,21 @@ def test_gradcheck_and_gradients_with_absent_and_coinciding_objects() -> None:
 def test_too_few_to_vote(count: int) -> None:
     result = hough_vote(torch.rand(count, 3), torch.rand(count, 3), torch.ones(count, dtype=torch.bool), 0.1, 1)
     assert result.votes.tolist() == [0.0] * count and not result.dynamic.any()
+
+
+@pytest.mark.parametrize(
+    ("previous", "current", "present"),
+    [((5, 2), (5, 3), (5,)), ((5, 3), (5, 2), (5,)), ((5, 3), (4, 3), (5,)), ((5, 3), (5, 3), (4,)), ((3,), (3,), ())],
+)
+def test_refuses_other_shapes(previous: tuple[int, ...], current: tuple[int, ...], present: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError):
+        hough_vote(torch.zeros(previous), torch.zeros(current), torch.ones(present, dtype=torch.bool), 0.1, 1)
+
+
+def test_the_module_votes_as_softly_as_it_is_told() -> None:
+    previous, current = scene(5, [1], by=0.5)
+    everyone = torch.ones(5, dtype=torch.bool)
+    for temperature in (None, 0.05, 0.2):
+        module = HoughVoting(0.1, 2, temperature)(previous, current, everyone)
+        assert torch.equal(module.votes, hough_vote(previous, current, everyone, 0.1, 2, temperature).votes)
+    assert not torch.equal(module.votes, hough_vote(previous, current, everyone, 0.1, 2).votes)

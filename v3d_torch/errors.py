@@ -31,3 +31,7 @@ class OutputError(V3DError):
 
 class GroundTruthWarning(UserWarning):
     """The ground truth of a sequence cannot be read: its frames can, and are given without true poses."""
+
+
+class NumericsError(V3DError):
+    """A stage gave a number that is NaN or infinite; raised in debug mode, see `v3d_torch.doors`."""

@@ -16,6 +16,7 @@ from v3d_torch.checkpoint import Checkpoint, go_on
 from v3d_torch.config import Config
 from v3d_torch.config_file import dump_config
 from v3d_torch.datasets import RGBDStream
+from v3d_torch.doors import CheckedSLAM
 from v3d_torch.earlier_results import remove_half_written
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import Evaluation
@@ -71,7 +72,8 @@ def run_logged(
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     masks = folder / "masks" if save_masks else None
-    slam = V3DSLAM(sequence.camera, segment, config, None if known is None else known.map)
+    system = CheckedSLAM if config.check_numerics else V3DSLAM
+    slam = system(sequence.camera, segment, config, None if known is None else known.map)
     pipeline = Pipeline(sequence, slam, masks, viewer, None if known is None else known.views)
     if checkpoint is not None:
         remove_half_written(folder)
