@@ -371,6 +371,14 @@ def test_a_lost_camera_maps_on_adrift_after_its_patience() -> None:
     assert take.mapper.map.keyframes[-1].adrift  # what is tied to it is adrift as well
 
 
+def test_a_covered_camera_is_given_time_to_find_its_place_when_it_sees_again() -> None:
+    take = Frames(restart_after=0.5)
+    assert take(0, Status.LOST)
+    assert [take(0, Status.LOST, features_=20) for _ in range(40)] == [False] * 40
+    made = [take(0, Status.LOST) for _ in range(20)]
+    assert made.index(True) in (15, 16)
+
+
 def test_patience_starts_anew_when_the_camera_is_found() -> None:
     take = Frames(restart_after=0.5, max_gap=1000)
     assert take(0, Status.LOST)

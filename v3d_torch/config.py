@@ -321,7 +321,8 @@ class MappingConfig(Section):
     """A camera that finds nothing of the map for so long, and knows its motion, maps on by that, seconds. Motions add
     up their errors; most often the map is found again first."""
     restart_after: float = Field(1.0, gt=0)
-    """A camera lost for so long maps on from where it is guessed to be, seconds; its poses are flagged as adrift."""
+    """A camera that sees enough and is lost for so long maps on from where it is guessed to be, seconds; its poses are
+    flagged as adrift."""
     landmarks_per_keyframe: int = Field(1000, gt=0)
     """Landmarks that a keyframe sees at most, old and new (ORB-SLAM2's number of features)."""
     fuse_keyframes: int = Field(10, ge=0)

@@ -72,8 +72,10 @@ class Mapper:
         config = self._config.mapping
         if status is Status.LOST and self.map.keyframes and self.map.keyframes[-1].known:
             return False
+        if int((static.depth > 0).sum()) < config.min_tracked:
+            self._untracked_since = None  # a camera that is covered is not yet looking for its place
+            return False
         if self._untracked_since is None:
             self._untracked_since = stamp
         patience = config.restart_after if status is Status.LOST else config.odometry_after
-        enough = int((static.depth > 0).sum()) >= config.min_tracked
-        return enough and (not self.map.keyframes or stamp - self._untracked_since >= patience)
+        return not self.map.keyframes or stamp - self._untracked_since >= patience
