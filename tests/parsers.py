@@ -110,7 +110,7 @@ PARSERS: dict[str, Parser] = {
     "mcap": from_file("take.mcap", frames_of),
     "archive": from_file("archive.tgz", unpack),
     "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
-    "metrics.json": from_file("metrics.json", stored_run._read_metrics),
+    "metrics.json": from_file("metrics.json", stored_run.read_metrics),
     "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
 }
 

@@ -55,7 +55,7 @@ CASES = [
         changed("colour.mkv", half),
         Says(
             "{root}/take/colour.mkv: breaks off at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
-            " before are in {out})",
+            " before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
