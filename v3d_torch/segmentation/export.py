@@ -16,7 +16,7 @@ from v3d_torch.segmentation.checkpoint import read_checkpoint
 from v3d_torch.segmentation.networks import one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
 from v3d_torch.segmentation.weights import REGISTRY
 
-_VERSION = 2
+_VERSION = 3
 """Of what this file makes of a checkpoint: raised with every change, so that older files in the cache are not used."""
 
 _OPSET = 17
