@@ -160,9 +160,10 @@ def test_killed_at_ten_frames_it_ends_with_the_same_bytes(
         time.sleep(0.05 * delays.random())  # anywhere in a frame, or in the writing of what there is
         os.kill(process, signal.SIGKILL)
         assert exit_code() == -signal.SIGKILL
-        # What is there can be read.
+        # What is there can be read. It may lack the frame that was being written, and one more where the time before
+        # the kill came between the results and their checkpoint: then the run has gone on from the frame before.
         so_far = read_run(out)
-        assert so_far.trajectory is not None and len(so_far.trajectory) == so_far.metrics.processed >= frame - 1
+        assert so_far.trajectory is not None and len(so_far.trajectory) == so_far.metrics.processed >= frame - 2
         assert so_far.metrics.failure is not None and so_far.metrics.failure.startswith("killed, or still running")
         assert (out / CHECKPOINT).is_file()
         arguments = ["--resume", str(out)]
