@@ -10,6 +10,7 @@ from v3d_torch.config import Config
 from v3d_torch.lie import rigid
 from v3d_torch.mapping.bundle import Observations, bundle_adjust
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.odometry.refine import pixel_sigma
 
 
 def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, camera: PinholeCamera) -> None:
@@ -37,7 +38,7 @@ def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, ca
     observations = Observations(
         uv=table["uv"][rows],
         inverse_depth=table["inverse_depth"][rows],
-        pixel_sigma=config.tracking.pixel_sigma * config.features.scale ** table["octave"][rows].to(torch.float64),
+        pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
         inverse_depth_sigma=config.tracking.inverse_depth_sigma,
         pose=pose,
         point=point,

@@ -222,8 +222,8 @@ class SparseMap:
             landmarks: id of the known landmark behind each of its features, -1 for none, int64, shape :math:`(N,)`.
         """
         known = (landmarks >= 0) & ~torch.isin(landmarks, keyframe.landmarks)
-        self._observe(keyframe, torch.nonzero(known & (keyframe.landmarks < 0))[:, 0], landmarks)
-        double = known & ~torch.isin(landmarks, keyframe.landmarks)
+        double = known & (keyframe.landmarks >= 0)
+        self._observe(keyframe, torch.nonzero(known & ~double)[:, 0], landmarks)
         one, other = keyframe.landmarks[double], landmarks[double]
         self._merge(torch.minimum(one, other), torch.maximum(one, other))
 

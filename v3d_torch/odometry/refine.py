@@ -51,12 +51,17 @@ class Measurements:
         return torch.full_like(self.inverse_depth, INLIER_LIMIT).masked_fill_(self.inverse_depth > 0, _LIMIT_WITH_DEPTH)
 
 
+def pixel_sigma(octave: Tensor, config: TrackingConfig, pyramid: FeaturesConfig) -> Tensor:
+    """Standard deviation of a feature's place, pixels: it is as sure as its level of the scale pyramid is fine."""
+    return config.pixel_sigma * pyramid.scale ** octave.to(torch.float64)
+
+
 def measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
-    """Features as measurements: a place is as sure as its level of the scale pyramid is fine."""
+    """Features as measurements."""
     return Measurements(
         uv=features.uv,
         inverse_depth=features.inverse_depth,
-        pixel_sigma=config.pixel_sigma * pyramid.scale ** features.octave.to(torch.float64),
+        pixel_sigma=pixel_sigma(features.octave, config, pyramid),
         inverse_depth_sigma=config.inverse_depth_sigma,
     )
 
