@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.files import read_text
+from v3d_torch.files import StrPath, read_text
 from v3d_torch.plain_yaml import parse_yaml
 from v3d_torch.validation import first_error
 
@@ -32,7 +32,7 @@ CONFIGS: Mapping[str, Path] = {
 """The configurations that come with the package, by name: the default (`FULL`), the paper's and the ablations'."""
 
 
-def find_config(name: str | Path) -> Path:
+def find_config(name: StrPath) -> Path:
     """The file of a configuration.
 
     Args:
@@ -49,18 +49,18 @@ def find_config(name: str | Path) -> Path:
     raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
 
 
-def load_config(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
+def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> Config:
     """Defaults, then a YAML file, then ``section.key=value`` overrides.
 
     Args:
-        path: YAML file with any part of the tree; None for the defaults.
+        name: ``paper`` or another of `CONFIGS`, or a YAML file with any part of the tree; None for the defaults.
         overrides: texts such as ``objects.voting.distance_threshold=0.05``; values are read as YAML.
 
     Raises:
         ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
     """
-    tree = _read_yaml(path) if path is not None else {}
-    return _overridden(tree, _validated(tree, f"{path}"), overrides)
+    tree = {} if name is None else _read_yaml(find_config(name))
+    return _overridden(tree, _validated(tree, f"{name}"), overrides)
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from v3d_torch.errors import InputError, OutputError
 
+StrPath = str | os.PathLike[str]
+"""A path as users of the library write it."""
+
 _MAX_LENGTH = 100 << 20
 """Letters: a trajectory of an hour at 200 Hz has fewer, and a device that never ends has more."""
 

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config, IdentityConfig
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.files import StrPath
 from v3d_torch.mapping.local_map import Keyframe, Loop, SparseMap
 from v3d_torch.mapping.recorder import Outlook, PoseRecorder, Status, _Entry
 from v3d_torch.mapping.table import Table
@@ -76,7 +77,7 @@ def refresh(slam: V3DSLAM) -> None:
         segment.memory = slam._memory
 
 
-def save_state(path: Path, slam: V3DSLAM) -> None:
+def save_state(path: StrPath, slam: V3DSLAM) -> None:
     """Write all that a system remembers, so that another process can go on with the next frame; see `load_state`.
 
     Args:
@@ -93,10 +94,10 @@ def save_state(path: Path, slam: V3DSLAM) -> None:
         "camera": asdict(slam.mapper.map.camera),
         "known": slam._known is not None,
     }
-    write_state(path, about, state)
+    write_state(Path(path), about, state)
 
 
-def load_state(path: Path, segment: Segmenter | None = None) -> V3DSLAM:
+def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
     """The system that was written by `save_state`: with the same frames it gives the same results, to the bit.
 
     Args:
@@ -107,7 +108,7 @@ def load_state(path: Path, segment: Segmenter | None = None) -> V3DSLAM:
         InputError: the file is not there, no state of a system, damaged, or of another version of this program.
         WeightsError: the network's weights are not to be had.
     """
-    about, state = read_state(path, CLASSES)
+    about, state = read_state(Path(path), CLASSES)
     try:
         config = Config.model_validate(about["config"])
         camera = PinholeCamera(**{**about["camera"], "distortion": tuple(about["camera"]["distortion"])})

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import InputError
-from v3d_torch.files import numbered_lines, write_text
+from v3d_torch.files import StrPath, numbered_lines, write_text
 from v3d_torch.stamps import seconds
 from v3d_torch.types import Trajectory
 
@@ -23,7 +23,7 @@ _MAX_LENGTH = 1e3
 _COLUMNS = "stamp tx ty tz qx qy qz qw"
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: StrPath) -> Trajectory:
     """Read camera poses.
 
     Comments (#), blank lines, a byte order mark, either line ending and commas for spaces are allowed. Quaternions are
@@ -38,7 +38,7 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises:
         InputError: the file cannot be read, holds no pose, or a line is not eight sensible numbers with a rotation.
     """
-    numbers, poses = _parse(path)
+    numbers, poses = _parse(Path(path))
     with np.errstate(over="ignore"):
         length = np.linalg.norm(poses[:, 4:], axis=1)
     for wrong, what in (
@@ -55,7 +55,7 @@ def read_trajectory(path: Path) -> Trajectory:
     return Trajectory(torch.from_numpy(stamps), T_wc)
 
 
-def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
     """Write camera poses whole or not at all: stamps with 6 decimals, the rest with 9, quaternions with qw >= 0.
 
     Args:
@@ -74,7 +74,7 @@ def write_trajectory(path: Path, trajectory: Trajectory) -> None:
             f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in pose) + "\n"
             for stamp, pose in zip(trajectory.stamps.tolist(), poses.tolist(), strict=True)
         ]
-    write_text(path, "".join(lines))
+    write_text(Path(path), "".join(lines))
 
 
 def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:

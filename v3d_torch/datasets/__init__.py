@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.download import Progress, cache_dir
 from v3d_torch.errors import GroundTruthWarning, InputError
+from v3d_torch.files import StrPath
 
 __all__ = [
     "PAPER_SEQUENCES",
@@ -34,9 +36,9 @@ _RATES = (0.01, 1e4)
 
 
 def open_source(
-    name: str,
+    name: StrPath,
     *,
-    data_root: Path | None = None,
+    data_root: StrPath | None = None,
     camera: CameraChoice = None,
     options: SourceOptions | None = None,
     download: bool = True,
@@ -70,8 +72,8 @@ def open_source(
 
 
 def _checked(
-    name: str,
-    data_root: Path | None,
+    name: StrPath,
+    data_root: StrPath | None,
     camera: CameraChoice,
     options: SourceOptions,
     download: bool,
@@ -80,7 +82,8 @@ def _checked(
     if options.fps is not None and not _RATES[0] <= options.fps <= _RATES[1]:
         raise InputError(f"--fps {options.fps:g}: give frames a second, between {_RATES[0]:g} and {_RATES[1]:g}")
     try:
-        return _open(name, data_root, camera, options, download, progress)
+        root = None if data_root is None else Path(data_root)
+        return _open(os.fspath(name), root, camera, options, download, progress)
     except OSError as error:  # a folder that may not be looked into, a name that is too long
         raise InputError(
             f"{error.filename or name}: cannot be read ({error.strerror}); check its name and who may read it"
@@ -118,9 +121,9 @@ def _open(
 
 
 def load_sequence(
-    name: str,
+    name: StrPath,
     *,
-    data_root: Path | None = None,
+    data_root: StrPath | None = None,
     camera: CameraChoice = None,
     options: SourceOptions | None = None,
     download: bool = True,

@@ -21,7 +21,7 @@ import torch
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.errors import InputError
-from v3d_torch.files import written_whole
+from v3d_torch.files import StrPath, written_whole
 from v3d_torch.mapping.columns import from_columns, to_columns, what_is_wrong
 from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.views import StaticViews
@@ -58,7 +58,7 @@ class StoredMap:
     views: StaticViews
 
 
-def save_map(path: Path, sparse_map: SparseMap, views: StaticViews | None = None) -> None:
+def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = None) -> None:
     """Write a map; the same map makes the same bytes.
 
     Args:
@@ -81,11 +81,11 @@ def save_map(path: Path, sparse_map: SparseMap, views: StaticViews | None = None
         },
     }
     arrays: dict[str, Any] = {name: column.numpy() for name, column in to_columns(sparse_map, views).items()}
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with written_whole(Path(path)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, about=np.frombuffer(json.dumps(about).encode(), dtype=np.uint8), **arrays)
 
 
-def load_map(path: Path, camera: PinholeCamera, config: Config) -> StoredMap:
+def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     """Read a map.
 
     Args:
@@ -96,6 +96,7 @@ def load_map(path: Path, camera: PinholeCamera, config: Config) -> StoredMap:
     Raises:
         InputError: the file is not there, no map, damaged, or of another version, camera or configuration.
     """
+    path = Path(path)
     stored = StoredMap(SparseMap(config.mapping, config.features, camera), StaticViews(camera, config.dense_map.stride))
     try:
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
