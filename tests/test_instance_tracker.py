@@ -321,6 +321,17 @@ def test_a_camera_that_turns_keeps_ids_of_flickering_classes() -> None:
     assert [(track.id, track.missed) for track in tracks] == [(1, False), (2, False)]
 
 
+@pytest.mark.parametrize("there", [True, False])
+def test_who_is_missed_but_seen_to_be_there_is_not_taken_for_who_appears_nearby(there: bool) -> None:
+    """Within the gate and of its class; only where the place of the first is empty has the first moved there."""
+    first, other = Board(-0.3), Board(0.28)
+    watch = Watch()
+    meet(watch, first)
+    tracks = watch(*([replace(first, seen=False)] if there else []), other)
+    assert at(tracks, other).id == (2 if there else 1)
+    assert [track.id for track in tracks if track.missed] == ([1] if there else [])
+
+
 def test_a_change_of_class_costs_what_decides_between_two_in_one_place() -> None:
     """Track 0 lies a little better on instance 1, but that is of the class of track 1."""
     nowhere = torch.full((1, 2, 3), torch.nan)

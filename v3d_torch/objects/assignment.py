@@ -24,6 +24,7 @@ def match_instances(
     least_overlap: float,
     tracked: Tensor | None = None,
     present: Tensor | None = None,
+    elsewhere: Tensor | None = None,
 ) -> Tensor:
     """Object that each instance continues.
 
@@ -41,6 +42,8 @@ def match_instances(
         least_overlap: masks that overlap by this are of one object, whatever the class.
         tracked: which objects exist, bool, shape :math:`(B, T)`; all by default.
         present: which instances exist, bool, shape :math:`(B, N)`; all by default.
+        elsewhere: pairs of an object that is seen to be where it was predicted, and an instance that lies beside it and
+            so is another one, however near; bool, shape :math:`(B, T, N)`; none by default.
 
     Returns:
         Index of the object, from 0 to T - 1, for each instance, -1 for none; int64, shape :math:`(B, N)`.
@@ -51,7 +54,8 @@ def match_instances(
     KORNIA_CHECK_SHAPE(alike, [str(size) for size in overlap.shape])
     distance = torch.cdist(predicted, seen)
     overlaps = overlap >= least_overlap
-    possible = ((distance <= gate[..., None]) & alike) | overlaps
+    near = (distance <= gate[..., None]) & alike
+    possible = (near if elsewhere is None else near & ~elsewhere) | overlaps
     if tracked is not None:
         possible = possible & tracked[..., :, None]
     if present is not None:

@@ -20,7 +20,7 @@ from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.objects.tracker import InstanceTracker
 from v3d_torch.objects.voting import hough_vote
 from v3d_torch.objects.witnesses import Witnesses
-from v3d_torch.segmentation.coco import LIVING, PERSON, class_name
+from v3d_torch.segmentation.coco import LIVING, PERSON, THINGS, class_name
 from v3d_torch.types import Instances
 
 
@@ -220,9 +220,13 @@ class ObjectDynamics:
         config = self._config.mask
         if track.last_dynamic == stamp:
             return Verdict.DYNAMIC
+        filled = came < self._config.background.still_share
         # Over every baseline its places were filled: it stands there since the longest of them.
-        still = len(came) > 0 and bool((came < self._config.background.still_share).all())
+        still = len(came) > 0 and bool(filled.all())
         if track.missed and (still or (track.score < config.bridge_score and track.last_dynamic == -torch.inf)):
+            return Verdict.STATIC
+        # Gaits pause, things do not: one whose places are filled, and are not known to have been empty, is at rest.
+        if track.label in THINGS and bool(filled.any()) and bool((filled | came.isnan()).all()):
             return Verdict.STATIC
         if stamp - track.last_dynamic <= config.hold_dynamic and track.evidence >= config.confirm_moving:
             return Verdict.DYNAMIC

@@ -101,6 +101,19 @@ class Silhouette:
         explained[v, u] = torch.from_numpy((z > low - tolerance) & (z < high + tolerance))
         return near, explained
 
+    def share_seen(self, depth: Tensor, tolerance: float) -> float:
+        """Share of the points where the depth is theirs; 0 where no point is in the image.
+
+        Args:
+            depth: metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            tolerance: metres by which it may lie before or behind a point.
+        """
+        if len(self._z) == 0:
+            return 0.0
+        _, height, width = depth.shape
+        u, v = np.minimum(_CELL * self._cells + _CELL // 2, (width - 1, height - 1)).T
+        return float((np.abs(depth[0].numpy()[v, u] - self._z) < tolerance).mean())
+
 
 def _pixels(first: int, last: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
     """Along one axis, which of every n-th pixel lie in the cells from ``first`` to before ``last``, and their cells."""

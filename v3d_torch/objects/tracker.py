@@ -30,6 +30,8 @@ class InstanceTracker(torch.nn.Module):
     """
 
     _COLUMNS = 160  # masks are compared on about so many columns of pixels: those of the network's own masks
+    _THERE = 0.5  # an object is where it was predicted if so many of its points are seen there
+    _BESIDE = 0.1  # and what covers less than this of it, and is covered by less, is another one
     _DEPTH_GATE = 0.2  # metres: arms and legs swing by that; a predicted mask keeps only pixels that near
 
     def __init__(self, config: IdentityConfig, camera: PinholeCamera, voxel_size: float) -> None:
@@ -61,7 +63,8 @@ class InstanceTracker(torch.nn.Module):
         expected = self._expect(stamp, T_wc)
         missing = depth <= 0
         now = {track: self._where(silhouette, depth, missing, self._stride) for track, silhouette in expected.items()}
-        owner = self._assign(stamp, instances, sightings, now)
+        there = [silhouette.share_seen(depth, self._DEPTH_GATE) > self._THERE for silhouette in expected.values()]
+        owner = self._assign(stamp, instances, sightings, now, torch.tensor(there))
         continued = set()
         for i, sighting in enumerate(sightings):
             track = owner.get(i)
@@ -115,9 +118,17 @@ class InstanceTracker(torch.nn.Module):
         return Sighting(stamp, R @ clouds.centroid[i].to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud))
 
     def _assign(
-        self, stamp: float, instances: Instances, sightings: list[Sighting], now: dict[Track, Tensor]
+        self,
+        stamp: float,
+        instances: Instances,
+        sightings: list[Sighting],
+        now: dict[Track, Tensor],
+        there: Tensor,
     ) -> dict[int, Track]:
-        """Track of each instance that continues one; where each should be by now is given on every n-th pixel."""
+        """Track of each instance that continues one.
+
+        ``now`` is where each should be by now, on every n-th pixel, and ``there`` whether it is seen to be there.
+        """
         if not self.tracks or not sightings:
             return {}
         predicted = torch.stack([track.predict(stamp) for track in self.tracks])
@@ -125,13 +136,22 @@ class InstanceTracker(torch.nn.Module):
         # A mask as it was is exact where little moves; moved on, it keeps up with fast walkers and a camera that turns.
         before = self._coarse([track.mask for track in self.tracks])
         moved = torch.stack(list(now.values())).flatten(1).to(before.dtype)
-        either = torch.cat([before, moved])
-        overlap = _overlap(either, self._coarse(list(instances.masks))).unflatten(0, (2, -1)).amax(dim=0)
+        masks = self._coarse(list(instances.masks))
+        overlap = torch.maximum(_overlap(before, masks), _overlap(moved, masks))
+        # A detection beside somebody who demonstrably has not moved there is somebody else, or nobody.
+        least = torch.minimum(moved.sum(dim=1)[:, None], masks.sum(dim=1))
+        elsewhere = there[:, None] & (moved @ masks.T < self._BESIDE * least)
         elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
         gate = self._config.max_jump + self._config.max_speed * elapsed
         alike = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
         matched = match_instances(
-            predicted[None], seen[None], overlap[None], alike[None], gate[None], self._config.least_overlap
+            predicted[None],
+            seen[None],
+            overlap[None],
+            alike[None],
+            gate[None],
+            self._config.least_overlap,
+            elsewhere=elsewhere[None],
         )[0]
         return {i: self.tracks[track] for i, track in enumerate(matched.tolist()) if track >= 0}
 

@@ -24,6 +24,9 @@ UNNAMED = -1
 LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
 """Classes that deform by themselves: people and animals. Things are rigid: they move as a whole or not at all."""
 
+THINGS = frozenset(range(len(COCO_NAMES))) - LIVING
+"""All others. What has no name is in neither: it may be somebody."""
+
 
 def class_name(label: int) -> str:
     """Name of a class index, also of `UNNAMED`."""
