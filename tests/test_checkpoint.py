@@ -290,8 +290,8 @@ def test_no_code_of_a_file_is_run_and_no_other_class_made(tmp_path: Path) -> Non
 
 def test_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = small(tmp_path / "s")
-    (tmp_path / "s").write_bytes(whole.replace(b"state 1 ", b"state 2 ", 1))
-    with pytest.raises(InputError, match=r"/s: is a state in version 2 .* knows version 1"):
+    (tmp_path / "s").write_bytes(whole.replace(b"state 2 ", b"state 3 ", 1))
+    with pytest.raises(InputError, match=r"/s: is a state in version 3 .* knows version 2"):
         read_state(tmp_path / "s", [])
     with monkeypatch.context() as patch:
         patch.setattr("v3d_torch.state_file.version", lambda _: "9.9")

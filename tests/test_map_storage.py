@@ -200,8 +200,8 @@ def about(path: Path, **changes: object) -> np.ndarray:
 
 def test_a_map_of_another_version(tmp_path: Path) -> None:
     path = saved(tmp_path, made_up(1))
-    rewritten(path, about=about(path, version=2, camera=None))
-    with pytest.raises(InputError, match=r"room\.map: is a map in version 2 of its format.* knows version 1"):
+    rewritten(path, about=about(path, version=3, camera=None))
+    with pytest.raises(InputError, match=r"room\.map: is a map in version 3 of its format.* knows version 2"):
         load_map(path, CAMERA, CONFIG)
 
 

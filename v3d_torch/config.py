@@ -331,6 +331,10 @@ class MappingConfig(Section):
     """Neighbours in which the landmarks of a new keyframe are looked for (ORB-SLAM2, which takes 10 for RGB-D)."""
     fuse_radius: float = Field(3.0, gt=0)
     """Radius of that search, pixels at level 0 (ORB-SLAM2): both poses are known by then."""
+    redundant_share: float = Field(0.9, gt=0, le=1)
+    """A keyframe goes when more of its landmarks than this are seen well enough by others (ORB-SLAM2). 1 keeps all."""
+    redundant_views: int = Field(3, gt=0)
+    """And so many others must see them (ORB-SLAM2)."""
     bundle_keyframes: int = Field(15, ge=0)
     """Keyframes that move in a local bundle adjustment, as many as make up the local map; 0 turns it off. With 8 the
     map of fr1_rpy bends by a fifth more."""

@@ -193,8 +193,9 @@ def _summary(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
     table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frames}")
     table.add_row("found", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
-    earlier = sum(keyframe.known for keyframe in slam.mapper.map.keyframes)
-    table.add_row("keyframes, loops", f"{len(slam.mapper.map.keyframes) - earlier}, {slam.loops.count}")
+    kept = slam.mapper.map.kept
+    earlier = sum(keyframe.known for keyframe in kept)
+    table.add_row("keyframes, loops", f"{len(kept) - earlier}, {slam.loops.count}")
     if earlier:
         table.add_row("known map", f"{earlier} keyframes")
     table.add_row("objects judged", ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items()) or "none")

@@ -94,9 +94,10 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
     write_text(folder / "config.yaml", dump_config(slam.config))
-    own = torch.tensor([not keyframe.known for keyframe in slam.mapper.map.keyframes], dtype=torch.bool)
-    stamps = torch.tensor([keyframe.stamp for keyframe in slam.mapper.map.keyframes], dtype=torch.float64)
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps[own], invert(slam.mapper.map.T_cw[own])))
+    own = [keyframe for keyframe in slam.mapper.map.kept if not keyframe.known]
+    stamps = torch.tensor([keyframe.stamp for keyframe in own], dtype=torch.float64)
+    T_wk = invert(slam.mapper.map.T_cw[[keyframe.index for keyframe in own]])
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, T_wk))
     evaluation = None
     if sequence.groundtruth is not None:
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
@@ -116,7 +117,7 @@ def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
     slam, rows = pipeline.slam, pipeline.run.frames
     stages = list(slam.clock.seconds)
     columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
-    kept = {keyframe.frame for keyframe in slam.mapper.map.keyframes}
+    kept = {keyframe.frame for keyframe in slam.mapper.map.kept}
     table: list[dict[str, object]] = [
         {
             **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in kept},
@@ -146,8 +147,8 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],
-        "keyframes": sum(not keyframe.known for keyframe in slam.mapper.map.keyframes),
-        "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.keyframes),
+        "keyframes": sum(not keyframe.known for keyframe in slam.mapper.map.kept),
+        "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.kept),
         "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
         "loops": slam.loops.count,
         "failure": failure,
@@ -183,7 +184,9 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
-    frames = [keyframe.frame for keyframe in slam.mapper.map.keyframes]
+    kept = slam.mapper.map.kept
+    T_wk = invert(slam.mapper.map.T_cw[[keyframe.index for keyframe in kept]])
+    frames = [keyframe.frame for keyframe in kept]
     statuses = [status.value for status in slam.poses.statuses]
-    path = camera_path(trajectory, statuses, invert(slam.mapper.map.T_cw), frames, pipeline.sequence.camera)
+    path = camera_path(trajectory, statuses, T_wk, frames, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -120,7 +120,7 @@ class V3DSLAM:
         self.track = MapTracker(config.tracking, config.features, camera)
         self.mapper = Mapper(config, camera, self._known)
         self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
-        for keyframe in self.mapper.map.keyframes:
+        for keyframe in self.mapper.map.kept:
             self.loops.learn(keyframe)
         self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
         vars(self).update(given)  # a stage that the user put in place before the camera was known stays

@@ -70,7 +70,7 @@ def put_back(owner: object, state: Mapping[str, Any]) -> None:
 
 def refresh(slam: V3DSLAM) -> None:
     """Let a system whose attributes were put back follow them: places that it recognises, memory of its segmenter."""
-    for keyframe in slam.mapper.map.keyframes:
+    for keyframe in slam.mapper.map.kept:
         slam.loops.learn(keyframe)
     segment: object = slam.segment
     if isinstance(segment, Remembering):

@@ -83,6 +83,7 @@ class LoopCloser:
         Returns:
             The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`; None without a loop.
         """
+        self._index.forget({known.index for known in sparse_map.keyframes if known.retired})
         place = self._find(keyframe, sparse_map) if self._config.enabled else None
         self.learn(keyframe)
         if place is None:
@@ -113,10 +114,15 @@ class LoopCloser:
         T_cw = sparse_map.T_cw
         edges = sparse_map.covisibility(self._COVISIBLE)
         measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
-        loops = torch.tensor([[loop.i, loop.j] for loop in sparse_map.loops])
-        solved = optimise_pose_graph(
-            invert(T_cw),
-            torch.cat([edges, loops]),
-            torch.cat([measured, torch.stack([loop.T_ij for loop in sparse_map.loops])]),
-        )
-        sparse_map.move_keyframes(invert(solved.T_wc))
+        carrier = torch.tensor([keyframe.carrier for keyframe in sparse_map.keyframes])
+        i, j = torch.tensor([[loop.i, loop.j] for loop in sparse_map.loops]).unbind(dim=1)
+        # Between those kept: a retired keyframe stays where it is beside the one that it goes along with.
+        to_i, to_j = T_cw[carrier[i]] @ invert(T_cw[i]), T_cw[j] @ invert(T_cw[carrier[j]])
+        loops = to_i @ torch.stack([loop.T_ij for loop in sparse_map.loops]) @ to_j
+        kept, node = carrier.unique(return_inverse=True)
+        ends = torch.stack([node[i], node[j]], dim=1)
+        apart = ends[:, 0] != ends[:, 1]
+        ends, loops = torch.cat([node[edges], ends[apart]]), torch.cat([measured, loops[apart]])
+        solved = optimise_pose_graph(invert(T_cw[kept]), ends, loops)
+        T_cw[kept] = invert(solved.T_wc)
+        sparse_map.move_keyframes(T_cw)

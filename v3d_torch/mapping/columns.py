@@ -25,6 +25,7 @@ def to_columns(sparse_map: SparseMap, views: StaticViews) -> dict[str, Tensor]:
             stamp=torch.tensor([keyframe.stamp], dtype=torch.float64),
             T_cw=keyframe.T_cw[None],
             adrift=torch.tensor([keyframe.adrift]),
+            carrier=torch.tensor([keyframe.carrier]),
             features=torch.tensor([len(keyframe.features)]),
         )
         features.append(**vars(keyframe.features), landmark=keyframe.landmarks)
@@ -57,8 +58,16 @@ def from_columns(columns: Columns, sparse_map: SparseMap, views: StaticViews) ->
     for index, (first, last) in enumerate(pairwise(ends)):
         own = {name: column[first:last] for name, column in features.items()}
         landmarks = own.pop("landmark")
-        stamp, adrift = keyframes["stamp"][index].item(), bool(keyframes["adrift"][index])
-        keyframe = Keyframe(index, -1, stamp, keyframes["T_cw"][index], Features(**own), landmarks, adrift)
+        keyframe = Keyframe(
+            index=index,
+            frame=-1,
+            stamp=keyframes["stamp"][index].item(),
+            T_cw=keyframes["T_cw"][index],
+            features=Features(**own),
+            landmarks=landmarks,
+            adrift=bool(keyframes["adrift"][index]),
+            carrier=int(keyframes["carrier"][index]),
+        )
         sparse_map.keyframes.append(keyframe)
     sparse_map.landmarks.append(**_group(columns, "landmark"))
     sparse_map.observations.append(**_group(columns, "observation"))
@@ -94,6 +103,7 @@ def what_is_wrong(columns: Columns, sparse_map: SparseMap, views: StaticViews) -
     camera, keyframes, landmarks = sparse_map.camera, lengths["keyframe"], lengths["landmark"]
     for name, least, beyond in (
         ("keyframe/features", 0, lengths["feature"] + 1),
+        ("keyframe/carrier", 0, keyframes),
         ("feature/pixel", 0, torch.tensor([camera.width, camera.height])),
         ("feature/landmark", -1, landmarks),
         ("landmark/keyframe", 0, keyframes),
@@ -106,13 +116,20 @@ def what_is_wrong(columns: Columns, sparse_map: SparseMap, views: StaticViews) -
     ):
         if not bool(((columns[name] >= least) & (columns[name] < beyond)).all()):
             return f"{name} points to what is not there"
-    return None
+    carrier = columns["keyframe/carrier"]
+    return None if torch.equal(carrier[carrier], carrier) else "keyframe/carrier points to what is retired"
 
 
 def _empty() -> tuple[Table, Table]:
     """Tables of keyframes and of their features, one keyframe's after another's."""
     number, real = torch.int64, torch.float64
-    keyframes = Table(stamp=((), real), T_cw=((4, 4), real), adrift=((), torch.bool), features=((), number))
+    keyframes = Table(
+        stamp=((), real),
+        T_cw=((4, 4), real),
+        adrift=((), torch.bool),
+        carrier=((), number),
+        features=((), number),
+    )
     features = Table(
         uv=((2,), real),
         pixel=((2,), number),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import FeaturesConfig, MappingConfig
-from v3d_torch.lie import invert
+from v3d_torch.lie import invert, rigid
 from v3d_torch.mapping.table import Table
 from v3d_torch.odometry.guided import LocalMap
 from v3d_torch.odometry.orb import Features, spread
@@ -30,6 +31,8 @@ class Keyframe:
         features: on pixels that stood still.
         landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
         adrift: whether only a guess joins it to the rest of the map.
+        carrier: index of the keyframe that it moves along with since it was retired; its own while it is part of the
+            map.
     """
 
     index: int
@@ -39,6 +42,16 @@ class Keyframe:
     features: Features
     landmarks: Tensor
     adrift: bool = False
+    carrier: int = -1
+
+    def __post_init__(self) -> None:
+        if self.carrier < 0:
+            self.carrier = self.index
+
+    @property
+    def retired(self) -> bool:
+        """Whether the map does without it: it sees nothing any more, but frames and landmarks still hang on it."""
+        return self.carrier != self.index
 
     @property
     def known(self) -> bool:
@@ -102,8 +115,13 @@ class SparseMap:
         )
 
     @property
+    def kept(self) -> list[Keyframe]:
+        """The keyframes that are not retired."""
+        return [keyframe for keyframe in self.keyframes if not keyframe.retired]
+
+    @property
     def T_cw(self) -> Tensor:
-        """World to camera of all keyframes, float64, shape :math:`(K, 4, 4)`; K may be 0."""
+        """World to camera of all keyframes, retired ones too, float64, shape :math:`(K, 4, 4)`; K may be 0."""
         poses = [keyframe.T_cw[None] for keyframe in self.keyframes]
         return torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
 
@@ -180,7 +198,7 @@ class SparseMap:
         )
 
     def covisibility(self, least: int) -> Tensor:
-        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and consecutive ones.
+        """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and consecutive ones of those kept.
 
         Not those between which the camera was lost: what joins them is a guess.
 
@@ -194,17 +212,22 @@ class SparseMap:
         shared = scipy.sparse.triu(seen @ seen.T, k=1).tocoo()
         enough = shared.data >= least
         pairs = torch.from_numpy(np.stack([shared.row[enough], shared.col[enough]], axis=1).astype(np.int64))
-        adrift = torch.tensor([keyframe.adrift for keyframe in self.keyframes], dtype=torch.bool)
-        first = torch.nonzero(adrift[:-1] == adrift[1:])[:, 0]
-        return torch.cat([pairs, torch.stack([first, first + 1], dim=1)]).unique(dim=0)
+        index = torch.tensor([keyframe.index for keyframe in self.kept], dtype=torch.int64)
+        adrift = torch.tensor([keyframe.adrift for keyframe in self.kept], dtype=torch.bool)
+        joined = adrift[:-1] == adrift[1:]
+        return torch.cat([pairs, torch.stack([index[:-1][joined], index[1:][joined]], dim=1)]).unique(dim=0)
 
     def move_keyframes(self, T_cw: Tensor) -> None:
-        """Put all keyframes at new poses; each landmark goes along with the keyframe that made it.
+        """Put keyframes at new poses; retired ones go along, and each landmark with the keyframe that made it.
 
         Args:
-            T_cw: world to camera, shape :math:`(K, 4, 4)`.
+            T_cw: world to camera, shape :math:`(K, 4, 4)`; what it says of retired ones does not count.
         """
-        T_new_old = (invert(T_cw) @ self.T_cw)[self.landmarks["keyframe"]]
+        before, carrier = self.T_cw, torch.tensor([keyframe.carrier for keyframe in self.keyframes])
+        along = carrier != torch.arange(len(carrier))
+        T_cw = T_cw.clone()
+        T_cw[along] = rigid(before[along] @ invert(before[carrier[along]]) @ T_cw[carrier[along]])
+        T_new_old = (invert(T_cw) @ before)[self.landmarks["keyframe"]]
         R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
         self.landmarks["point"][:] = (R @ self.landmarks["point"][..., None])[..., 0] + t
         self.landmarks["direction"][:] = (R @ self.landmarks["direction"][..., None])[..., 0]
@@ -270,6 +293,22 @@ class SparseMap:
         owners, features = self.observations["keyframe"][rows], self.observations["feature"][rows]
         for index in owners.unique().tolist():
             self.keyframes[index].landmarks[features[owners == index]] = -1
+
+    def retire(self, carriers: Mapping[int, int]) -> None:
+        """Let the map do without some keyframes: what they saw is forgotten, their poses go along with others'.
+
+        Args:
+            carriers: index of each, and of the keyframe kept that it goes along with from now on.
+        """
+        for keyframe in self.keyframes:
+            keyframe.carrier = carriers.get(keyframe.carrier, keyframe.carrier)
+        table, gone, nothing = self.observations, torch.tensor(list(carriers)), torch.zeros(0, dtype=torch.int64)
+        for index in carriers:
+            keyframe = self.keyframes[index]
+            keyframe.features, keyframe.landmarks = keyframe.features[nothing], nothing
+        table.keep(table["valid"] & ~torch.isin(table["keyframe"], gone))
+        seen = torch.bincount(table["landmark"], minlength=len(self.landmarks)) > 0
+        self.landmarks["alive"][~seen] = False
 
     def cull(self) -> None:
         """Forget landmarks that few of the frames found that should have, and those that no second keyframe saw."""

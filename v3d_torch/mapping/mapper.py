@@ -5,6 +5,7 @@ from __future__ import annotations
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.mapping.adjust import adjust_locally
+from v3d_torch.mapping.culling import cull_keyframes
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
 from v3d_torch.mapping.neighbours import NeighbourSearch
 from v3d_torch.mapping.recorder import Estimate, Status
@@ -51,6 +52,7 @@ class Mapper:
         self._search_neighbours(self.map, keyframe)
         adjust_locally(self.map, keyframe, self._config, self._camera)
         self.map.cull()
+        cull_keyframes(self.map, keyframe, self._config.mapping)
         return keyframe
 
     def _wants(self, frame: RGBDFrame, static: Features, estimate: Estimate) -> bool:

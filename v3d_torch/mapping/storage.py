@@ -26,7 +26,7 @@ from v3d_torch.mapping.columns import from_columns, to_columns, what_is_wrong
 from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.views import StaticViews
 
-_FORMAT, _VERSION = "v3d_torch map", 1
+_FORMAT, _VERSION = "v3d_torch map", 2
 
 _ROOM, _RATIO = 1 << 28, 20
 """Bytes that any file may unpack to, and by how much a larger one may grow: maps grow threefold."""

@@ -45,3 +45,8 @@ class Table:
         indices = torch.arange(self._length, end)
         self._length = end
         return indices
+
+    def keep(self, rows: Tensor) -> None:
+        """Drop all rows but those where ``rows``, bool, is true; the others move up, and keep their order."""
+        self._columns = {name: column[rows] for name, column in self.columns.items()}
+        self._length = int(rows.sum())

@@ -101,5 +101,5 @@ class StaticViews:
         self.append(StaticView(keyframe, units, image[:, self._v, self._u]))
 
     def append(self, view: StaticView) -> None:
-        """Keep a view of this camera."""
-        self._views.append(view)
+        """Keep a view of this camera, and let go those of keyframes that the map does without by now."""
+        self._views = [known for known in self._views if not known.keyframe.retired] + [view]

@@ -129,7 +129,8 @@ class RerunViewer:
         points = landmarks["point"][landmarks["alive"]].numpy()
         grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/landmarks", grey)
-        frusta = _frusta(self._camera, invert(slam.mapper.map.T_cw))
+        kept = [keyframe.index for keyframe in slam.mapper.map.kept]
+        frusta = _frusta(self._camera, invert(slam.mapper.map.T_cw[kept]))
         self._stream.log("world/map/keyframes", _way(frusta, "tab:cyan", width=0.7))
         positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
         self._stream.log("world/trajectory", _way([positions], "tab:blue"))

@@ -1,0 +1,68 @@
+"""Keyframes that the map can do without (ORB-SLAM2, local mapping: keyframe culling).
+
+A camera that stays in a room makes keyframes for as long as it looks. One whose landmarks enough others see as well
+tells nothing new, but costs memory, and time in each adjustment.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from v3d_torch.config import MappingConfig
+from v3d_torch.mapping.local_map import Keyframe, SparseMap
+
+
+def cull_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfig) -> None:
+    """Retire the neighbours of a new keyframe that are redundant by now; never the first, which fixes the world.
+
+    Args:
+        sparse_map: whose keyframes and observations are changed in place.
+        newest: the new keyframe.
+        config: when a keyframe is redundant.
+    """
+    neighbours = sparse_map.covisible(newest.seen, config.bundle_keyframes).tolist()
+    around = _Neighbourhood(sparse_map, neighbours)
+    carriers: dict[int, int] = {}
+    for index in neighbours:
+        if index in (0, newest.index) or around.redundancy(index, config.redundant_views) <= config.redundant_share:
+            continue
+        carriers[index] = around.nearest(index)
+        around.drop(index)
+        carriers = {gone: carriers.get(carrier, carrier) for gone, carrier in carriers.items()}
+    if carriers:
+        sparse_map.retire(carriers)
+
+
+class _Neighbourhood:
+    """Who sees the landmarks of some keyframes."""
+
+    def __init__(self, sparse_map: SparseMap, keyframes: list[int]) -> None:
+        table = sparse_map.observations
+        usable = table["valid"] & sparse_map.landmarks["alive"][table["landmark"]]
+        theirs = torch.zeros(len(sparse_map.landmarks), dtype=torch.bool)
+        theirs[table["landmark"][usable & torch.isin(table["keyframe"], torch.tensor(keyframes))]] = True
+        rows = usable & theirs[table["landmark"]]
+        self._keyframe, self._octave = table["keyframe"][rows], table["octave"][rows]
+        self._landmarks, self._landmark = table["landmark"][rows].unique(return_inverse=True)
+        self._levels = sparse_map.features.levels
+
+    def redundancy(self, keyframe: int, views: int) -> float:
+        """Share of a keyframe's landmarks that so many others see on its level of scale, the next or a finer one."""
+        own = self._keyframe == keyframe
+        place = self._landmark[~own] * self._levels + self._octave[~own]
+        counts = torch.bincount(place, minlength=len(self._landmarks) * self._levels)
+        up_to = counts.view(-1, self._levels).cumsum(dim=1)
+        seen_by = up_to[self._landmark[own], (self._octave[own] + 1).clamp(max=self._levels - 1)]
+        return float((seen_by >= views).double().mean()) if len(seen_by) else 0.0
+
+    def nearest(self, keyframe: int) -> int:
+        """The other keyframe that shares most landmarks with one; of those that share as many, the newest."""
+        others = self._keyframe[torch.isin(self._landmark, self._landmark[self._keyframe == keyframe])]
+        shared = torch.bincount(others)
+        shared[keyframe] = 0
+        return int((shared * len(shared) + torch.arange(len(shared))).argmax())
+
+    def drop(self, keyframe: int) -> None:
+        """Go on without a keyframe."""
+        kept = self._keyframe != keyframe
+        self._keyframe, self._octave, self._landmark = self._keyframe[kept], self._octave[kept], self._landmark[kept]
