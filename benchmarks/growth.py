@@ -58,7 +58,7 @@ def long_run(sequence: RGBDSequence, frames: int) -> Iterator[str]:
     slam = system.slam
 
     def mark() -> Mark:
-        keyframes = len(slam.mapper.map.keyframes)
+        keyframes = len(slam.mapper.map.kept)
         return Mark(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loops.count)
 
     marks = [mark()]

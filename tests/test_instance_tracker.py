@@ -332,6 +332,15 @@ def test_who_is_missed_but_seen_to_be_there_is_not_taken_for_who_appears_nearby(
     assert [track.id for track in tracks if track.missed] == ([1] if there else [])
 
 
+def test_who_comes_into_sight_from_behind_something_is_the_part_that_was_seen() -> None:
+    """First a part beside a cabinet, then all: the centroid jumps beyond the gate, but over the place of the part."""
+    part, cabinet = Board(-0.9, width=0.4, height=2.0), Board(0.3, z=1.9, width=2.0, height=2.0, seen=False)
+    whole = Board(0.1, width=2.4, height=2.0)
+    watch = Watch()
+    meet(watch, part, cabinet)
+    assert [(track.id, track.missed) for track in watch(whole)] == [(1, False)]
+
+
 def test_a_change_of_class_costs_what_decides_between_two_in_one_place() -> None:
     """Track 0 lies a little better on instance 1, but that is of the class of track 1."""
     nowhere = torch.full((1, 2, 3), torch.nan)

@@ -24,6 +24,7 @@ def match_instances(
     least_overlap: float,
     tracked: Tensor | None = None,
     present: Tensor | None = None,
+    covered: Tensor | None = None,
     elsewhere: Tensor | None = None,
 ) -> Tensor:
     """Object that each instance continues.
@@ -42,6 +43,8 @@ def match_instances(
         least_overlap: masks that overlap by this are of one object, whatever the class.
         tracked: which objects exist, bool, shape :math:`(B, T)`; all by default.
         present: which instances exist, bool, shape :math:`(B, N)`; all by default.
+        covered: pairs of an object whose place an instance covers: of one class they may be one, however far their
+            centroids, bool, shape :math:`(B, T, N)`; none by default.
         elsewhere: pairs of an object that is seen to be where it was predicted, and an instance that lies beside it and
             so is another one, however near; bool, shape :math:`(B, T, N)`; none by default.
 
@@ -55,7 +58,11 @@ def match_instances(
     distance = torch.cdist(predicted, seen)
     overlaps = overlap >= least_overlap
     near = (distance <= gate[..., None]) & alike
-    possible = (near if elsewhere is None else near & ~elsewhere) | overlaps
+    if covered is not None:
+        near = near | (alike & covered)
+    if elsewhere is not None:
+        near = near & ~elsewhere
+    possible = near | overlaps
     if tracked is not None:
         possible = possible & tracked[..., :, None]
     if present is not None:

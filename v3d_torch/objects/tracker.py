@@ -138,9 +138,10 @@ class InstanceTracker(torch.nn.Module):
         moved = torch.stack(list(now.values())).flatten(1).to(before.dtype)
         masks = self._coarse(list(instances.masks))
         overlap = torch.maximum(_overlap(before, masks), _overlap(moved, masks))
-        # A detection beside somebody who demonstrably has not moved there is somebody else, or nobody.
-        least = torch.minimum(moved.sum(dim=1)[:, None], masks.sum(dim=1))
-        elsewhere = there[:, None] & (moved @ masks.T < self._BESIDE * least)
+        both, areas = moved @ masks.T, moved.sum(dim=1)[:, None]
+        covered = both > self._config.least_overlap * areas
+        # A detection beside somebody who is seen to be where expected is somebody else, or nobody.
+        elsewhere = there[:, None] & (both < self._BESIDE * torch.minimum(areas, masks.sum(dim=1)))
         elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
         gate = self._config.max_jump + self._config.max_speed * elapsed
         alike = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
@@ -151,6 +152,7 @@ class InstanceTracker(torch.nn.Module):
             alike[None],
             gate[None],
             self._config.least_overlap,
+            covered=covered[None],
             elsewhere=elsewhere[None],
         )[0]
         return {i: self.tracks[track] for i, track in enumerate(matched.tolist()) if track >= 0}
