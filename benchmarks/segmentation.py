@@ -33,6 +33,7 @@ from v3d_torch.types import Instances, RGBDFrame, Segmenter
 SERIAL = ("lookahead=false", "segmentation.threads=1")  # as in v3d_torch/run.py
 
 REFERENCE = "yolov8n 640x480, 32 bits"
+FULL = ("segmentation.width=640", "segmentation.height=480")
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,11 @@ class Variant:
 
 
 VARIANTS: Mapping[str, Variant] = {
-    REFERENCE: Variant(("segmentation.precision=float32",)),
-    "8 bits (the default)": Variant(),
+    REFERENCE: Variant((*FULL, "segmentation.precision=float32")),
+    "8 bits, 640x480": Variant(FULL),
     "8 bits, 512x384": Variant(("segmentation.width=512", "segmentation.height=384")),
-    "8 bits, 416x320": Variant(("segmentation.width=416", "segmentation.height=320")),
+    "8 bits, 416x320 (the default)": Variant(),
+    "8 bits, 320x256": Variant(("segmentation.width=320", "segmentation.height=256")),
     "8 bits, yolo11n": Variant(("segmentation.model=yolo11n-seg",)),
     "8 bits, yolo26n": Variant(("segmentation.model=yolo26n-seg",)),
     "8 bits, every 2nd frame": Variant(every=2),
