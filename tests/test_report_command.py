@@ -230,6 +230,24 @@ def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def test_the_folder_above_runs_names_the_newest(tmp_path: Path) -> None:
+    names = ("demo/2026-01-01", "demo/2026-01-02", "study/desk/full/seed0")
+    for age, name in enumerate(names):
+        write_text(tmp_path / name / "metrics.json", "{}")
+        os.utime(tmp_path / name / "metrics.json", ns=(0, 10**9 * (10 - age)))
+    for above, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
+        with pytest.raises(InputError, match=re.escape(f"; give the newest of the runs in it, {tmp_path / newest}")):
+            read_run(tmp_path / above)
+    (tmp_path / "demo/latest").symlink_to("2026-01-01")
+    with pytest.raises(InputError, match=r"in it, .*latest$"):
+        read_run(tmp_path / "demo")
+
+
+def test_a_file_of_a_run_names_its_folder(copy: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(f"; give the folder that map.ply is in, {copy}")):
+        read_run(copy / "map.ply")
+
+
 @pytest.mark.parametrize(
     ("name", "spoil", "message"),
     [
