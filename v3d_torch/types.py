@@ -19,6 +19,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
+from v3d_torch.validation import number
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class RGBDFrame:
         Raises:
             InputError: an image has another shape or type, or another size than the camera's; the stamp is no number.
         """
-        colour, measured, seconds = _array(image), _array(depth), _number(stamp)
+        colour, measured, seconds = _array(image), _array(depth), number(stamp)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
             raise InputError(
                 f"frame {index}: the colour image is {colour.dtype} of shape {colour.shape}; give uint8 RGB of shape"
@@ -101,14 +102,6 @@ def _array(image: object) -> NDArray[Any]:
         image = image.detach()
         return (image.to(torch.float32) if image.is_floating_point() else image).numpy()
     return np.asarray(image)
-
-
-def _number(value: object) -> float:
-    """A number, NaN where it is none."""
-    try:
-        return float(value)  # type: ignore[arg-type]  # that is the question
-    except (TypeError, ValueError):
-        return math.nan
 
 
 @dataclass(frozen=True)
