@@ -161,15 +161,32 @@ class Remembering(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Camera poses over time.
+    """Camera poses over time. Arrays, and lists of them, become tensors.
 
     Attributes:
         stamps: seconds, float64, shape :math:`(N,)`, strictly increasing.
         T_wc: camera-to-world, float64, shape :math:`(N, 4, 4)`.
+
+    Raises:
+        InputError: they are not numbers of these shapes.
     """
 
     stamps: Tensor
     T_wc: Tensor
+
+    def __post_init__(self) -> None:
+        for name, shape in (("stamps", ()), ("T_wc", (4, 4))):
+            given: Any = getattr(self, name)
+            try:
+                value = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float64))
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{name} of a trajectory are no numbers ({error}); give an array or tensor") from error
+            if value.shape[1:] != shape or value.ndim != 1 + len(shape) or len(value) != len(self.stamps):
+                raise InputError(
+                    f"{name} of a trajectory have the shape {tuple(value.shape)}; give stamps of shape (N,) and as many"
+                    " poses T_wc of shape (N, 4, 4)"
+                )
+            object.__setattr__(self, name, value.to(torch.float64))
 
     def __len__(self) -> int:
         return self.stamps.shape[0]
