@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
 from v3d_torch.files import read_text
+from v3d_torch.home import at_home
 from v3d_torch.plain_yaml import parse_yaml
 from v3d_torch.validation import first_error
 
@@ -59,7 +60,7 @@ def load_camera(path_or_name: str | Path) -> PinholeCamera:
     """
     if str(path_or_name) in PRESETS:
         return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name))
-    path = Path(path_or_name)
+    path = at_home(path_or_name)
     if not path.is_file():
         near = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
         hint = f"did you mean {near[0]}?" if near else f"the presets are {', '.join(PRESETS)}"
