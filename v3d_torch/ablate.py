@@ -34,7 +34,8 @@ def main(
     from v3d_torch.study import run_study
 
     with exit_on_error():
-        run_study(seq, variants.split(","), seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)
+        names = [name.strip() for name in variants.split(",")]
+        run_study(seq, names, seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)
 
 
 if __name__ == "__main__":
