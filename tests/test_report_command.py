@@ -135,6 +135,13 @@ def test_the_command_makes_one_page_with_everything_in_it(copy: Path) -> None:
     assert "prefers-color-scheme: dark" in html and "@media print" in html
 
 
+def test_the_page_names_the_folder_itself(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "latest").symlink_to(copy.name)
+    monkeypatch.chdir(copy)
+    for folder in (Path(), tmp_path / "latest"):
+        assert "A run of V3D-SLAM, copy <b>&" in page_of(folder).words
+
+
 def test_plots_are_drawings_and_the_same_again(results: Path) -> None:
     html = render_page(read_run(results))
     drawings = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)

@@ -56,7 +56,7 @@ def render_page(run: StoredRun) -> str:
     stages = _stages(run)
     return environment.get_template("page.html").render(
         metrics=run.metrics,
-        folder=run.folder.name,
+        folder=run.folder.resolve().name,  # not "latest", which will be another, nor the empty name of "."
         evaluation=run.evaluation,
         poses=_pose_plots(run),
         found=_found_plots(run),
