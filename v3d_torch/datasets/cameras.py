@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from importlib import resources
 from pathlib import Path
@@ -93,6 +94,8 @@ def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera |
 
 
 def _named_or_own(camera: str | Path | None, folder: Path, published: PinholeCamera | None) -> PinholeCamera:
+    if camera is not None and not isinstance(camera, str | os.PathLike):
+        raise InputError(f"the camera is a {type(camera).__name__}; give a PinholeCamera, a preset's name or a file")
     if camera is not None:
         return load_camera(camera)
     for name in ("camera.yaml", "K.txt"):
