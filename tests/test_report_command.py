@@ -198,6 +198,21 @@ def test_a_file_that_is_not_there_leaves_a_gap_and_the_rest(
     assert page.images == images
 
 
+@pytest.mark.parametrize(
+    ("moving", "static", "said"),
+    [
+        (0.5, 0.25, "50.0 % of the moving and 25.0 % of the static pixels"),
+        (None, 0.25, "25.0 % of the static pixels"),
+        (0.5, None, "50.0 % of the moving pixels"),
+    ],
+)
+def test_what_the_true_masks_say(copy: Path, moving: float | None, static: float | None, said: str) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics["masks"] = {"moving_left_out": moving, "static_left_out": static}
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    assert f"Against the true masks: {said} were left out of tracking." in page_of(copy).words
+
+
 def test_without_objects(tmp_path: Path) -> None:
     run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
     page = page_of(tmp_path)
