@@ -74,6 +74,10 @@ def done(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 # --- the study
 
 
+def test_blanks_after_the_commas_are_no_part_of_the_names() -> None:
+    assert_one_sentence(call("--seq", "nowhere", "--variants", " baseline, full "), "nowhere: is neither")
+
+
 def test_all_variants_stand_in_one_table(done: tuple[Path, str]) -> None:
     out, screen = done
     for words in ("Ablation on moment", *VARIANTS, "ATE, m", "RPE", "moving out", f"results: {out}"):

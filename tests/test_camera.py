@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import astuple
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v3d_torch.camera import BackProjector, PinholeCamera
+from v3d_torch.errors import InputError
 
 FR1 = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 FR3 = PinholeCamera(535.4, 539.2, 320.1, 247.6)
@@ -68,3 +72,32 @@ def test_back_projection_has_gradients() -> None:
     camera = PinholeCamera(5.0, 5.0, 3.5, 2.5, width=8, height=6)
     depth = (torch.rand(1, 1, 6, 8, dtype=torch.float64) + 0.5).requires_grad_()
     assert torch.autograd.gradcheck(BackProjector(camera), (depth,))
+
+
+def test_numbers_of_any_kind_make_a_camera() -> None:
+    K = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
+    lens = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera gives it
+    camera = PinholeCamera(K[0, 0], torch.tensor(516.5).double(), K[0, 2], K[1, 2], np.int64(640), 480.0, lens)
+    assert camera == FR1 and hash(camera) == hash(FR1) and torch.equal(camera.rays, FR1.rays)
+    assert all(type(value) in (int, float, tuple) for value in astuple(camera))
+    assert PinholeCamera(535.4, 539.2, 320.1, 247.6, distortion=(0.1, 0.2, 0, 0)).distortion == (0.1, 0.2, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 0}, "fx is 0; give a finite number above 0"),
+        ({"fy": -480.0}, "fy is -480.0; give a finite number above 0"),
+        ({"fx": np.eye(3)}, "fx is array"),
+        ({"cx": math.nan}, "cx is nan; give a finite number$"),
+        ({"cy": None}, "cy is None; give"),
+        ({"width": 0}, "width is 0; give"),
+        ({"height": 479.5}, "height is 479.5; give whole pixels"),
+        ({"depth_scale": 0}, "depth_scale is 0; give"),
+        ({"distortion": "barrel"}, "distortion is 'barrel'; give the numbers k1, k2, p1, p2, k3"),
+        ({"distortion": None}, "distortion is None; give"),
+    ],
+)
+def test_what_is_no_camera_is_said(change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=f"^the camera's {message}"):
+        PinholeCamera(**{"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0} | change)

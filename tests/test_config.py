@@ -21,6 +21,10 @@ def test_the_command_line_goes_over_the_file_over_the_defaults(tmp_path: Path) -
     assert config.objects.clouds == Config().objects.clouds
 
 
+def test_one_value_needs_no_list() -> None:
+    assert load_config("paper", "seed=3") == load_config("paper", ["seed=3"])
+
+
 def test_a_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
     config = load_config(None, ["objects.voting.baselines=[0.0, 0.5]", "loop.enabled=false"])
     file = tmp_path / "config.yaml"

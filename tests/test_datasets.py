@@ -129,6 +129,21 @@ def test_index_behind_the_end(folder: Path) -> None:
         load_sequence(str(folder))[3]
 
 
+def test_frames_have_numbers(folder: Path) -> None:
+    sequence = load_sequence(str(folder))
+    frame = sequence[np.int64(1)]
+    assert (frame.index, type(frame.index)) == (1, int)
+    for wrong in (slice(0, 2), "1", 1.0, None):
+        with pytest.raises(InputError, match=r"by their numbers, and not by .*; take several with itertools\.islice"):
+            sequence[wrong]
+
+
+def test_a_camera_of_another_kind(folder: Path) -> None:
+    for wrong, kind in ((np.eye(3), "ndarray"), ({"fx": 500}, "dict")):
+        with pytest.raises(InputError, match=f"^the camera is a {kind}; give a PinholeCamera, a preset's name or a"):
+            load_sequence(str(folder), camera=wrong)
+
+
 def camera_after(change: Callable[[Path], object], folder: Path, **arguments: str) -> PinholeCamera:
     change(folder)
     return tum.TUMSequence(folder, **arguments).camera  # whatever the size of its images

@@ -445,3 +445,11 @@ def test_an_rpe_over_another_time_is_not_set_beside_the_papers() -> None:
 def test_sequences_of_the_paper_by_name(name: str, sequence: str | None) -> None:
     assert paper_sequence(name) == sequence
     assert set(paper_scores()["ate"]) == set(SEQUENCES)
+
+
+def test_what_is_no_trajectory_is_said() -> None:
+    poses = Trajectory(torch.arange(3.0), torch.eye(4).repeat(3, 1, 1))
+    with pytest.raises(InputError, match=r"^the ground truth is a str; give a Trajectory: of a file by read"):
+        evaluate("groundtruth.txt", poses)
+    with pytest.raises(InputError, match=r"^the estimate is a ndarray; give a Trajectory"):
+        evaluate(poses, np.zeros((3, 8)))

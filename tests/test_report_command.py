@@ -135,6 +135,13 @@ def test_the_command_makes_one_page_with_everything_in_it(copy: Path) -> None:
     assert "prefers-color-scheme: dark" in html and "@media print" in html
 
 
+def test_the_page_names_the_folder_itself(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "latest").symlink_to(copy.name)
+    monkeypatch.chdir(copy)
+    for folder in (Path(), tmp_path / "latest"):
+        assert "A run of V3D-SLAM, copy <b>&" in page_of(folder).words
+
+
 def test_plots_are_drawings_and_the_same_again(results: Path) -> None:
     html = render_page(read_run(results))
     drawings = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)
@@ -191,6 +198,21 @@ def test_a_file_that_is_not_there_leaves_a_gap_and_the_rest(
     assert page.images == images
 
 
+@pytest.mark.parametrize(
+    ("moving", "static", "said"),
+    [
+        (0.5, 0.25, "50.0 % of the moving and 25.0 % of the static pixels"),
+        (None, 0.25, "25.0 % of the static pixels"),
+        (0.5, None, "50.0 % of the moving pixels"),
+    ],
+)
+def test_what_the_true_masks_say(copy: Path, moving: float | None, static: float | None, said: str) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics["masks"] = {"moving_left_out": moving, "static_left_out": static}
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    assert f"Against the true masks: {said} were left out of tracking." in page_of(copy).words
+
+
 def test_without_objects(tmp_path: Path) -> None:
     run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
     page = page_of(tmp_path)
@@ -228,6 +250,24 @@ def without(path: Path, key: str) -> None:
 
 def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_the_folder_above_runs_names_the_newest(tmp_path: Path) -> None:
+    names = ("demo/2026-01-01", "demo/2026-01-02", "study/desk/full/seed0")
+    for age, name in enumerate(names):
+        write_text(tmp_path / name / "metrics.json", "{}")
+        os.utime(tmp_path / name / "metrics.json", ns=(0, 10**9 * (10 - age)))
+    for above, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
+        with pytest.raises(InputError, match=re.escape(f"; give the newest of the runs in it, {tmp_path / newest}")):
+            read_run(tmp_path / above)
+    (tmp_path / "demo/latest").symlink_to("2026-01-01")
+    with pytest.raises(InputError, match=r"in it, .*latest$"):
+        read_run(tmp_path / "demo")
+
+
+def test_a_file_of_a_run_names_its_folder(copy: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(f"; give the folder that map.ply is in, {copy}")):
+        read_run(copy / "map.ply")
 
 
 @pytest.mark.parametrize(

@@ -274,6 +274,11 @@ def test_a_finished_run_says_so(whole: Path) -> None:
 def test_where_there_is_no_checkpoint(tmp_path: Path) -> None:
     assert_one_sentence(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint to go on from; give")
     assert_one_sentence(call("--resume", tmp_path / "no"), f"{tmp_path / 'no'}: is no folder; give")
+    run = tmp_path / "seq" / "2026-01-01"
+    run.mkdir(parents=True)
+    (run / CHECKPOINT).touch()
+    assert_one_sentence(call("--resume", tmp_path), f"; give the newest of the runs in it, {run}")
+    assert_one_sentence(call("--resume", run / CHECKPOINT), f"is no folder; give the folder that {CHECKPOINT} is in")
     done = call()
     assert done.exit_code == 2 and "--resume" in done.stderr
 

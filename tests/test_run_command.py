@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -11,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import chdir
+from datetime import datetime, tzinfo
 from pathlib import Path
 
 import cv2
@@ -20,9 +22,10 @@ import plyfile
 import pytest
 from typer.testing import CliRunner, Result
 
-from v3d_torch import run
+from v3d_torch import console, run
 from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAMES, RATE, write_sequence
+from v3d_torch.errors import OutputError
 from v3d_torch.trajectory import read_trajectory
 
 FILES = {
@@ -175,6 +178,38 @@ def test_without_a_segmenter_and_without_out(moment: Path, tmp_path: Path) -> No
         newest.append(latest.resolve())
     assert newest[0] != newest[1]
     assert {path.name for path in runs.iterdir()} == {"latest", *(path.name for path in newest)}
+
+
+def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stopped(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> Stopped:
+            return cls(2026, 1, 2, 3, 4, 5, tzinfo=tz)
+
+    monkeypatch.setattr(console, "datetime", Stopped)
+    monkeypatch.chdir(tmp_path)
+    made = [console.result_folder(None, "fr3/w/xyz") for _ in range(3)]
+    assert [folder.name for folder in made] == [f"2026-01-02_03-04-05{end}" for end in ("", "_2", "_3")]
+    assert (tmp_path / "results" / "fr3_w_xyz" / "latest").resolve() == made[-1].resolve()
+
+
+def test_where_there_can_be_no_links_there_is_no_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "A required privilege is not held by the client")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    monkeypatch.chdir(tmp_path)
+    folder = console.result_folder(None, "demo")
+    assert folder.is_dir() and [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_where_no_folder_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "results").symlink_to("nowhere")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match=r"demo: cannot be made \(.*\); choose another folder with --out"):
+        console.result_folder(None, "demo")
 
 
 def test_a_configuration_file_and_the_command_line_over_it(moment: Path, tmp_path: Path) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from v3d_torch import V3DSLAM, RGBDFrame, Tracked, load_sequence
+from v3d_torch import V3DSLAM, PinholeCamera, RGBDFrame, Tracked, load_sequence
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.depth import DepthSmoother
@@ -76,6 +79,44 @@ def test_depth_in_the_cameras_units_becomes_metres(demo: RGBDSequence) -> None:
 def test_arrays_of_another_shape_or_type_are_refused(image: np.ndarray, depth: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"frame 7: .*; give "):
         RGBDFrame.of(7, 0.0, image, depth)
+
+
+def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
+    frame = demo[0]
+    rgb, metres = frame.image.permute(1, 2, 0).numpy(), frame.depth[0]
+    bgr = np.ascontiguousarray(rgb[..., ::-1])
+    for image, depth in (
+        (bgr[..., ::-1], metres),  # OpenCV's, the usual way round
+        (rgb[:, ::-1][:, ::-1], metres.numpy()[:, ::-1][:, ::-1]),
+        (Image.fromarray(rgb), Image.fromarray(metres.numpy())),
+        (torch.from_numpy(rgb), metres.clone().requires_grad_()),  # a network's
+    ):
+        made = RGBDFrame.of(0, frame.stamp, image, depth, demo.camera)
+        assert torch.equal(made.image, frame.image) and torch.equal(made.depth, frame.depth)
+    half = RGBDFrame.of(0, 0.0, rgb, metres.to(torch.bfloat16), demo.camera)
+    torch.testing.assert_close(half.depth, frame.depth, rtol=4e-3, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"image": None}, "the colour image is object of shape "),
+        ({"image": "rgb.png"}, "the colour image is <U7 of shape "),
+        ({"depth": np.ones((480, 640), bool)}, "the depth image is bool; give metres"),
+        ({"depth": np.ones((480, 640), complex)}, "the depth image is complex128; give metres"),
+        ({"stamp": math.nan}, "the stamp is nan; give seconds"),
+        ({"stamp": None}, "the stamp is None; give seconds"),
+        ({"camera": np.eye(3)}, "the camera is a ndarray; give a PinholeCamera"),
+        (
+            {"camera": PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240)},
+            "has 640x480 pixels, the camera 320x240; give the camera that took it",
+        ),
+    ],
+)
+def test_what_is_no_frame_is_said(change: dict[str, object], message: str) -> None:
+    given = {"stamp": 0.0, "image": np.zeros((480, 640, 3), np.uint8), "depth": np.ones((480, 640))} | change
+    with pytest.raises(InputError, match=f"^frame 7: {message}"):
+        RGBDFrame.of(7, **given)
 
 
 def test_without_any_camera_it_says_so(demo: RGBDSequence) -> None:

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from v3d_torch.errors import InputError, OutputError
+from v3d_torch.evaluation import evaluate
 from v3d_torch.lie import se3_exp
 from v3d_torch.trajectory import read_trajectory, write_trajectory
 from v3d_torch.types import Trajectory
@@ -139,3 +140,46 @@ def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").mkdir()
     with pytest.raises(OutputError, match=r"trajectory\.txt"):
         write_trajectory(tmp_path / "trajectory.txt", random_trajectory(2, seed=0))
+
+
+def test_arrays_and_lists_make_a_trajectory(tmp_path: Path) -> None:
+    expected = random_trajectory(3, 0)
+    stamps, T_wc = expected.stamps.numpy(), expected.T_wc.numpy()
+    write_trajectory(tmp_path / "expected.txt", expected)
+    for made in (
+        Trajectory(stamps, T_wc),
+        Trajectory(stamps.tolist(), list(T_wc)),
+        Trajectory(stamps[::-1][::-1], T_wc[::-1][::-1]),
+    ):
+        write_trajectory(tmp_path / "made.txt", made)
+        assert (tmp_path / "made.txt").read_bytes() == (tmp_path / "expected.txt").read_bytes()
+        assert evaluate(expected, made).ate.rmse < 1e-9
+    single = Trajectory(expected.stamps, expected.T_wc.float())
+    assert single.T_wc.dtype == torch.float64 and evaluate(expected, single).ate.rmse < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("stamps", "T_wc", "message"),
+    [
+        (np.zeros(2), np.zeros((3, 4, 4)), r"T_wc of a trajectory have the shape \(3, 4, 4\); give"),
+        (np.zeros(2), np.zeros((2, 7)), r"T_wc of a trajectory have the shape \(2, 7\); give"),
+        (np.zeros((2, 1)), np.zeros((2, 4, 4)), r"stamps of a trajectory have the shape \(2, 1\); give"),
+        (["then", "now"], np.zeros((2, 4, 4)), "stamps of a trajectory are no numbers"),
+        (None, None, "stamps of a trajectory"),
+    ],
+)
+def test_what_is_no_trajectory_is_said(stamps: object, T_wc: object, message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}"):
+        Trajectory(stamps, T_wc)
+
+
+def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
+    path, good = tmp_path / "out.txt", random_trajectory(2, 0)
+    with pytest.raises(InputError, match=r"takes a path and a Trajectory, this is a .*Path"):
+        write_trajectory(good, path)
+    for wrong in (torch.nan, torch.inf, 0.0):
+        T_wc = good.T_wc.clone()
+        T_wc[1] *= wrong
+        with pytest.raises(InputError, match=r"out\.txt: pose 1 has no rotation or no finite position"):
+            write_trajectory(path, Trajectory(good.stamps, T_wc))
+    assert not path.exists()

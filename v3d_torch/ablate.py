@@ -7,10 +7,13 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.home import paths_at_home
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @app.command()
+@paths_at_home
 def main(
     seq: Annotated[list[str], typer.Option(help="demo, a TUM RGB-D sequence or a folder; may be given several times.")],
     data_root: Annotated[
@@ -31,7 +34,8 @@ def main(
     from v3d_torch.study import run_study
 
     with exit_on_error():
-        run_study(seq, variants.split(","), seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)
+        names = [name.strip() for name in variants.split(",")]
+        run_study(seq, names, seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)
 
 
 if __name__ == "__main__":

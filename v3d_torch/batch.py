@@ -8,6 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from v3d_torch.home import paths_at_home
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
@@ -30,6 +32,7 @@ class SeveralValues(TyperCommand):
 
 
 @app.command(cls=SeveralValues)
+@paths_at_home
 def main(
     seqs: Annotated[
         list[str],

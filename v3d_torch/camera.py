@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 
+import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.geometry.calibration import distort_points, undistort_points
 from torch import Tensor
+
+from v3d_torch.errors import InputError
+from v3d_torch.validation import number
 
 
 @dataclass(frozen=True)
@@ -23,8 +28,12 @@ class PinholeCamera:
         cy: v of the principal point, pixels.
         width: columns of the images, pixels.
         height: rows of the images, pixels.
-        distortion: k1, k2, p1, p2, k3 of the Brown model in OpenCV's order.
+        distortion: k1, k2, p1, p2, k3 of the Brown model in OpenCV's order; as it gives them, an array of four or more.
         depth_scale: units of the depth image per metre (TUM: 5000).
+
+    Raises:
+        InputError: one of them is no such number. A focal length below 0, as ICL-NUIM publishes for a y axis that
+            points up, is none: that of an image points down.
     """
 
     fx: float
@@ -35,6 +44,23 @@ class PinholeCamera:
     height: int = 480
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: float = 5000.0
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy", "width", "height", "depth_scale"):
+            given = getattr(self, name)
+            value = number(given)
+            if not math.isfinite(value) or (value <= 0 and name not in ("cx", "cy")):
+                above = "" if name in ("cx", "cy") else " above 0"
+                raise InputError(f"the camera's {name} is {given!r}; give a finite number{above}")
+            if name in ("width", "height"):
+                if value % 1:
+                    raise InputError(f"the camera's {name} is {given!r}; give whole pixels")
+                value = int(value)
+            object.__setattr__(self, name, value)
+        lens = [number(value) for value in np.ravel(self.distortion)]
+        if not all(map(math.isfinite, lens)):
+            raise InputError(f"the camera's distortion is {self.distortion!r}; give the numbers k1, k2, p1, p2, k3")
+        object.__setattr__(self, "distortion", (*lens, *[0.0] * (5 - len(lens))))
 
     def __getstate__(self) -> dict[str, object]:
         """What it is made of: what is cached follows from that, and takes megabytes."""

@@ -23,7 +23,7 @@ from v3d_torch.request import Request
 from v3d_torch.slam import Tracked
 from v3d_torch.state import CLASSES, OF_SLAM, State, gather, put_back, refresh
 from v3d_torch.state_file import read_state, write_state
-from v3d_torch.stored_run import read_metrics
+from v3d_torch.stored_run import read_metrics, where_instead
 
 CHECKPOINT = "checkpoint.v3d"
 """Name of the file. It is there from a run's first checkpoint to its end."""
@@ -95,13 +95,12 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         InputError: there is no checkpoint, or it is damaged, of another version or of a stream.
     """
     path = folder / CHECKPOINT
-    if not folder.is_dir():
-        raise InputError(f"{folder}: is no folder; give the folder of the results of a run")
     if not path.is_file():
-        raise InputError(
-            f"{folder}: has no checkpoint to go on from; give the folder of a run that was killed after its first one,"
-            " or run the sequence again"
+        lacks = "has no checkpoint to go on from" if folder.is_dir() else "is no folder"
+        instead = where_instead(folder, CHECKPOINT) or (
+            "give the folder of a run that was killed after its first one, or run the sequence again"
         )
+        raise InputError(f"{folder}: {lacks}; {instead}")
     about, state = read_state(path, _CLASSES)
     try:
         request, config = Request(**about["request"]), Config.model_validate(about["config"])

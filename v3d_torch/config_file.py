@@ -54,7 +54,7 @@ def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> C
 
     Args:
         name: ``paper`` or another of `CONFIGS`, or a YAML file with any part of the tree; None for the defaults.
-        overrides: texts such as ``objects.voting.distance_threshold=0.05``; values are read as YAML.
+        overrides: texts such as ``objects.voting.distance_threshold=0.05``, or one; values are read as YAML.
 
     Raises:
         ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
@@ -69,7 +69,7 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 
 
 def _overridden(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
-    for override in overrides:
+    for override in [overrides] if isinstance(overrides, str) else overrides:  # which is an iterable of letters
         _apply_override(tree, override)
         config = _validated(tree, "--set")
     return config

@@ -8,7 +8,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence, Sized
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from threading import Event
@@ -189,13 +189,32 @@ def interrupts_between_frames() -> Iterator[Event]:
 def result_folder(out: Path | None, name: str) -> Path:
     """The folder given, made if need be, else a new one by the time, which ``latest`` beside it points to."""
     runs = Path("results") / name.replace("/", "_")
-    folder = out or runs / datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if out is None:
-            pointer = runs / f".latest.{os.getpid()}"  # renamed, so that there is always a latest
-            pointer.symlink_to(folder.name)
-            pointer.replace(runs / "latest")
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            return out
+        folder = _folder_of_now(runs)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out") from error
+        raise OutputError(
+            f"{out or runs}: cannot be made ({error.strerror}); choose another folder with --out"
+        ) from error
+    pointer = runs / f".latest.{os.getpid()}"  # renamed, so that there is always a latest
+    with suppress(OSError):  # no links on Windows without developer mode, nor on some disks: the run goes without
+        pointer.symlink_to(folder.name)
+        pointer.replace(runs / "latest")
     return folder
+
+
+def _folder_of_now(runs: Path) -> Path:
+    """A new folder by the time, to the second; of runs that begin in the same one, each has its own."""
+    runs.mkdir(parents=True, exist_ok=True)
+    now = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    folder, others = runs / now, 0
+    while True:
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            others += 1
+            folder = runs / f"{now}_{others + 1}"
+        else:
+            return folder

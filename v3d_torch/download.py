@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 from platformdirs import user_cache_path
 
 from v3d_torch.errors import DownloadError, OutputError
+from v3d_torch.home import at_home
 
 Progress = Callable[[int, int | None], None]
 """Called with the bytes that are here and the bytes that there will be (None: the server does not say)."""
@@ -27,7 +28,7 @@ _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 def cache_dir() -> Path:
     """Folder for what is downloaded or made once: ``$V3D_CACHE``, else the user's cache of this platform."""
-    return Path(os.environ.get("V3D_CACHE") or user_cache_path("v3d_torch"))
+    return at_home(os.environ.get("V3D_CACHE") or user_cache_path("v3d_torch"))
 
 
 def fetch(

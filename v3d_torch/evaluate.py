@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from v3d_torch.home import paths_at_home
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -16,6 +18,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 
 
 @app.command()
+@paths_at_home
 def main(
     groundtruth: Annotated[Path, typer.Argument(help="True poses: stamp tx ty tz qx qy qz qw, camera to world.")],
     estimate: Annotated[Path, typer.Argument(help="Estimated poses, in the same layout and any world.")],

@@ -7,10 +7,13 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.home import paths_at_home
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @app.command()
+@paths_at_home
 def main(
     out: Annotated[Path, typer.Option(help="Folder to write, new or empty.")],
     seq: Annotated[

@@ -8,11 +8,13 @@ from typing import Annotated
 import typer
 
 from v3d_torch.batch import SeveralValues
+from v3d_torch.home import paths_at_home
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @app.command(cls=SeveralValues)
+@paths_at_home
 def main(
     data_root: Annotated[
         Path | None, typer.Option(envvar="V3D_DATA", help="Where the sequences are, or are downloaded to.")

@@ -21,6 +21,11 @@ from v3d_torch.trajectory import read_trajectory
 from v3d_torch.types import Trajectory
 from v3d_torch.validation import first_error
 
+_METRICS = "metrics.json"
+
+_DEPTH = 3
+"""Folders between a run and the one above it that is given: a batch has sequence, configuration and seed."""
+
 
 class Metrics(BaseModel):
     """What ``metrics.json`` says beside the scores; the names are its keys."""
@@ -84,13 +89,14 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     Raises:
         InputError: the folder holds no results, a file in it is broken, or the given true poses are of another time.
     """
-    if not (folder / "metrics.json").is_file():
+    if not (folder / _METRICS).is_file():
         raise InputError(
-            f"{folder}: holds no results of a run, there is no metrics.json; give the folder that run names at its end"
+            f"{folder}: holds no results of a run, there is no {_METRICS};"
+            f" {where_instead(folder, _METRICS) or 'give the folder that run names at its end'}"
         )
     config_path = folder / "config.yaml"
     config_text = read_text(config_path, "it is a configuration in YAML") if config_path.is_file() else ""
-    metrics, trajectory = read_metrics(folder / "metrics.json"), _read_poses(folder / "trajectory.txt")
+    metrics, trajectory = read_metrics(folder / _METRICS), _read_poses(folder / "trajectory.txt")
     frames = len(metrics.status)
     if trajectory is not None and metrics.failure is not None:  # killed between writing the two: it has more poses
         trajectory = Trajectory(trajectory.stamps[:frames], trajectory.T_wc[:frames])
@@ -122,6 +128,26 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         config_text=config_text,
         config=_read_config(config_path),
     )
+
+
+def where_instead(path: Path, file: str) -> str | None:
+    """Which folder to give instead of one that is none of a run: the one around a file, or the newest run below it.
+
+    Args:
+        path: that was given.
+        file: name of the file that a run's folder has to have.
+
+    Returns:
+        What to do, in words; None where there is no such folder.
+    """
+    if path.is_file() and (path.parent / file).is_file():
+        return f"give the folder that {path.name} is in, {path.parent}"
+    found = [place for depth in range(1, _DEPTH + 1) for place in path.glob("*/" * depth + file)]
+    if not found:
+        return None
+    # A name that points to the newest, as latest does, is as new as what it points to, and easier to type.
+    newest = max(found, key=lambda place: (place.stat().st_mtime_ns, place.parent.is_symlink()))
+    return f"give the newest of the runs in it, {newest.parent}"
 
 
 def read_metrics(path: Path) -> Metrics:

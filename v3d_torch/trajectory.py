@@ -63,9 +63,16 @@ def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
         trajectory: poses; none make an empty file.
 
     Raises:
+        InputError: what is given is no trajectory, or a pose in it no rigid motion.
         OutputError: when the folder cannot be written or the disk is full.
     """
+    if not isinstance(trajectory, Trajectory):
+        raise InputError(f"write_trajectory takes a path and a Trajectory, this is a {type(trajectory).__name__}")
     T_wc = trajectory.T_wc.detach().numpy()
+    with np.errstate(invalid="ignore"):
+        rigid = np.isfinite(T_wc).all(axis=(1, 2)) & (np.linalg.det(T_wc[:, :3, :3]) > 0)
+    if not rigid.all():
+        raise InputError(f"{path}: pose {rigid.argmin()} has no rotation or no finite position; repair or leave it out")
     lines = []
     if len(trajectory):
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)

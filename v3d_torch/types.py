@@ -7,9 +7,10 @@ means "no measurement"; stamps are seconds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
+from v3d_torch.validation import number
 
 
 @dataclass(frozen=True)
@@ -53,29 +55,53 @@ class RGBDFrame:
         Args:
             index: position in the sequence, from 0.
             stamp: seconds.
-            image: colour, uint8 RGB, shape :math:`(H, W, 3)`.
+            image: colour, uint8 RGB, shape :math:`(H, W, 3)`; also a view such as ``bgr[..., ::-1]``, or of PIL.
             depth: pixel by pixel on it, shape :math:`(H, W)`: metres where it is a floating-point image, else the
                 camera's units; 0 or not a number = no measurement.
             camera: that took both; gives the units of depth, millimetres where there is none.
 
         Raises:
-            InputError: an image has another shape or type.
+            InputError: an image has another shape or type, or another size than the camera's; the stamp is no number.
         """
-        colour, measured = torch.as_tensor(image), torch.as_tensor(np.asarray(depth).astype(np.float32))
-        if colour.dtype != torch.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
+        colour, measured, seconds = _array(image), _array(depth), number(stamp)
+        if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
             raise InputError(
-                f"frame {index}: the colour image is {colour.dtype} of shape {tuple(colour.shape)}; give uint8 RGB"
-                " of shape (H, W, 3)"
+                f"frame {index}: the colour image is {colour.dtype} of shape {colour.shape}; give uint8 RGB of shape"
+                " (H, W, 3)"
             )
         if measured.shape != colour.shape[:2]:
             raise InputError(
-                f"frame {index}: the depth image has shape {tuple(measured.shape)}, the colour image"
-                f" {tuple(colour.shape)}; give depth of shape (H, W), registered to the colour image"
+                f"frame {index}: the depth image has shape {measured.shape}, the colour image {colour.shape}; give"
+                " depth of shape (H, W), registered to the colour image"
             )
-        if not np.issubdtype(np.asarray(depth).dtype, np.floating):
-            measured = measured / (camera.depth_scale if camera is not None else 1000)
-        measured = measured.where(measured.isfinite() & (measured > 0), 0.0)
-        return RGBDFrame(index, stamp, colour.permute(2, 0, 1).contiguous(), measured[None], camera=camera)
+        if measured.dtype.kind not in "fiu":
+            raise InputError(
+                f"frame {index}: the depth image is {measured.dtype}; give metres in floating point, or whole numbers"
+                " in the camera's units"
+            )
+        if not math.isfinite(seconds):
+            raise InputError(f"frame {index}: the stamp is {stamp!r}; give seconds, as a finite number")
+        if not isinstance(camera, PinholeCamera | None):
+            raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
+        if camera is not None and colour.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"frame {index}: has {colour.shape[1]}x{colour.shape[0]} pixels, the camera"
+                f" {camera.width}x{camera.height}; give the camera that took it"
+            )
+        metres = torch.from_numpy(measured.astype(np.float32))
+        if measured.dtype.kind != "f":
+            metres = metres / (camera.depth_scale if camera is not None else 1000)
+        metres = metres.where(metres.isfinite() & (metres > 0), 0.0)
+        channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
+        return RGBDFrame(index, seconds, channels, metres[None], camera=camera)
+
+
+def _array(image: object) -> NDArray[Any]:
+    """An image as an array: a tensor may be of a type that NumPy has not, or wait for gradients."""
+    if isinstance(image, Tensor):
+        image = image.detach()
+        return (image.to(torch.float32) if image.is_floating_point() else image).numpy()
+    return np.asarray(image)
 
 
 @dataclass(frozen=True)
@@ -135,15 +161,32 @@ class Remembering(Protocol):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Camera poses over time.
+    """Camera poses over time. Arrays, and lists of them, become tensors.
 
     Attributes:
         stamps: seconds, float64, shape :math:`(N,)`, strictly increasing.
         T_wc: camera-to-world, float64, shape :math:`(N, 4, 4)`.
+
+    Raises:
+        InputError: they are not numbers of these shapes.
     """
 
     stamps: Tensor
     T_wc: Tensor
+
+    def __post_init__(self) -> None:
+        for name, shape in (("stamps", ()), ("T_wc", (4, 4))):
+            given: Any = getattr(self, name)
+            try:
+                value = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float64))
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{name} of a trajectory are no numbers ({error}); give an array or tensor") from error
+            if value.shape[1:] != shape or value.ndim != 1 + len(shape) or len(value) != len(self.stamps):
+                raise InputError(
+                    f"{name} of a trajectory have the shape {tuple(value.shape)}; give stamps of shape (N,) and as many"
+                    " poses T_wc of shape (N, 4, 4)"
+                )
+            object.__setattr__(self, name, value.to(torch.float64))
 
     def __len__(self) -> int:
         return self.stamps.shape[0]

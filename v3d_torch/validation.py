@@ -1,7 +1,8 @@
-"""What a model refuses, in words."""
+"""What is given, and whether it can be taken: numbers, and in words what a model refuses."""
 
 from __future__ import annotations
 
+import math
 import reprlib
 
 from pydantic import ValidationError
@@ -13,3 +14,11 @@ def first_error(error: ValidationError) -> str:
     key = ".".join(str(part) for part in first["loc"]) or "the whole"
     rule = "input should be a valid dictionary of keys" if first["type"] == "model_type" else first["msg"].lower()
     return f"{key}: {rule}, got {reprlib.repr(first['input'])}"
+
+
+def number(value: object) -> float:
+    """A number of any kind, or a text or array that holds one; NaN where it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]  # that is the question
+    except (TypeError, ValueError):
+        return math.nan

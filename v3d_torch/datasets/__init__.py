@@ -17,6 +17,7 @@ from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.download import Progress, cache_dir
 from v3d_torch.errors import GroundTruthWarning, InputError
 from v3d_torch.files import StrPath
+from v3d_torch.home import at_home
 
 __all__ = [
     "PAPER_SEQUENCES",
@@ -82,7 +83,7 @@ def _checked(
     if options.fps is not None and not _RATES[0] <= options.fps <= _RATES[1]:
         raise InputError(f"--fps {options.fps:g}: give frames a second, between {_RATES[0]:g} and {_RATES[1]:g}")
     try:
-        root = None if data_root is None else Path(data_root)
+        root = None if data_root is None else at_home(data_root)
         return _open(os.fspath(name), root, camera, options, download, progress)
     except OSError as error:  # a folder that may not be looked into, a name that is too long
         raise InputError(

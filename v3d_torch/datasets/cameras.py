@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from importlib import resources
 from pathlib import Path
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
 from v3d_torch.files import read_text
+from v3d_torch.home import at_home
 from v3d_torch.plain_yaml import parse_yaml
 from v3d_torch.validation import first_error
 
@@ -59,7 +61,7 @@ def load_camera(path_or_name: str | Path) -> PinholeCamera:
     """
     if str(path_or_name) in PRESETS:
         return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name))
-    path = Path(path_or_name)
+    path = at_home(path_or_name)
     if not path.is_file():
         near = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
         hint = f"did you mean {near[0]}?" if near else f"the presets are {', '.join(PRESETS)}"
@@ -92,6 +94,8 @@ def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera |
 
 
 def _named_or_own(camera: str | Path | None, folder: Path, published: PinholeCamera | None) -> PinholeCamera:
+    if camera is not None and not isinstance(camera, str | os.PathLike):
+        raise InputError(f"the camera is a {type(camera).__name__}; give a PinholeCamera, a preset's name or a file")
     if camera is not None:
         return load_camera(camera)
     for name in ("camera.yaml", "K.txt"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import suppress
 from pathlib import Path
 
 from v3d_torch.datasets.names import canonical_name, download_url, short_name, unknown_name
@@ -13,6 +12,7 @@ from v3d_torch.download import Progress, cache_dir, fetch
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.extract import extract_tar
 from v3d_torch.files import one_process_makes
+from v3d_torch.home import at_home
 
 
 def sequence_path(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
@@ -45,9 +45,8 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
 
 def stored_path(name: str, data_root: Path | None) -> Path | None:
     """The folder or file of a sequence that is here, looked for as `sequence_path` does; None where there is none."""
-    with suppress(RuntimeError):  # ~somebody who is not known here
-        if (path := Path(name).expanduser()).exists():
-            return path
+    if (path := at_home(name)).exists():
+        return path
     found = (_find(root, name, canonical_name(name)) for root in (data_folder(data_root), cache_dir()))
     return next((path for path in found if path is not None), None)
 
@@ -55,7 +54,7 @@ def stored_path(name: str, data_root: Path | None) -> Path | None:
 def data_folder(data_root: Path | None) -> Path:
     """Where sequences are kept: ``data_root`` if given, else ``$V3D_DATA``, else the cache."""
     shared = os.environ.get("V3D_DATA")
-    return data_root or (Path(shared) if shared else cache_dir())
+    return data_root or (at_home(shared) if shared else cache_dir())
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 
@@ -61,8 +62,15 @@ class StoredFrames(ABC):
 
         Raises:
             IndexError: there is no such frame.
-            InputError: an image is broken, of the wrong kind or not of the camera's size.
+            InputError: an image is broken, of the wrong kind or not of the camera's size, or ``index`` is no number.
         """
+        try:
+            index = operator.index(index)
+        except TypeError as error:
+            raise InputError(
+                f"{self.name}: frames are read one by one, by their numbers, and not by {index!r}; take several with"
+                " itertools.islice(sequence, start, stop)"
+            ) from error
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, there is none with index {index}")
         image, depth = self._read(index)

@@ -75,8 +75,13 @@ def evaluate(
         frames: colour-depth pairs of the sequence, for the coverage.
 
     Raises:
-        InputError: fewer than three poses of the two belong together.
+        InputError: fewer than three poses of the two belong together, or one of the two is no trajectory.
     """
+    for what, given in (("ground truth", groundtruth), ("estimate", estimate)):
+        if not isinstance(given, Trajectory):
+            raise InputError(
+                f"the {what} is a {type(given).__name__}; give a Trajectory: of a file by read_trajectory, or of arrays"
+            )
     matches = match(groundtruth, estimate, max_time_difference)
     if len(matches) < MIN_PAIRS:
         raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,11 +57,12 @@ def render_page(run: StoredRun) -> str:
     stages = _stages(run)
     return environment.get_template("page.html").render(
         metrics=run.metrics,
-        folder=run.folder.name,
+        folder=run.folder.resolve().name,  # not "latest", which will be another, nor the empty name of "."
         evaluation=run.evaluation,
         poses=_pose_plots(run),
         found=_found_plots(run),
         objects=_object_plot(run),
+        left_out=_left_out(run.metrics.masks or {}),
         pictures=[
             (inline_image(run.folder / "figures" / name), text)
             for name, text in _FIGURES.items()
@@ -71,6 +73,12 @@ def render_page(run: StoredRun) -> str:
         changes=changes(run.config) if run.config is not None else None,
         config_text=run.config_text,
     )
+
+
+def _left_out(scores: Mapping[str, Any]) -> list[str]:
+    """Shares of the truly moving and static pixels, in words; without those of which there are no pixels."""
+    shares = {what: scores.get(f"{what}_left_out") for what in ("moving", "static")}
+    return [f"{100 * share:.1f} % of the {what}" for what, share in shares.items() if share is not None]
 
 
 def changes(config: Config) -> list[tuple[str, Any, Any]]:
