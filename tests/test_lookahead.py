@@ -13,9 +13,9 @@ from v3d_torch.config_file import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import InputError
 from v3d_torch.lookahead import percepts
+from v3d_torch.percept import Percept
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.slam import Percept
 from v3d_torch.types import Instances
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))

@@ -19,7 +19,8 @@ from .objects.intra_motion import Deformation, IntraObjectMotion, intra_object_m
 from .objects.tracker import InstanceTracker
 from .objects.voting import HoughVoting, Votes, hough_vote
 from .objects.voxel import VoxelPool, Voxels, voxel_pool
-from .slam import V3DSLAM, Tracked
+from .percept import Tracked
+from .slam import V3DSLAM
 from .state import load_state, save_state
 from .trajectory import read_trajectory, write_trajectory
 from .types import Instances, RGBDFrame, Trajectory

@@ -18,9 +18,9 @@ from v3d_torch.errors import InputError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.mapping.views import StaticView
 from v3d_torch.objects.dynamics import Judged, Scene, Verdict
+from v3d_torch.percept import Tracked
 from v3d_torch.pipeline import Pipeline, Run, Snapshot
 from v3d_torch.request import Request
-from v3d_torch.slam import Tracked
 from v3d_torch.state import CLASSES, OF_SLAM, State, gather, put_back, refresh
 from v3d_torch.state_file import read_state, write_state
 from v3d_torch.stored_run import read_metrics, where_instead

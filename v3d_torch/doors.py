@@ -18,7 +18,8 @@ from torch import Tensor
 
 from v3d_torch.errors import NumericsError
 from v3d_torch.mapping.recorder import Outlook
-from v3d_torch.slam import V3DSLAM, Percept, Tracked
+from v3d_torch.percept import Percept, Tracked
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
 STAGES = frozenset(

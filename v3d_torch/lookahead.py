@@ -8,7 +8,8 @@ from dataclasses import replace
 from functools import partial
 
 from v3d_torch.mapping.recorder import Outlook
-from v3d_torch.slam import V3DSLAM, Percept
+from v3d_torch.percept import Percept
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.timing import StageClock
 from v3d_torch.types import RGBDFrame
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 from torch import Tensor
@@ -10,7 +10,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
-from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.intake import check_frame, check_instances, check_order, check_parts
 from v3d_torch.lie import invert, rigid
 from v3d_torch.localise import Localiser
 from v3d_torch.loop.closing import LoopCloser
@@ -18,55 +18,18 @@ from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.recorder import Outlook, PoseRecorder, Status
 from v3d_torch.objects.background import BackgroundWatch
-from v3d_torch.objects.dynamics import ObjectDynamics, Scene
-from v3d_torch.objects.lift import CloudLifter, ObjectClouds
+from v3d_torch.objects.dynamics import ObjectDynamics
+from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.odometry.motion import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, View
-from v3d_torch.odometry.orb import ORB, Features
+from v3d_torch.odometry.orb import ORB
 from v3d_torch.odometry.tracker import MapTracker
+from v3d_torch.percept import Percept, Tracked
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
-from v3d_torch.types import Instances, Remembering, RGBDFrame, Segmenter
-
-
-@dataclass(frozen=True, kw_only=True)
-class Tracked(Scene):
-    """What is known of a frame when it has been taken in. Later corrections of its pose are in `V3DSLAM.poses`.
-
-    Attributes:
-        stamp: seconds.
-        T_wc: camera to world, float64, shape :math:`(4, 4)`; the world is the first frame's camera.
-        status: how the pose was found.
-    """
-
-    stamp: float
-    T_wc: Tensor
-    status: Status
-
-
-@dataclass(frozen=True)
-class Percept:
-    """What a frame shows by itself, whatever was seen before.
-
-    Attributes:
-        frame: as it came.
-        instances: that the segmentation finds.
-        depth: re-estimated, metres, float32, shape :math:`(1, H, W)`.
-        features: of the whole image.
-        clouds: of the instances.
-        seconds: that each stage took.
-        memory: of the segmentation after the frame, where it has one (`Remembering`).
-    """
-
-    frame: RGBDFrame
-    instances: Instances
-    depth: Tensor
-    features: Features
-    clouds: ObjectClouds
-    seconds: dict[str, float]
-    memory: object
+from v3d_torch.types import Remembering, RGBDFrame, Segmenter
 
 
 class V3DSLAM:
@@ -82,10 +45,12 @@ class V3DSLAM:
         known: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
 
     Attributes:
+        camera: of all frames; None before the first, where it was not given.
         next_outlook: with which the next frame is to be looked at, see `perceive`.
 
     Raises:
         WeightsError: the network's weights are not to be had.
+        ConfigError: what is given as camera or configuration is none.
     """
 
     def __init__(
@@ -95,6 +60,7 @@ class V3DSLAM:
         config: Config | None = None,
         known: SparseMap | None = None,
     ) -> None:
+        check_parts(camera, config)
         self.config = config or Config()
         self.segment = segment or make_segmenter(self.config.segmentation)
         self.poses = PoseRecorder()
@@ -103,7 +69,7 @@ class V3DSLAM:
         self._memory: object = None
         self._known = known
         self.next_outlook = self.outlook()
-        self._ready = camera is not None
+        self.camera: PinholeCamera | None = None
         if camera is not None:
             self._set_up(camera)
 
@@ -124,17 +90,15 @@ class V3DSLAM:
             self.loops.learn(keyframe)
         self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
         vars(self).update(given)  # a stage that the user put in place before the camera was known stays
+        self.camera = camera
 
     def __call__(self, frame: RGBDFrame) -> Tracked:
         """Take in the next frame.
 
         Raises:
-            ConfigError: nobody said which camera took the first frame.
-            InputError: it is no frame.
+            ConfigError: nobody said which camera took the first frame; a stage of the user's gave what it should not.
+            InputError: it is no frame, or not of this camera, or not after the last one.
         """
-        if not isinstance(frame, RGBDFrame):
-            what = type(frame).__qualname__  # type: ignore[unreachable]
-            raise InputError(f"V3DSLAM takes frames, this is a {what}; make one of arrays with RGBDFrame.of")
         percept = self.perceive(frame, self.next_outlook)
         self.next_outlook = self.outlook()
         return self.take_in(percept)
@@ -152,16 +116,16 @@ class V3DSLAM:
                 down; see `percepts`, which runs this ahead.
 
         Raises:
-            ConfigError: nobody said which camera took the first frame.
+            ConfigError: nobody said which camera took the first frame; the segmenter gave no instances.
+            InputError: it is no frame, or not of this camera.
         """
-        if not self._ready:
-            if frame.camera is None:
-                raise ConfigError("the camera is not known: give it to V3DSLAM, or frames that carry it")
-            self._set_up(frame.camera)
-            self._ready = True
+        camera = check_frame(frame, self.camera)
+        if self.camera is None:
+            self._set_up(camera)
         clock = StageClock()
         with clock("segmentation"):  # III-A: instances, people among them set aside
             instances = self.segment(replace(frame, T_cw=None if outlook is None else outlook.at(frame.stamp)))
+            check_instances(instances, frame)
         with clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth(frame.depth[None])[0]
         with clock("features"):  # III-A: ORB
@@ -172,7 +136,12 @@ class V3DSLAM:
         return Percept(frame, instances, depth, features, clouds, clock.seconds, memory)
 
     def take_in(self, percept: Percept) -> Tracked:
-        """Follow the camera and the objects on to the next frame."""
+        """Follow the camera and the objects on to the next frame.
+
+        Raises:
+            InputError: it is not after the last one.
+        """
+        check_order(percept.frame, self.poses.stamp)
         frame, instances, depth, features = percept.frame, percept.instances, percept.depth, percept.features
         self._memory = percept.memory  # not as the segmentation has it now: it may be a frame ahead
         self.clock.add(percept.seconds)

@@ -92,6 +92,11 @@ class PoseRecorder:
         return self._entries[-1].status if self._entries else None
 
     @property
+    def stamp(self) -> float:
+        """Of the last frame, seconds; minus infinity before the first."""
+        return self._entries[-1].stamp if self._entries else -torch.inf
+
+    @property
     def located(self) -> bool:
         """Whether any frame was found so far."""
         return self._last_found() > -torch.inf
