@@ -259,7 +259,7 @@ def test_a_state_comes_back_and_what_was_shared_is(tmp_path: Path) -> None:
 def test_damage_is_told(tmp_path: Path) -> None:
     whole = small(tmp_path / "s", torch.ones(50))
     for content in (
-        *(b"", b"v3d_torch state 1\n", b"\xff" * 300, whole[:100], whole[: len(whole) // 2], whole[:-1]),
+        *(b"", b"v3d_torch state 2\n", b"\xff" * 300, whole[:100], whole[: len(whole) // 2], whole[:-1]),
         *(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :] for place in range(3, len(whole), 97)),
     ):
         (tmp_path / "s").write_bytes(content)

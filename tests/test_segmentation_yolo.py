@@ -31,6 +31,9 @@ from v3d_torch.types import RGBDFrame
 
 SMALL = {"height": 320, "width": 320, "threads": 1}
 
+LARGE = {"height": 480, "width": 640, "threads": 1}
+"""As large as the photographs: what is found in smaller ones is another thing."""
+
 ASTRONAUT = [(155, 60), (190, 20), (260, 20), (300, 70), (295, 120), (270, 150), (300, 215), (340, 260), (360, 350)]
 ASTRONAUT += [(290, 390), (280, 511), (20, 511), (15, 400), (60, 250), (115, 200), (125, 160), (175, 140)]
 """Outline of the person drawn by hand, (u, v)."""
@@ -43,12 +46,20 @@ def photograph(name: str) -> Tensor:
 
 @pytest.fixture(scope="module", params=list(product(REGISTRY, ("float32", "int8"))), ids="-".join)
 def segmenter(request: pytest.FixtureRequest) -> YOLOSegmenter:
-    """Each model at the default size, in each precision."""
+    """Each model in each precision."""
     model, precision = request.param
-    return YOLOSegmenter(SegmentationConfig(model=model, precision=precision, threads=1))
+    return YOLOSegmenter(SegmentationConfig(model=model, precision=precision, **LARGE))
 
 
 def test_the_astronaut_is_a_person_where_she_stands(segmenter: YOLOSegmenter) -> None:
+    assert_astronaut(segmenter)
+
+
+def test_so_she_is_at_the_default_size() -> None:
+    assert_astronaut(YOLOSegmenter(SegmentationConfig(threads=1)))
+
+
+def assert_astronaut(segmenter: YOLOSegmenter) -> None:
     instances = segmenter.segment(photograph("astronaut"))
     assert instances.labels[0] == PERSON
     assert instances.scores[0] > 0.8
@@ -106,7 +117,7 @@ def test_a_mirrored_image_gives_mirrored_masks() -> None:
 @pytest.mark.parametrize("turns", range(4))
 def test_a_rolled_camera_finds_the_person_as_well(turns: int) -> None:
     """The mask is the one of the upright picture, turned as the camera is."""
-    network = YOLOSegmenter(SegmentationConfig(threads=1))
+    network = YOLOSegmenter(SegmentationConfig(**LARGE))
     image = photograph("astronaut")
     held = torch.rot90(image, turns, dims=(1, 2)).contiguous()
     here = torch.eye(4, dtype=torch.float64)
