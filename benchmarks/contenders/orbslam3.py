@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 import pyorbslam3
 import torch
 
@@ -60,8 +61,11 @@ class OrbSlam3:
             self._slam.save_trajectory_euroc(str(path))
             if not path.is_file() or not path.read_text().strip():
                 return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
-            found = read_trajectory(path)
-        return Trajectory(found.stamps / 1e9, found.T_wc)
+            # Nanoseconds of any origin: read as they are, they would be taken for those of a clock.
+            poses = np.loadtxt(path, ndmin=2)
+            poses[:, 0] /= 1e9
+            np.savetxt(path, poses, fmt="%.9f")
+            return read_trajectory(path)
 
 
 def wait_for_threads(pause: float = 0.5) -> None:
