@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.files import StrPath, read_text
+from v3d_torch.home import at_home
 from v3d_torch.plain_yaml import parse_yaml
 from v3d_torch.validation import first_error
 
@@ -43,8 +44,8 @@ def find_config(name: StrPath) -> Path:
     """
     if str(name) in CONFIGS:
         return CONFIGS[str(name)]
-    with suppress(OSError, RuntimeError):  # a name that is too long, ~somebody who is not known here
-        if (path := Path(name).expanduser()).is_file():
+    with suppress(OSError):  # a name that is too long
+        if (path := at_home(name)).is_file():
             return path
     raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
 

@@ -20,11 +20,9 @@ def check_parts(camera: PinholeCamera | None, config: Config | None) -> None:
         ConfigError: it is not.
     """
     if not isinstance(camera, PinholeCamera | None):
-        what = type(camera).__qualname__  # type: ignore[unreachable]
-        raise ConfigError(f"the camera of a V3DSLAM is a {what}; give a PinholeCamera, such as sequence.camera")
+        raise ConfigError(f"the camera of a V3DSLAM is {_kind(camera)}; give a PinholeCamera, such as sequence.camera")
     if not isinstance(config, Config | None):
-        what = type(config).__qualname__  # type: ignore[unreachable]
-        raise ConfigError(f'the config of a V3DSLAM is a {what}; give a Config, such as load_config("paper")')
+        raise ConfigError(f'the config of a V3DSLAM is {_kind(config)}; give a Config, such as load_config("paper")')
 
 
 def check_frame(frame: RGBDFrame, camera: PinholeCamera | None) -> PinholeCamera:
@@ -38,8 +36,7 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera | None) -> PinholeCamera
         ConfigError: nobody said which camera took it.
     """
     if not isinstance(frame, RGBDFrame):
-        what = type(frame).__qualname__  # type: ignore[unreachable]
-        raise InputError(f"V3DSLAM takes frames, this is a {what}; make one of arrays with RGBDFrame.of")
+        raise InputError(f"V3DSLAM takes frames, this is {_kind(frame)}; make one of arrays with RGBDFrame.of")
     camera = frame.camera if camera is None else camera
     if camera is None:
         raise ConfigError("the camera is not known: give it to V3DSLAM, or frames that carry it")
@@ -83,8 +80,7 @@ def check_instances(instances: Instances, frame: RGBDFrame) -> None:
         ConfigError: it did not.
     """
     if not isinstance(instances, Instances):
-        what = type(instances).__qualname__  # type: ignore[unreachable]
-        raise ConfigError(f"the segmenter gave a {what} for frame {frame.index}; it has to give Instances")
+        raise ConfigError(f"the segmenter gave {_kind(instances)} for frame {frame.index}; it has to give Instances")
     count, size = len(instances.masks), tuple(frame.image.shape[-2:])
     for name, shape, dtype in (
         ("masks", (count, *size), torch.bool),
@@ -104,4 +100,9 @@ def _said(value: object) -> str:
     """What something is, in words."""
     if isinstance(value, Tensor):
         return f"{value.dtype} of shape {tuple(value.shape)}"
+    return _kind(value)
+
+
+def _kind(value: object) -> str:
+    """Of which class something is, in words."""
     return f"a {type(value).__qualname__}"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 from v3d_torch.datasets import SourceOptions
 from v3d_torch.datasets.cameras import PRESETS
+from v3d_torch.home import at_home
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Request:
         values = asdict(self)
         for name in _PATHS:
             if values[name] is not None:
-                values[name] = str(Path(values[name]).expanduser().absolute())
+                values[name] = str(at_home(values[name]).absolute())
         for name, no_path in (("seq", ("demo",)), ("camera", (None, *PRESETS))):
             if values[name] not in no_path:
                 values[name] = _path_if_there(values[name])
@@ -74,7 +74,7 @@ _OPTIONS = {"map_in": "--load-map", "map_out": "--save-map"}
 
 def _path_if_there(name: str) -> str:
     """A name that may be a path: absolute where it is one."""
-    with suppress(OSError, RuntimeError):  # a name that is too long, ~somebody who is not known here
-        if (path := Path(name).expanduser()).exists():
+    with suppress(OSError):  # a name that is too long
+        if (path := at_home(name)).exists():
             return str(path.absolute())
     return name

@@ -21,6 +21,7 @@ from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.files import write_text, written_whole
 from v3d_torch.lie import invert
 from v3d_torch.mapping.dense import fuse_points
+from v3d_torch.mapping.local_map import poses_of
 from v3d_torch.mapping.mesh import fuse_mesh
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.pipeline import Pipeline
@@ -96,8 +97,7 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
     write_text(folder / "config.yaml", dump_config(slam.config))
     own = [keyframe for keyframe in slam.mapper.map.kept if not keyframe.known]
     stamps = torch.tensor([keyframe.stamp for keyframe in own], dtype=torch.float64)
-    T_wk = invert(slam.mapper.map.T_cw[[keyframe.index for keyframe in own]])
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, T_wk))
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(poses_of(own))))
     evaluation = None
     if sequence.groundtruth is not None:
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
@@ -185,8 +185,7 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
     kept = slam.mapper.map.kept
-    T_wk = invert(slam.mapper.map.T_cw[[keyframe.index for keyframe in kept]])
     frames = [keyframe.frame for keyframe in kept]
     statuses = [status.value for status in slam.poses.statuses]
-    path = camera_path(trajectory, statuses, T_wk, frames, pipeline.sequence.camera)
+    path = camera_path(trajectory, statuses, invert(poses_of(kept)), frames, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -9,6 +9,7 @@ from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config_file import CONFIGS, FULL, find_config, load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError
+from v3d_torch.home import at_home
 from v3d_torch.jobs.job import Job, on_one_thread
 from v3d_torch.segmentation import make_source
 
@@ -67,7 +68,7 @@ def plan(
     return [
         Job(
             sequence=name,
-            source=str(path.absolute()) if (path := Path(source).expanduser()).exists() else source,
+            source=str(path.absolute()) if (path := at_home(source)).exists() else source,
             frames=len(sequence),
             data_root=data_root.absolute() if data_root is not None else None,
             config_name=label,

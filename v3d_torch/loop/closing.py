@@ -114,7 +114,7 @@ class LoopCloser:
         T_cw = sparse_map.T_cw
         edges = sparse_map.covisibility(self._COVISIBLE)
         measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
-        carrier = torch.tensor([keyframe.carrier for keyframe in sparse_map.keyframes])
+        carrier = sparse_map.carriers
         i, j = torch.tensor([[loop.i, loop.j] for loop in sparse_map.loops]).unbind(dim=1)
         # Between those kept: a retired keyframe stays where it is beside the one that it goes along with.
         to_i, to_j = T_cw[carrier[i]] @ invert(T_cw[i]), T_cw[j] @ invert(T_cw[carrier[j]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +64,12 @@ class Keyframe:
         return self.landmarks[self.landmarks >= 0]
 
 
+def poses_of(keyframes: Sequence[Keyframe]) -> Tensor:
+    """World to camera of keyframes, float64, shape :math:`(K, 4, 4)`; K may be 0."""
+    poses = [keyframe.T_cw[None] for keyframe in keyframes]
+    return torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
+
+
 @dataclass(frozen=True)
 class Loop:
     """A motion between two keyframes that a place seen again tells.
@@ -122,8 +128,12 @@ class SparseMap:
     @property
     def T_cw(self) -> Tensor:
         """World to camera of all keyframes, retired ones too, float64, shape :math:`(K, 4, 4)`; K may be 0."""
-        poses = [keyframe.T_cw[None] for keyframe in self.keyframes]
-        return torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
+        return poses_of(self.keyframes)
+
+    @property
+    def carriers(self) -> Tensor:
+        """Index of the keyframe that each goes along with, its own unless it is retired, int64, shape :math:`(K,)`."""
+        return torch.tensor([keyframe.carrier for keyframe in self.keyframes], dtype=torch.int64)
 
     def insert(self, frame: int, stamp: float, T_cw: Tensor, features: Features, landmarks: Tensor) -> Keyframe:
         """Make a keyframe; features with depth that match no landmark become landmarks.
@@ -212,8 +222,9 @@ class SparseMap:
         shared = scipy.sparse.triu(seen @ seen.T, k=1).tocoo()
         enough = shared.data >= least
         pairs = torch.from_numpy(np.stack([shared.row[enough], shared.col[enough]], axis=1).astype(np.int64))
-        index = torch.tensor([keyframe.index for keyframe in self.kept], dtype=torch.int64)
-        adrift = torch.tensor([keyframe.adrift for keyframe in self.kept], dtype=torch.bool)
+        kept = self.kept
+        index = torch.tensor([keyframe.index for keyframe in kept], dtype=torch.int64)
+        adrift = torch.tensor([keyframe.adrift for keyframe in kept], dtype=torch.bool)
         joined = adrift[:-1] == adrift[1:]
         return torch.cat([pairs, torch.stack([index[:-1][joined], index[1:][joined]], dim=1)]).unique(dim=0)
 
@@ -223,7 +234,7 @@ class SparseMap:
         Args:
             T_cw: world to camera, shape :math:`(K, 4, 4)`; what it says of retired ones does not count.
         """
-        before, carrier = self.T_cw, torch.tensor([keyframe.carrier for keyframe in self.keyframes])
+        before, carrier = self.T_cw, self.carriers
         along = carrier != torch.arange(len(carrier))
         T_cw = T_cw.clone()
         T_cw[along] = rigid(before[along] @ invert(before[carrier[along]]) @ T_cw[carrier[along]])

@@ -137,11 +137,11 @@ class InstanceTracker(torch.nn.Module):
         before = self._coarse([track.mask for track in self.tracks])
         moved = torch.stack(list(now.values())).flatten(1).to(before.dtype)
         masks = self._coarse(list(instances.masks))
-        overlap = torch.maximum(_overlap(before, masks), _overlap(moved, masks))
-        both, areas = moved @ masks.T, moved.sum(dim=1)[:, None]
+        both, areas, own = moved @ masks.T, moved.sum(dim=1)[:, None], masks.sum(dim=1)
+        overlap = torch.maximum(_overlap(before @ masks.T, before.sum(dim=1)[:, None], own), _overlap(both, areas, own))
         covered = both > self._config.least_overlap * areas
         # A detection beside somebody who is seen to be where expected is somebody else, or nobody.
-        elsewhere = there[:, None] & (both < self._BESIDE * torch.minimum(areas, masks.sum(dim=1)))
+        elsewhere = there[:, None] & (both < self._BESIDE * torch.minimum(areas, own))
         elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
         gate = self._config.max_jump + self._config.max_speed * elapsed
         alike = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
@@ -169,8 +169,6 @@ class InstanceTracker(torch.nn.Module):
         return near & (explained | missing[0, ::step, ::step])
 
 
-def _overlap(a: Tensor, b: Tensor) -> Tensor:
-    """Intersection over union of every row of ``a`` with every one of ``b``, float64, shape :math:`(A, B)`."""
-    both = a @ b.T
-    either = a.sum(dim=1)[:, None] + b.sum(dim=1)[None, :] - both
-    return (both / either.clamp(min=1)).to(torch.float64)
+def _overlap(both: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Intersection over union by the areas of intersections (A, B) and masks (A, 1) and (B,), float64, (A, B)."""
+    return (both / (a + b - both).clamp(min=1)).to(torch.float64)

@@ -17,6 +17,7 @@ from v3d_torch.errors import OutputError
 from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.report import is_oriented
 from v3d_torch.lie import invert
+from v3d_torch.mapping.local_map import poses_of
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.slam import V3DSLAM
@@ -129,8 +130,7 @@ class RerunViewer:
         points = landmarks["point"][landmarks["alive"]].numpy()
         grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/landmarks", grey)
-        kept = [keyframe.index for keyframe in slam.mapper.map.kept]
-        frusta = _frusta(self._camera, invert(slam.mapper.map.T_cw[kept]))
+        frusta = _frusta(self._camera, invert(poses_of(slam.mapper.map.kept)))
         self._stream.log("world/map/keyframes", _way(frusta, "tab:cyan", width=0.7))
         positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
         self._stream.log("world/trajectory", _way([positions], "tab:blue"))
