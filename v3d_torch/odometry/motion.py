@@ -59,13 +59,16 @@ class MotionEstimator:
         self._camera = camera
         self._seed = seed
 
-    def __call__(self, a: Features, b: Features, elapsed: float = math.inf) -> Motion | None:
+    def __call__(
+        self, a: Features, b: Features, elapsed: float = math.inf, guess: Tensor | None = None
+    ) -> Motion | None:
         """Motion from view ``a`` to view ``b``.
 
         Args:
             a: known view; its features with depth take part.
             b: new view.
             elapsed: time between the views, seconds, which bounds how far a camera can have come.
+            guess: motion that the camera may have made, ``T_ba``, float64, shape :math:`(4, 4)`; None if unknown.
 
         Returns:
             None when fewer than ``min_inliers`` matches agree on one motion, or on one that no hand can make.
@@ -94,6 +97,7 @@ class MotionEstimator:
             threshold=config.pnp_threshold,
             iterations=config.iterations,
             seed=self._seed,
+            guess=guess,
         )
         if pose is None or int(pose[1].sum()) < config.min_inliers:
             return None

@@ -75,7 +75,7 @@ class Odometry:
             None when neither features nor pixels tell, or what they tell is no motion that a camera can make.
         """
         elapsed = now.frame.stamp - then.frame.stamp
-        motion = self._by_features(then.features, now.features, elapsed=elapsed)
+        motion = self._by_features(then.features, now.features, elapsed, T_ba)
         if motion is not None:
             return motion
         aligned = self._align(self._dense(then), self._dense(now), T_ba)

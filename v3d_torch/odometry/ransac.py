@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import kornia_rs
 import torch
@@ -42,7 +43,14 @@ def epipolar_inliers(uv_a: Tensor, uv_b: Tensor, *, threshold: float, iterations
 
 
 def pnp_ransac(
-    points: Tensor, uv: Tensor, camera: PinholeCamera, *, threshold: float, iterations: int, seed: int
+    points: Tensor,
+    uv: Tensor,
+    camera: PinholeCamera,
+    *,
+    threshold: float,
+    iterations: int,
+    seed: int,
+    guess: Tensor | None = None,
 ) -> tuple[Tensor, Tensor] | None:
     """Pose of a camera that sees known points: EPnP in RANSAC, refined on all that agree.
 
@@ -53,6 +61,8 @@ def pnp_ransac(
         threshold: reprojection error of an inlier, pixels.
         iterations: most hypotheses.
         seed: of the sampling.
+        guess: a pose that may be near, float64, shape :math:`(4, 4)`: if it, refined, explains half of the points,
+            nothing is sampled.
 
     Returns:
         ``T_cw``, float64, shape :math:`(4, 4)`, and the inliers, bool, shape :math:`(N,)`; None without a solution.
@@ -60,18 +70,25 @@ def pnp_ransac(
     count = points.shape[0]
     if count < 6:
         return None
+    sigma = uv.new_full((count,), threshold / math.sqrt(INLIER_LIMIT))
+    # Without the camera's own depth: the points' depths have told what they can.
+    seen = Measurements(uv=uv, inverse_depth=uv.new_zeros(count), pixel_sigma=sigma, inverse_depth_sigma=1.0)
+
+    def starts() -> Iterator[Tensor]:
+        if guess is not None:
+            yield guess
+        for enough in sorted({min(_SOME, count), count}):
+            some = torch.linspace(0, count - 1, enough).round().to(torch.int64)
+            T_cw = _sampled(points[some], uv[some], camera.K, threshold=threshold, iterations=iterations, seed=seed)
+            if T_cw is not None:
+                yield T_cw
+
     found = None
-    for enough in sorted({min(_SOME, count), count}):
-        some = torch.linspace(0, count - 1, enough).round().to(torch.int64)
-        T_cw = _sampled(points[some], uv[some], camera.K, threshold=threshold, iterations=iterations, seed=seed)
-        if T_cw is not None:
-            sigma = uv.new_full((count,), threshold / math.sqrt(INLIER_LIMIT))
-            # Without the camera's own depth: the points' depths have told what they can.
-            seen = Measurements(uv=uv, inverse_depth=uv.new_zeros(count), pixel_sigma=sigma, inverse_depth_sigma=1.0)
-            refined = refine_pose(T_cw, points, seen, camera, rounds=2)
-            found = refined.T_cw, refined.inliers
-            if 2 * int(refined.inliers.sum()) > count:
-                break
+    for T_cw in starts():
+        refined = refine_pose(T_cw, points, seen, camera, rounds=2)
+        found = refined.T_cw, refined.inliers
+        if 2 * int(refined.inliers.sum()) > count:
+            break
     return found
 
 
