@@ -69,6 +69,8 @@ class Upright:
 
     def _see(self, frame: RGBDFrame, turns: int) -> Instances:
         """Instances of a frame that is turned before it is looked at."""
+        if turns == 0:
+            return self.segment(frame)
         image, depth = (torch.rot90(values, turns, dims=(1, 2)).contiguous() for values in (frame.image, frame.depth))
         instances = self.segment(replace(frame, image=image, depth=depth))
         for _ in range(turns):
