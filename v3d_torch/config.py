@@ -60,8 +60,9 @@ class DepthConfig(Section):
 class CloudConfig(Section):
     """Instance clouds and their outlier rejection (paper, Sec. III-B.2)."""
 
-    stride: int = Field(2, gt=0, le=100)
-    """Every n-th pixel of a mask becomes a point; 2 still puts several points into a voxel up to 5 m."""
+    stride: int = Field(4, gt=0, le=100)
+    """Every n-th pixel of a mask becomes a point: the network draws masks in cells of 4 pixels and more. Up to 4 m a
+    Kinect's points are then no farther apart than 0.03 m, and DBSCAN's radius is 0.08."""
     max_depth: float = Field(6.0, gt=0)
     """Farther points are left out, metres: a Kinect's depth is good to 10 cm there, as much as what is to be found."""
     voxel_size: float = Field(0.02, gt=0)
@@ -339,7 +340,10 @@ class MappingConfig(Section):
     """Keyframes that move in a local bundle adjustment, as many as make up the local map; 0 turns it off. With 8 the
     map of fr1_rpy bends by a fifth more."""
     bundle_iterations: int = Field(5, gt=0)
-    """Levenberg-Marquardt steps of a local bundle adjustment."""
+    """Levenberg-Marquardt steps of a local bundle adjustment, at most."""
+    bundle_tolerance: float = Field(1e-4, gt=0)
+    """A step that changes the cost by a smaller share is the last. The cost is some thousands of squared standard
+    deviations: less than one is left to gain, and the next keyframe goes on from there."""
 
 
 class MeshConfig(Section):
@@ -399,7 +403,8 @@ class Config(Section):
     threads: int = Field(1, gt=0, le=256)
     """Threads of torch: the tensors of a frame are so small that more threads wait for each other."""
     lookahead: bool = True
-    """Whether the next frame is read, segmented and lifted while one is tracked; the results are the same."""
+    """Whether the next frame is read, segmented and lifted while one is tracked, in another thread and, where a stored
+    sequence is long enough, another process; the results are the same."""
     check_numerics: bool = False
     """Debug mode: whatever leaves a stage is looked through for NaN and infinity, and the first stage that gives some
     is named. The results are the same. In Python it is `v3d_torch.doors.CheckedSLAM`."""

@@ -50,6 +50,7 @@ def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, ca
         camera,
         fixed,
         config.mapping.bundle_iterations,
+        config.mapping.bundle_tolerance,
     )
     # Landmarks with one observation do not take part: they go along with the keyframe that made them.
     T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])

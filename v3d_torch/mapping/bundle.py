@@ -85,6 +85,7 @@ def bundle_adjust(
     camera: PinholeCamera,
     fixed: Tensor,
     iterations: int = 10,
+    tolerance: float = 1e-6,
 ) -> BundleResult:
     """Adjust poses and points together.
 
@@ -95,13 +96,14 @@ def bundle_adjust(
         camera: intrinsics.
         fixed: poses that stay as they are, bool, shape :math:`(K,)`. Without one the map as a whole may drift.
         iterations: most Levenberg-Marquardt steps.
+        tolerance: relative change of the cost that ends them.
 
     Returns:
         Poses and points at the least robust cost found.
     """
     free = torch.nonzero(~fixed)[:, 0]
     problem = partial(normal_equations, observations=observations, camera=camera, free=free)
-    found = levenberg_marquardt((T_cw, points), problem, partial(_step, free=free), iterations)
+    found = levenberg_marquardt((T_cw, points), problem, partial(_step, free=free), iterations, tolerance)
     T_cw, points = found.state
     in_camera, _ = _to_camera(T_cw, points, observations)
     chi2 = chi_square(in_camera, reprojection(in_camera, observations, camera)[0])
