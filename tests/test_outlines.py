@@ -33,12 +33,12 @@ def outline(depth: Tensor, came: Tensor | None = None, *, missed: bool = False, 
     found = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     found[ROWS.start : CUT, COLUMNS] = True
     cloud = (CAMERA.rays * depth[0][..., None])[found & (depth[0] > 0)][::5]
-    track = Track(1, found, found & (depth[0] > 0), 0.0, IdentityConfig(), missed=missed)
+    track = Track(1, found, found & (depth[0] > 0), found.flatten().float(), 0.0, IdentityConfig(), missed=missed)
     track.extend(Sighting(0.0, cloud.mean(dim=0).to(torch.float64), cloud))
     if came is None:
         came = torch.full((1, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
     view = DepthView(0.0, depth, torch.eye(4, dtype=torch.float64))
-    return Outliner(view, Arrivals(came, STEP), MaskConfig(**mask), CAMERA, SPACING)(track)
+    return Outliner([track], view, Arrivals(came, STEP), MaskConfig(**mask), CAMERA, SPACING)(track)
 
 
 def reached(shape: Tensor) -> int:

@@ -12,7 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.objects.silhouette import silhouettes
+from v3d_torch.objects.silhouette import Silhouette, silhouettes
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 WALL, OBJECT = 4.0, 2.0
@@ -38,7 +38,15 @@ ON_BOARD = before_a_wall()[0] == OBJECT
 
 def draw(cloud: Tensor, depth: Tensor, spacing: float = SPACING, margin: int = 0) -> tuple[Tensor, Tensor]:
     (silhouette,) = silhouettes([cloud], CAMERA, spacing)
-    return silhouette(depth, margin, TOLERANCE)
+    return near_and_explained(silhouette, depth, margin)
+
+
+def near_and_explained(
+    silhouette: Silhouette, depth: Tensor, margin: int, tolerance: float = TOLERANCE
+) -> tuple[Tensor, Tensor]:
+    """Pixels near the points, which are those that are drawn where nothing is measured, and those explained."""
+    near = silhouette(torch.zeros_like(depth), margin, tolerance, or_missing=True)
+    return near, silhouette(depth, margin, tolerance)
 
 
 @pytest.mark.parametrize("margin", [0, 8, 20])
@@ -132,7 +140,7 @@ def test_a_lens_folds_nothing_from_afar_into_the_image(degrees: float) -> None:
     lens = (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
     camera = PinholeCamera(542.822841, 542.576870, 315.593520, 237.756098, distortion=lens)
     cloud = OBJECT * torch.tensor([[math.tan(math.radians(degrees)), 0.0, 1.0]])
-    near, _ = silhouettes([cloud], camera, SPACING)[0](torch.full((1, 480, 640), OBJECT), 8, TOLERANCE)
+    near = silhouettes([cloud], camera, SPACING)[0](torch.zeros(1, 480, 640), 8, TOLERANCE, or_missing=True)
     assert bool(near.any()) is (degrees < 31)
 
 
@@ -149,14 +157,15 @@ def test_each_point_is_near_and_explains_its_own_depth(height: int, width: int, 
     z = 0.5 + 4 * torch.rand(len(v), generator=generator)
     depth = torch.zeros(1, height, width)
     depth[0, v, u] = z
-    near, explained = silhouettes([camera.rays[v, u] * z[:, None]], camera, SPACING)[0](depth, margin, 0.01)
+    (silhouette,) = silhouettes([camera.rays[v, u] * z[:, None]], camera, SPACING)
+    near, explained = near_and_explained(silhouette, depth, margin, 0.01)
     assert near[v, u].all() and explained[v, u].all()
     assert not (explained & ~near).any()
 
 
 def test_several_clouds_are_drawn_as_each_alone() -> None:
     clouds = [points(), torch.zeros(0, 3), points(1.5, every=3), -points()]
-    together = [drawn(before_a_wall(), 8, TOLERANCE) for drawn in silhouettes(clouds, CAMERA, SPACING)]
+    together = [near_and_explained(drawn, before_a_wall(), 8) for drawn in silhouettes(clouds, CAMERA, SPACING)]
     for cloud, (near, explained) in zip(clouds, together, strict=True):
         alone = draw(cloud, before_a_wall(), margin=8)
         assert torch.equal(near, alone[0]) and torch.equal(explained, alone[1])
@@ -167,7 +176,16 @@ def test_every_nth_pixel_is_drawn_as_among_all(step: int) -> None:
     depth = before_a_wall()
     depth[0, 50:60, 70:80] = 0.0
     (drawn,) = silhouettes([points(every=3)], CAMERA, SPACING)
-    for all_of_them, some in zip(
-        drawn(depth, 8, TOLERANCE), drawn(depth[:, ::step, ::step], 8, TOLERANCE, step), strict=True
-    ):
+    for or_missing in (False, True):
+        all_of_them = drawn(depth, 8, TOLERANCE, or_missing=or_missing)
+        some = drawn(depth[:, ::step, ::step], 8, TOLERANCE, step=step, or_missing=or_missing)
         assert some.any() and torch.equal(some, all_of_them[::step, ::step])
+
+
+def test_pixels_without_depth_are_taken_on_request_where_points_are_near() -> None:
+    depth = before_a_wall()
+    depth[0, 50:60, 70:80] = 0.0
+    (drawn,) = silhouettes([points()], CAMERA, SPACING)
+    hole = depth[0] == 0
+    assert not drawn(depth, 8, TOLERANCE)[hole].any() and drawn(depth, 8, TOLERANCE, or_missing=True)[hole].all()
+    assert torch.equal(drawn(depth, 8, TOLERANCE) | hole, drawn(depth, 8, TOLERANCE, or_missing=True))

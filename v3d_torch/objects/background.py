@@ -79,9 +79,9 @@ def look_through(points: Tensor, view: DepthView, camera: PinholeCamera, config:
     seen = points @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
     expected = seen[:, 2]
     pixels, inside = camera.locate(seen, config.min_depth)
-    u, v = pixels[inside].round().to(torch.int64).unbind(dim=1)
-    measured = torch.zeros_like(expected)
-    measured[inside] = view.nearest[v, u].to(torch.float64)
+    u, v = pixels.round().to(torch.int64).unbind(dim=1)
+    place = torch.where(inside, v * camera.width + u, 0)
+    measured = torch.where(inside, view.nearest.flatten().index_select(0, place), 0.0).to(torch.float64)
     tolerance = (config.tolerance * expected.square()).clamp(min=config.min_tolerance)
     in_sight = (measured > 0) & (measured > expected - tolerance)
     return torch.where(in_sight, (measured > expected + tolerance).to(torch.float64), torch.nan)
@@ -141,9 +141,11 @@ class Arrivals:
         step, told = self.stride, self.came.flatten(1).T
         if not masks:
             return self.came.new_zeros(0, told.shape[1])
-        within = torch.stack([mask[::step, ::step] for mask in masks]).flatten(1).to(told.dtype)
-        known = within @ (~told.isnan()).to(told.dtype)
-        return (within @ told.nan_to_num() / known).masked_fill(known < least, torch.nan)
+        within = torch.stack([mask[::step, ::step] for mask in masks]).flatten(1).to(torch.float32)
+        # Float32 counts pixels exactly, and in half the time.
+        counts = within @ torch.cat([told.nan_to_num(), ~told.isnan()], dim=1).to(torch.float32)
+        came, known = counts.to(self.came.dtype).chunk(2, dim=1)
+        return (came / known).masked_fill(known < least, torch.nan)
 
 
 class BackgroundWatch:

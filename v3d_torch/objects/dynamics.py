@@ -136,8 +136,9 @@ class ObjectDynamics:
         moving = [track for track, verdict in verdicts.items() if not self._may_be_tracked(verdict)]
         people = [track for track in tracks if track.label == PERSON]
         # Who moves is mostly a person: each outline is drawn once and serves both.
-        draw = Outliner(view, arrivals, self._config.mask, self._camera, self._config.clouds.voxel_size)
-        outlines = {track: draw(track) for track in dict.fromkeys([*moving, *people])}
+        drawn = list(dict.fromkeys([*moving, *people]))
+        draw = Outliner(drawn, view, arrivals, self._config.mask, self._camera, self._config.clouds.voxel_size)
+        outlines = {track: draw(track) for track in drawn}
         size = view.depth.shape[-2:]
         static = self._clear_of([outlines[track] for track in moving], size)
         unpeopled = static & self._clear_of([outlines[track] for track in people], size)

@@ -38,6 +38,8 @@ class ObjectClouds:
 
     def joined(self, others: ObjectClouds) -> ObjectClouds:
         """These clouds, then the others."""
+        if len(others) == 0:
+            return self
         longest = max(self.points.shape[1], others.points.shape[1])
         both = (self, others)
         return ObjectClouds(
@@ -95,9 +97,8 @@ class CloudLifter:
         step = self._config.stride
         z = depth[:, ::step, ::step]
         cloud = back_project(z[None], self._rays).reshape(-1, 3)
-        z = z.reshape(-1)
-        masks = instances.masks[:, ::step, ::step].flatten(1)
-        masks = masks & (z > 0) & (z <= self._config.max_depth)
+        masks = instances.masks[:, ::step, ::step] & (z > 0) & (z <= self._config.max_depth)
+        masks = masks.flatten(1)
         instance, pixel = torch.nonzero(masks, as_tuple=True)
         count = masks.sum(dim=1)
         longest = int(count.max()) if len(instances) else 0

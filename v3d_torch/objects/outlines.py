@@ -7,6 +7,8 @@ on from there without an edge is still the object, unless the camera saw it ther
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -21,9 +23,10 @@ from v3d_torch.objects.track import Track
 
 
 class Outliner:
-    """Draws the outlines of the objects of one frame.
+    """Draws the outlines of objects of one frame.
 
     Args:
+        tracks: the objects.
         view: depth of the frame, and its pose.
         arrivals: what came since earlier frames, on every n-th pixel.
         config: margins and tolerances.
@@ -32,30 +35,38 @@ class Outliner:
     """
 
     def __init__(
-        self, view: DepthView, arrivals: Arrivals, config: MaskConfig, camera: PinholeCamera, spacing: float
+        self,
+        tracks: Sequence[Track],
+        view: DepthView,
+        arrivals: Arrivals,
+        config: MaskConfig,
+        camera: PinholeCamera,
+        spacing: float,
     ) -> None:
         self._view = view
         self._config = config
-        self._camera = camera
-        self._spacing = spacing
         self._stride = arrivals.stride
         self._open = _smooth(view.depth[0], self._stride, config.edge) & ~arrivals.still
+        located = [track for track in tracks if track.newest.located]
+        R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
+        clouds = [track.cloud_at(view.stamp) @ R.T + t for track in located]
+        distances = [float(cloud[:, 2].median()) for cloud in clouds]
+        self._seen = dict(zip(located, zip(silhouettes(clouds, camera, spacing), distances, strict=True), strict=True))
 
     def __call__(self, track: Track) -> Tensor:
-        """Pixels of an object, bool, shape :math:`(H, W)`."""
+        """Pixels of one of the objects, bool, shape :math:`(H, W)`."""
         config, depth = self._config, self._view.depth
-        if not track.newest.located:  # too few points to tell which depths are its own
+        if track not in self._seen:  # too few points to tell which depths are its own
             return track.mask if track.missed else grown(track.mask, config.margin)
-        T_cw = self._view.T_cw
-        cloud = track.cloud_at(self._view.stamp) @ T_cw[:3, :3].T + T_cw[:3, 3]
-        tolerance = config.tolerance + config.tolerance_growth * float(cloud[:, 2].median()) ** 2
-        (silhouette,) = silhouettes([cloud], self._camera, self._spacing)
-        _, reached = silhouette(depth, config.reach, tolerance)
-        going_on = self._going_on(track, reached) & reached
+        silhouette, distance = self._seen[track]
+        tolerance = config.tolerance + config.tolerance_growth * distance**2
+        reached = silhouette(depth, config.reach, tolerance)
+        outline = self._going_on(track, reached) & reached
         if track.missed:  # a mask that is predicted by its depth is as it is
-            return track.mask | going_on
-        _, explained = silhouette(depth, config.margin, tolerance)
-        return track.own | going_on | (grown(track.mask, config.margin) & (explained | self._view.missing))
+            return outline.logical_or_(track.mask)
+        explained = silhouette(depth, config.margin, tolerance).logical_or_(self._view.missing)
+        rim = grown(track.mask, config.margin).logical_and_(explained)
+        return outline.logical_or_(rim).logical_or_(track.own)
 
     def _going_on(self, track: Track, reached: Tensor) -> Tensor:
         """Where an object's pixels go on within reach, up to the next edge, bool, shape (H, W)."""

@@ -62,28 +62,34 @@ class Silhouette:
 
     def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
         self._cells, self._z = cells, z
-        self._gap = spacing * camera.fx / float(np.median(z)) if len(z) else 0.0
+        self._gap = 0.0
+        if len(z):
+            middle = len(z) // 2
+            self._gap = spacing * camera.fx / float(np.partition(z, middle)[middle])
+            self._first, self._last = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
 
-    def __call__(self, depth: Tensor, margin: int, tolerance: float, step: int = 1) -> tuple[Tensor, Tensor]:
-        """Pixels near the points, and those of them that the points' depths explain.
+    def __call__(
+        self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, or_missing: bool = False
+    ) -> Tensor:
+        """Pixels near the points whose depth the points around explain.
 
         Args:
             depth: metres, of every n-th pixel, shape :math:`(1, h, w)`; 0 = no measurement.
             margin: pixels by which the outline is farther out than the outermost points.
             tolerance: metres by which depth may lie before or behind the points around it.
             step: that n.
+            or_missing: takes pixels without depth that are near as well.
 
         Returns:
-            near and explained, bool, both of shape :math:`(h, w)`; none where no point is in the image.
+            bool, shape :math:`(h, w)`; none where no point is in the image.
         """
-        near = torch.zeros(depth.shape[1:], dtype=torch.bool)
-        explained = torch.zeros_like(near)
+        explained = torch.zeros(depth.shape[1:], dtype=torch.bool)
         if len(self._z) == 0:
-            return near, explained
+            return explained
         radius = max(round((margin + self._gap) / _CELL), 1)
         # Nothing is near beyond the radius: all that follows looks at this part of the image only.
-        left, top = np.maximum(self._cells.min(axis=0) - radius, 0).tolist()
-        right, bottom = (self._cells.max(axis=0) + radius + 1).tolist()
+        left, top = (max(first - radius, 0) for first in self._first)
+        right, bottom = (last + radius + 1 for last in self._last)
         rows, columns = bottom - top, right - left
         cell = (self._cells[:, 1] - top) * columns + self._cells[:, 0] - left
         front, back = np.full(rows * columns, _NONE, np.float32), np.full(rows * columns, -_NONE, np.float32)
@@ -97,9 +103,11 @@ class Silhouette:
         # Columns first, while there are few rows.
         low, high = (cells.take(of_column, axis=1).take(of_row, axis=0) for cells in (nearest, farthest))
         z = depth[0].numpy()[v, u]  # NumPy compares in a third of torch's time
-        near[v, u] = torch.from_numpy(low < _NONE)
-        explained[v, u] = torch.from_numpy((z > low - tolerance) & (z < high + tolerance))
-        return near, explained
+        fits = (z > low - tolerance) & (z < high + tolerance)
+        if or_missing:
+            fits |= (z <= 0) & (low < _NONE)
+        explained.numpy()[v, u] = fits
+        return explained
 
     def share_seen(self, depth: Tensor, tolerance: float) -> float:
         """Share of the points where the depth is theirs; 0 where no point is in the image.

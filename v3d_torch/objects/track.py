@@ -42,6 +42,7 @@ class Track:
         id: number of the object, from 1, never used again.
         mask: its pixels in the newest frame, bool, shape :math:`(H, W)`; predicted where the network missed it.
         own: those of them whose depth is its own, bool, shape :math:`(H, W)`.
+        coarse: every n-th pixel of the mask, as the tracker compares them, float32, shape :math:`(P,)`.
         first_seen: seconds.
         config: noise of centroids, and for how long they are remembered.
         sightings: newest last, not older than the history of the configuration; at least one.
@@ -57,6 +58,7 @@ class Track:
     id: int
     mask: Tensor
     own: Tensor
+    coarse: Tensor
     first_seen: float
     config: IdentityConfig
     sightings: list[Sighting] = field(default_factory=list)

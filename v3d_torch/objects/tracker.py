@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -61,47 +59,53 @@ class InstanceTracker(torch.nn.Module):
         sightings = [self._sight(stamp, clouds, i, T_wc) for i in range(len(instances))]
         # Where each should be by now: to be found there, and left out there if it is not found.
         expected = self._expect(stamp, T_wc)
-        missing = depth <= 0
-        now = {track: self._where(silhouette, depth, missing, self._stride) for track, silhouette in expected.items()}
+        now = {
+            track: self._coarse(self._where(silhouette, depth, self._stride)) for track, silhouette in expected.items()
+        }
         there = [silhouette.share_seen(depth, self._DEPTH_GATE) > self._THERE for silhouette in expected.values()]
-        owner = self._assign(stamp, instances, sightings, now, torch.tensor(there))
+        masks = self._coarse(instances.masks[:, :: self._stride, :: self._stride])
+        owner = self._assign(stamp, instances, masks, sightings, now, torch.tensor(there))
         continued = set()
         for i, sighting in enumerate(sightings):
             track = owner.get(i)
             if track is None:
-                track = Track(self._next_id, instances.masks[i], clouds.own[i], stamp, self._config)
+                track = Track(self._next_id, instances.masks[i], clouds.own[i], masks[i], stamp, self._config)
                 self._next_id += 1
                 self.tracks.append(track)
             track.extend(sighting)
-            track.mask, track.own, track.missed = instances.masks[i], clouds.own[i], False
+            track.mask, track.own, track.coarse, track.missed = instances.masks[i], clouds.own[i], masks[i], False
             track.name(int(instances.labels[i]), float(instances.scores[i]))
             continued.add(track.id)
         self.tracks = [t for t in self.tracks if stamp - t.newest.stamp <= self._config.max_gap]
+        measured = depth[0] > 0
         for track in self.tracks:
             if track.id not in continued:
                 track.missed = True
-                track.mask = self._where(expected[track], depth, missing)
-                track.own = track.mask & ~missing[0]
-        self._drop_found_again()
+                track.mask, track.coarse = self._where(expected[track], depth), now[track]
+                track.own = track.mask & measured
+        self._drop_found_again(self._coarse(measured[:: self._stride, :: self._stride]))
         return list(self.tracks)
 
-    def _drop_found_again(self) -> None:
-        """Drop missed objects where one of their class was found where they should be: the same, with another id."""
+    def _drop_found_again(self, measured: Tensor) -> None:
+        """Drop missed objects where one of their class was found where they should be: the same, with another id.
+
+        ``measured`` tells on which of the coarse pixels there is depth.
+        """
         missed = [track for track in self.tracks if track.missed]
         found = [track for track in self.tracks if not track.missed and track.newest.located]
         if not missed or not found:
             return
-        own = self._coarse([track.own for track in missed])
-        both = own @ self._coarse([track.mask for track in found]).T
+        own = torch.stack([track.coarse for track in missed]) * measured
+        both = own @ torch.stack([track.coarse for track in found]).T
         alike = torch.tensor([[track.label == other.label for other in found] for track in missed])
         again = (alike & (both > self._config.least_overlap * own.sum(dim=1, keepdim=True))).any(dim=1)
         dropped = {track for track, is_again in zip(missed, again.tolist(), strict=True) if is_again}
         self.tracks = [track for track in self.tracks if track not in dropped]
 
-    def _coarse(self, masks: Sequence[Tensor]) -> Tensor:
-        """Masks as rows of numbers, some of their pixels, float32, :math:`(K, P)`."""
-        step = self._stride
-        return torch.stack([mask[::step, ::step] for mask in masks]).flatten(1).to(torch.float32)
+    @staticmethod
+    def _coarse(mask: Tensor) -> Tensor:
+        """Every n-th pixel of masks as rows of numbers, bool :math:`(..., h, w)` to float32 :math:`(..., P)`."""
+        return mask.flatten(-2).to(torch.float32)
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the tracks along when the map is corrected under them.
@@ -121,22 +125,22 @@ class InstanceTracker(torch.nn.Module):
         self,
         stamp: float,
         instances: Instances,
+        masks: Tensor,
         sightings: list[Sighting],
         now: dict[Track, Tensor],
         there: Tensor,
     ) -> dict[int, Track]:
         """Track of each instance that continues one.
 
-        ``now`` is where each should be by now, on every n-th pixel, and ``there`` whether it is seen to be there.
+        ``masks`` are those of the instances, coarse, ``now`` is where each track should be by now, and ``there`` tells
+        whether it is seen to be there.
         """
         if not self.tracks or not sightings:
             return {}
         predicted = torch.stack([track.predict(stamp) for track in self.tracks])
         seen = torch.stack([sighting.centroid for sighting in sightings])
         # A mask as it was is exact where little moves; moved on, it keeps up with fast walkers and a camera that turns.
-        before = self._coarse([track.mask for track in self.tracks])
-        moved = torch.stack(list(now.values())).flatten(1).to(before.dtype)
-        masks = self._coarse(list(instances.masks))
+        before, moved = torch.stack([track.coarse for track in self.tracks]), torch.stack(list(now.values()))
         both, areas, own = moved @ masks.T, moved.sum(dim=1)[:, None], masks.sum(dim=1)
         overlap = torch.maximum(_overlap(before @ masks.T, before.sum(dim=1)[:, None], own), _overlap(both, areas, own))
         covered = both > self._config.least_overlap * areas
@@ -163,10 +167,9 @@ class InstanceTracker(torch.nn.Module):
         clouds = [track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in self.tracks]
         return dict(zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True))
 
-    def _where(self, expected: Silhouette, depth: Tensor, missing: Tensor, step: int = 1) -> Tensor:
+    def _where(self, expected: Silhouette, depth: Tensor, step: int = 1) -> Tensor:
         """Every n-th pixel of an object where the depth agrees or is missing, bool, :math:`(h, w)`."""
-        near, explained = expected(depth[:, ::step, ::step], 0, self._DEPTH_GATE, step)
-        return near & (explained | missing[0, ::step, ::step])
+        return expected(depth[:, ::step, ::step], 0, self._DEPTH_GATE, step=step, or_missing=True)
 
 
 def _overlap(both: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -37,8 +37,10 @@ class Witnesses:
         Returns:
             bool, shape :math:`(K,)`.
         """
-        column, row = self.pixel.unbind(dim=1)
-        inside = torch.cat([self.fits.new_zeros(0, len(column)), *(mask[row, column][None] for mask in masks)])
+        if len(masks) == 0:
+            return self.fits.new_zeros(0)
+        place = self.pixel[:, 1] * masks[0].shape[1] + self.pixel[:, 0]
+        inside = torch.stack([mask.flatten().index_select(0, place) for mask in masks])
         outside = ~inside.any(dim=0)
         usual = (self.fits & outside).sum() / outside.sum().clamp(min=1)
         fitting, all_ = (inside & self.fits).sum(dim=1), inside.sum(dim=1)
