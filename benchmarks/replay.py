@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.types import RGBDFrame
+from v3d_torch.datasets.stored import StoredFrames
 
 
-class Replay:
-    """An `RGBDSequence` of frames of another, without its ground truth and masks.
+class Replay(StoredFrames):
+    """Frames of another sequence, without its ground truth and masks.
 
     Time goes on by as much as lies between two frames in the other, in whichever direction.
 
@@ -23,25 +21,16 @@ class Replay:
         indices: of the frames, no two neighbours equal, at least one.
     """
 
-    groundtruth = None
-
     def __init__(self, sequence: RGBDSequence, indices: Sequence[int]) -> None:
-        self.name = sequence.name
-        self.camera: PinholeCamera = sequence.camera
+        stamps = sequence.stamps[torch.tensor(indices)]
+        times = torch.cat([stamps[:1], stamps[0] + stamps.diff().abs().cumsum(dim=0)])
+        super().__init__(sequence.name, times.tolist(), sequence.camera)
         self._sequence = sequence
         self._indices = indices
-        stamps = sequence.stamps[torch.tensor(indices)]
-        self.stamps: Tensor = torch.cat([stamps[:1], stamps[0] + stamps.diff().abs().cumsum(dim=0)])
 
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return (self[index] for index in range(len(self)))
-
-    def __getitem__(self, index: int) -> RGBDFrame:
-        """Frame ``index`` of the replay, which raises IndexError behind the last."""
-        return replace(self._sequence[self._indices[index]], index=index, stamp=float(self.stamps[index]))
+    def _read(self, index: int) -> tuple[Tensor, Tensor]:
+        frame = self._sequence[self._indices[index]]
+        return frame.image, frame.depth
 
 
 def forth_and_back(count: int, frames: int) -> list[int]:

@@ -4,32 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 
+from v3d_torch.datasets.stored import Following
 from v3d_torch.mapping.recorder import Outlook
 from v3d_torch.percept import Percept
+from v3d_torch.second_process import SecondProcess
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.timing import StageClock
 from v3d_torch.types import RGBDFrame
+
+_WORTH = 60
+"""A second process is begun after so many frames, if as many are left: it takes some seconds until it is up, and a
+shorter run is done by then."""
 
 
 def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Generator[Percept]:
     """What the frames show, for `V3DSLAM.take_in`, one after the other.
 
     Each frame is looked at with what was known of the camera when the one before it came, not when it was done with:
-    so it makes no difference to the results whether that happens ahead, in another thread.
+    so it makes no difference to the results whether that happens ahead, in another thread or another process.
 
     Args:
         frames: to be read.
         slam: that looks at them, and takes each in before it asks for the next.
-        ahead: whether the next frame is read and looked at while one is taken in.
+        ahead: whether the next frame is read and looked at while one is taken in. Of a stored sequence that is long
+            enough, a second process does that as soon as it is up, until then a thread.
 
     Raises:
         V3DError: a frame cannot be read; those before have been given.
     """
+    second: SecondProcess | None = None
+    stack = ExitStack()
 
     def look(outlook: Outlook | None) -> Percept | None:
+        nonlocal second
+        if ahead and isinstance(frames, Following) and frames.left:
+            if second is None and frames.given == _WORTH <= frames.left:
+                second = stack.enter_context(closing(SecondProcess(slam, frames.sequence)))
+            percept = None if second is None else second.look(frames.index, outlook)
+            if percept is not None:
+                frames.index += 1
+                return percept
         clock = StageClock()
         with clock("read"):
             frame = next(frames, None)
@@ -38,7 +56,7 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
         percept = slam.perceive(frame, outlook)
         return replace(percept, seconds={**clock.seconds, **percept.seconds})
 
-    with ThreadPoolExecutor(1, "perception") as thread:
+    with stack, ThreadPoolExecutor(1, "perception") as thread:
 
         def begin() -> Callable[[], Percept | None]:
             outlook = slam.next_outlook

@@ -55,7 +55,7 @@ class StoredFrames(ABC):
 
     def since(self, index: int) -> Iterator[RGBDFrame]:
         """The frames from one on, read as they are asked for."""
-        return (self[later] for later in range(index, len(self)))
+        return Following(self, index)
 
     def __getitem__(self, index: int) -> RGBDFrame:
         """Decode frame ``index``, from 0.
@@ -119,3 +119,36 @@ class StoredFrames(ABC):
                 " give the camera that took it with --camera"
             )
         return image
+
+
+class Following(Iterator[RGBDFrame]):
+    """Frames of a stored sequence one after the other.
+
+    Args:
+        sequence: of the frames.
+        first: index of the first.
+
+    Attributes:
+        index: of the next; who has got that frame otherwise may step over it.
+    """
+
+    def __init__(self, sequence: StoredFrames, first: int) -> None:
+        self.sequence = sequence
+        self.index = self._first = first
+
+    @property
+    def given(self) -> int:
+        """Frames before the next."""
+        return self.index - self._first
+
+    @property
+    def left(self) -> int:
+        """Frames from the next on."""
+        return max(len(self.sequence) - self.index, 0)
+
+    def __next__(self) -> RGBDFrame:
+        if not self.left:
+            raise StopIteration
+        frame = self.sequence[self.index]
+        self.index += 1
+        return frame

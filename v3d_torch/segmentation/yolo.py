@@ -49,6 +49,10 @@ class YOLOSegmenter:
         self.height, self.width = _check_layout(self._session, path)
         self._iou_threshold = None if REGISTRY[config.model].one_to_one else config.iou_threshold
 
+    def __reduce__(self) -> tuple[type[YOLOSegmenter], tuple[SegmentationConfig, Path]]:
+        """For another process, which opens the network anew."""
+        return YOLOSegmenter, (self.config, self._path)
+
     def __call__(self, frame: RGBDFrame) -> Instances:
         """Instances in a frame's colour image."""
         return self.segment(frame.image)

@@ -1,0 +1,169 @@
+"""A second process looks at frames: the same bytes, and nothing is lost when it cannot."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from corpus.base import write_base
+from torch import Tensor
+
+import v3d_torch.lookahead
+from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch.config import Config
+from v3d_torch.config_file import load_config
+from v3d_torch.datasets.stored import Following, StoredFrames
+from v3d_torch.errors import InputError
+from v3d_torch.lookahead import percepts
+from v3d_torch.percept import Percept
+from v3d_torch.second_process import SecondProcess
+from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.types import Instances
+
+NO_NETWORK = load_config(None, ("segmentation.source=none",))
+SMALL = load_config(None, ("segmentation.height=192", "segmentation.width=256"))
+
+
+@pytest.fixture(scope="module")
+def demo() -> StoredFrames:
+    sequence = load_sequence("demo")
+    assert isinstance(sequence, StoredFrames)
+    return sequence
+
+
+def started(slam: V3DSLAM, sequence: StoredFrames) -> SecondProcess:
+    """A process that is up, or never will be."""
+    second = SecondProcess(slam, sequence)
+    until = time.monotonic() + 60
+    with suppress(EOFError):
+        while not second._is_ready():
+            assert time.monotonic() < until
+            time.sleep(0.02)
+    return second
+
+
+def same(one: object, other: object) -> bool:
+    """Whether two values, of tensors all the way down, are the same to the bit."""
+    if isinstance(one, Tensor):
+        return (
+            isinstance(other, Tensor) and one.dtype == other.dtype and torch.equal(one.nan_to_num(), other.nan_to_num())
+        )
+    if hasattr(one, "__dataclass_fields__"):
+        names = [field.name for field in fields(one)]  # type: ignore[arg-type]
+        return all(same(getattr(one, name), getattr(other, name)) for name in names)
+    if isinstance(one, tuple):
+        return isinstance(other, tuple) and all(map(same, one, other))
+    return one == other
+
+
+def without_times(percept: Percept) -> Percept:
+    return replace(percept, seconds={})
+
+
+def test_it_sees_what_is_seen_here_to_the_bit(demo: StoredFrames) -> None:
+    """With the network, upright, and what that remembers of the frames before."""
+    here, slam = V3DSLAM(demo.camera, config=SMALL), V3DSLAM(demo.camera, config=SMALL)
+    with closing(started(slam, demo)) as second:
+        for index in range(3):
+            outlook = here.next_outlook
+            expected = here.perceive(demo[index], outlook)
+            seen = second.look(index, outlook)
+            assert seen is not None and same(without_times(seen), without_times(expected))
+            assert same(slam.segment.memory, expected.memory)  # type: ignore[attr-defined]
+            assert set(seen.seconds) == {"read", "segmentation", "depth", "features", "clouds"}
+            assert seen.frame.camera is demo.camera
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second process is begun with the first frame that it may be begun with, and waited for."""
+    monkeypatch.setattr(v3d_torch.lookahead, "_WORTH", 1)
+    monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", started)
+
+
+def tracked(config: Config, frames: Iterator[RGBDFrame], sequence: StoredFrames) -> tuple[V3DSLAM, list[Percept]]:
+    slam, given = V3DSLAM(sequence.camera, config=config), []
+    for percept in percepts(frames, slam, ahead=True):
+        slam.take_in(percept)
+        given.append(percept)
+    return slam, given
+
+
+@pytest.mark.usefixtures("at_once")
+def test_the_trajectory_is_that_without(demo: StoredFrames) -> None:
+    class Short(Following):
+        @property
+        def left(self) -> int:
+            return max(6 - self.index, 0)
+
+    slam, given = tracked(SMALL, Short(demo, 0), demo)
+    plain, _ = tracked(SMALL, (demo[index] for index in range(6)), demo)
+    assert [percept.frame.index for percept in given] == list(range(6))
+    assert torch.equal(slam.poses.trajectory().T_wc, plain.poses.trajectory().T_wc)
+    assert same(slam.segment.memory, plain.segment.memory)  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("at_once")
+def test_when_it_dies_the_run_goes_on_without(demo: StoredFrames, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[SecondProcess] = []
+
+    def noted(slam: V3DSLAM, sequence: StoredFrames) -> SecondProcess:
+        begun.append(started(slam, sequence))
+        return begun[0]
+
+    monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", noted)
+    slam, given = V3DSLAM(demo.camera, config=NO_NETWORK), []
+    for percept in percepts(iter(demo), slam, ahead=True):
+        slam.take_in(percept)
+        given.append(percept.frame.index)
+        if len(given) == 3:
+            process = begun[0]._process
+            assert process is not None and process.poll() is None and not begun[0]._gone
+            process.kill()
+        if len(given) == 7:
+            assert begun[0]._gone and len(begun) == 1
+            break
+    assert given == list(range(7))
+
+
+def test_what_cannot_be_sent_is_looked_at_here(demo: StoredFrames) -> None:
+    def segment(frame: RGBDFrame) -> Instances:
+        return NoSegmentation()(frame)
+
+    slam = V3DSLAM(demo.camera, segment, NO_NETWORK)
+    with closing(SecondProcess(slam, demo)) as second:
+        until = time.monotonic() + 60
+        while not second._gone:
+            assert second.look(0, None) is None and time.monotonic() < until
+            time.sleep(0.05)
+        assert second.look(0, None) is None
+
+
+@pytest.mark.usefixtures("at_once")
+def test_a_broken_image_is_told_of_by_its_own_error_after_those_before_it(tmp_path: Path) -> None:
+    write_base(tmp_path)
+    sequence = load_sequence(str(tmp_path))
+    assert isinstance(sequence, StoredFrames) and len(sequence) > 3
+    broken = sorted((tmp_path / "rgb").iterdir())[3]
+    broken.write_bytes(broken.read_bytes()[: broken.stat().st_size // 2])
+    given = []
+    slam = V3DSLAM(sequence.camera, config=NO_NETWORK)
+    with pytest.raises(InputError, match=rf"{broken.name}: is truncated"):
+        for percept in percepts(iter(sequence), slam, ahead=True):
+            slam.take_in(percept)
+            given.append(percept.frame.index)
+    assert given == [0, 1, 2]
+
+
+def test_its_end_is_waited_for(demo: StoredFrames) -> None:
+    slam = V3DSLAM(demo.camera, config=NO_NETWORK)
+    second = started(slam, demo)
+    process = second._process
+    second.close()
+    assert process is not None and process.returncode is not None
+    assert second.look(0, None) is None

@@ -1,0 +1,126 @@
+"""Objects with tensors in them, from one process to another and back."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import socket
+import struct
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from itertools import accumulate, pairwise
+from mmap import mmap
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+_NUMBER = struct.Struct("!Q")
+
+ARENA = 1 << 26
+"""Bytes of the memory that two processes share: no more of it is taken than the frames need, at 640x480 about 5 MB."""
+
+
+def new_arena() -> int | None:
+    """Descriptor of memory for both ends of a channel; None where the system has none of this kind."""
+    if not hasattr(os, "memfd_create"):
+        return None
+    descriptor = os.memfd_create("v3d_torch")
+    os.truncate(descriptor, ARENA)
+    return descriptor
+
+
+class Channel:
+    """One end of a connection between a process and another that it started, which speak in turns.
+
+    What tensors hold goes through memory that both share, as it lies there, masks as a bit a pixel.
+
+    Args:
+        connection: to the other end; is closed with this one.
+        arena: descriptor of the shared memory; None sends all by the connection. It is the caller's to close.
+    """
+
+    def __init__(self, connection: socket.socket, arena: int | None) -> None:
+        self.connection = connection
+        self._arena = None if arena is None else mmap(arena, ARENA)
+
+    def send(self, value: object) -> None:
+        """Send a value.
+
+        Raises:
+            OSError: nobody listens any more.
+            Exception: the value cannot be pickled, whatever its classes raise.
+        """
+        buffers: list[pickle.PickleBuffer] = []
+        stream = BytesIO()
+        _Pickler(stream, protocol=5, buffer_callback=buffers.append).dump(value)
+        parts = [stream.getbuffer(), *(buffer.raw() for buffer in buffers)]
+        sizes = [part.nbytes for part in parts]
+        self.connection.sendall(b"".join(map(_NUMBER.pack, (len(parts), *sizes))))
+        if self._arena is not None and sum(sizes) <= ARENA:
+            for part, (begin, end) in zip(parts, pairwise(accumulate(sizes, initial=0)), strict=True):
+                self._arena[begin:end] = part
+            self.connection.sendall(b"!")
+        else:
+            for part in parts:
+                self.connection.sendall(part)
+
+    def receive(self) -> Any:
+        """The next value that the other end sent.
+
+        Raises:
+            EOFError: the other end is closed.
+            OSError: the connection is broken.
+        """
+        (count,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
+        sizes = [size for (size,) in _NUMBER.iter_unpack(self._exactly(count * _NUMBER.size))]
+        if self._arena is not None and sum(sizes) <= ARENA:
+            self._exactly(1)
+            ends = pairwise(accumulate(sizes, initial=0))
+            parts = [_writable(memoryview(self._arena)[begin:end]) for begin, end in ends]
+        else:
+            parts = [self._exactly(size) for size in sizes]
+        stream, *buffers = parts
+        return pickle.loads(stream, buffers=buffers)  # noqa: S301 - of this program's own process, over a private socket
+
+    def close(self) -> None:
+        """End the connection, which the other end is told."""
+        self.connection.close()
+
+    def _exactly(self, size: int) -> memoryview:
+        """So many bytes from the connection, in memory that may be written to."""
+        content = np.empty(size, np.uint8).data  # a bytearray would be filled with zeros first
+        got = 0
+        while got < size:
+            came = self.connection.recv_into(content[got:])
+            if came == 0:
+                raise EOFError("the other process has ended")
+            got += came
+        return content
+
+
+def _writable(shared: memoryview) -> memoryview:
+    """A copy, for the next value takes the place of this one."""
+    return np.frombuffer(shared, np.uint8).copy().data
+
+
+class _Pickler(pickle.Pickler):
+    def reducer_override(self, value: object) -> tuple[Callable[..., Tensor], tuple[object, ...]] | Any:
+        if type(value) is not Tensor:
+            return NotImplemented
+        # In the order of the memory: an image whose channels come last there stays as it is.
+        order = sorted(range(value.ndim), key=value.stride, reverse=True)
+        rows = value.detach().permute(order).contiguous().numpy()
+        if rows.dtype == np.bool_:
+            return _mask, (np.packbits(rows), rows.shape, order)
+        return _tensor, (rows, order)
+
+
+def _tensor(rows: NDArray[Any], order: Sequence[int]) -> Tensor:
+    return torch.from_numpy(rows).permute(tuple(np.argsort(order).tolist()))
+
+
+def _mask(bits: NDArray[np.uint8], shape: tuple[int, ...], order: Sequence[int]) -> Tensor:
+    return _tensor(np.unpackbits(bits, count=int(np.prod(shape))).reshape(shape).view(np.bool_), order)
