@@ -10,6 +10,7 @@ import torch
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
+from v3d_torch.lie import se3_exp
 from v3d_torch.odometry.motion import MotionEstimator
 from v3d_torch.odometry.orb import ORB, Features, spread
 from v3d_torch.odometry.ransac import epipolar_inliers, pnp_ransac
@@ -90,6 +91,37 @@ def test_ransac_of_too_few_points_is_empty() -> None:
     assert not epipolar_inliers(a.uv[:7], b.uv[:7], threshold=1.0, iterations=10, seed=0).any()
     points = CAMERA.lift(a.uv[:5], a.depth[:5])
     assert pnp_ransac(points, b.uv[:5], CAMERA, threshold=2.0, iterations=10, seed=0) is None
+
+
+def _near(T: torch.Tensor, metres: float, radians: float) -> torch.Tensor:
+    return se3_exp(torch.tensor([metres, -metres, metres, radians, radians, -radians], dtype=torch.float64)) @ T
+
+
+def test_a_guess_that_explains_half_of_the_points_spares_the_sampling(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b, T_ba = _views(outliers=100)
+    points = CAMERA.lift(a.uv, a.depth)
+    sampled = pnp_ransac(points, b.uv, CAMERA, threshold=2.0, iterations=100, seed=0)
+
+    def none(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("v3d_torch.odometry.ransac._sampled", none)
+    guess = _near(T_ba, 0.02, 0.02)
+    guessed = pnp_ransac(points, b.uv, CAMERA, threshold=2.0, iterations=100, seed=0, guess=guess)
+    assert sampled is not None and guessed is not None
+    torch.testing.assert_close(guessed[0], sampled[0], rtol=0, atol=1e-4)
+    assert guessed[1][:300].all() and guessed[1].sum() == sampled[1].sum()
+
+
+def test_a_wrong_guess_costs_nothing_but_time() -> None:
+    a, b, T_ba = _views(outliers=100)
+    points = CAMERA.lift(a.uv, a.depth)
+    guess = _near(T_ba, 3.0, 1.0)
+    plain, misled = (
+        pnp_ransac(points, b.uv, CAMERA, threshold=2.0, iterations=100, seed=0, guess=told) for told in (None, guess)
+    )
+    assert plain is not None and misled is not None
+    assert torch.equal(plain[0], misled[0]) and torch.equal(plain[1], misled[1])
 
 
 @pytest.mark.parametrize("kind", ["identical", "collinear"])

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from dataclasses import fields, replace
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
 from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets.stored import Following, StoredFrames
+from v3d_torch.doors import CheckedSLAM
 from v3d_torch.errors import InputError
 from v3d_torch.lookahead import percepts
 from v3d_torch.percept import Percept
@@ -79,11 +81,19 @@ def test_it_sees_what_is_seen_here_to_the_bit(demo: StoredFrames) -> None:
             assert seen.frame.camera is demo.camera
 
 
+def test_numbers_are_checked_there_too(demo: StoredFrames) -> None:
+    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
+    with closing(started(slam, demo)) as second:
+        seen = second.look(0, slam.next_outlook)
+    assert seen is not None and same(without_times(seen), without_times(slam.perceive(demo[0], slam.next_outlook)))
+
+
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A second process is begun with the first frame that it may be begun with, and waited for."""
     monkeypatch.setattr(v3d_torch.lookahead, "_WORTH", 1)
     monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", started)
+    monkeypatch.setattr(v3d_torch.lookahead, "_cores", lambda: 2)
 
 
 def tracked(config: Config, frames: Iterator[RGBDFrame], sequence: StoredFrames) -> tuple[V3DSLAM, list[Percept]]:
@@ -167,3 +177,33 @@ def test_its_end_is_waited_for(demo: StoredFrames) -> None:
     second.close()
     assert process is not None and process.returncode is not None
     assert second.look(0, None) is None
+
+
+@pytest.mark.parametrize(("cores", "ahead", "frames"), [(1, True, 100), (2, False, 100), (2, True, 3)])
+def test_none_is_begun_that_would_not_pay(
+    demo: StoredFrames, monkeypatch: pytest.MonkeyPatch, cores: int, ahead: bool, frames: int
+) -> None:
+    class Short(Following):
+        @property
+        def left(self) -> int:
+            return max(frames - self.index, 0)
+
+    def none(slam: V3DSLAM, sequence: StoredFrames) -> SecondProcess:
+        raise AssertionError
+
+    monkeypatch.setattr(v3d_torch.lookahead, "_WORTH", 2)
+    monkeypatch.setattr(v3d_torch.lookahead, "_cores", lambda: cores)
+    monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", none)
+    slam = V3DSLAM(demo.camera, config=NO_NETWORK)
+    for percept in islice(percepts(Short(demo, 0), slam, ahead=ahead), 4):
+        slam.take_in(percept)
+
+
+def test_without_memory_to_share_and_without_processes(demo: StoredFrames, monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = V3DSLAM(demo.camera, config=NO_NETWORK)
+    monkeypatch.setattr("v3d_torch.second_process.new_arena", lambda: None)
+    with closing(started(slam, demo)) as second:
+        assert second.look(1, slam.next_outlook) is not None
+    monkeypatch.setattr("v3d_torch.second_process.sys.executable", "/nowhere/python")
+    with closing(SecondProcess(slam, demo)) as second:
+        assert second.look(1, slam.next_outlook) is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
@@ -42,7 +43,7 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
     def look(outlook: Outlook | None) -> Percept | None:
         nonlocal second
         if ahead and isinstance(frames, Following) and frames.left:
-            if second is None and frames.given == _WORTH <= frames.left:
+            if second is None and frames.given == _WORTH <= frames.left and _cores() > 1:
                 second = stack.enter_context(closing(SecondProcess(slam, frames.sequence)))
             percept = None if second is None else second.look(frames.index, outlook)
             if percept is not None:
@@ -67,3 +68,8 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
             slam.next_outlook = slam.outlook()
             upcoming = begin()
             yield percept
+
+
+def _cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -27,8 +27,8 @@ from v3d_torch.wire import Channel, new_arena
 
 _LOG = logging.getLogger(__name__)
 
-_STAGES = "smooth", "detect", "lift"
-"""Those that look at a frame by itself, as attributes of `V3DSLAM`, beside the segmentation."""
+_STAGES = "segment", "smooth", "detect", "lift"
+"""Those that look at a frame by itself, as attributes of `V3DSLAM`."""
 
 _COMMAND = "from v3d_torch.second_process import serve; serve(*{})"
 
@@ -110,7 +110,7 @@ class SecondProcess:
             else:
                 slam, self._told = self._slam, True
                 stages = {name: getattr(slam, name) for name in _STAGES}
-                self._channel.send((slam.camera, slam.segment, slam.config, stages, self._sequence))
+                self._channel.send((type(slam), slam.camera, slam.config, stages, self._sequence))
         return self._ready
 
 
@@ -123,10 +123,11 @@ def serve(connection: int, arena: int | None = None) -> None:
     """
     channel = Channel(socket.socket(fileno=connection), arena)
     channel.send(None)
-    camera, segment, config, stages, sequence = channel.receive()
+    kind, camera, config, stages, sequence = channel.receive()
     torch.set_num_threads(config.threads)
-    slam = V3DSLAM(camera, segment, config)
+    slam: V3DSLAM = kind(camera, stages["segment"], config)
     vars(slam).update(stages)
+    segment: object = slam.segment
     channel.send(None)
     while True:
         index, outlook, memory = channel.receive()
