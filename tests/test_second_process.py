@@ -191,7 +191,7 @@ def test_none_is_begun_that_would_not_pay(
     def none(slam: V3DSLAM, sequence: StoredFrames) -> SecondProcess:
         raise AssertionError
 
-    monkeypatch.setattr(v3d_torch.lookahead, "_WORTH", 2)
+    monkeypatch.setattr(v3d_torch.lookahead, "_WORTH", 4)
     monkeypatch.setattr(v3d_torch.lookahead, "_cores", lambda: cores)
     monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", none)
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)

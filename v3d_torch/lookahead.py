@@ -17,9 +17,8 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.timing import StageClock
 from v3d_torch.types import RGBDFrame
 
-_WORTH = 60
-"""A second process is begun after so many frames, if as many are left: it takes some seconds until it is up, and a
-shorter run is done by then."""
+_WORTH = 150
+"""Frames for which a second process is begun: fewer are done soon after it is up, which takes some seconds."""
 
 
 def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Generator[Percept]:
@@ -43,7 +42,7 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
     def look(outlook: Outlook | None) -> Percept | None:
         nonlocal second
         if ahead and isinstance(frames, Following) and frames.left:
-            if second is None and frames.given == _WORTH <= frames.left and _cores() > 1:
+            if frames.given == 0 and frames.left >= _WORTH and _cores() > 1:
                 second = stack.enter_context(closing(SecondProcess(slam, frames.sequence)))
             percept = None if second is None else second.look(frames.index, outlook)
             if percept is not None:
