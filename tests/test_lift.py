@@ -89,7 +89,7 @@ def test_centroid_is_the_mean_of_the_points_that_are_kept() -> None:
 
 
 def test_a_voxel_holds_one_point() -> None:
-    clouds = lift(board(), rectangle())
+    clouds = lift(board(), rectangle(), stride=2)
     voxels = (clouds.points[0, clouds.valid[0]] / 0.02).floor()
     assert len(voxels) == len(voxels.unique(dim=0))
     # 120 x 180 pixels at 2 m are 0.457 m x 0.686 m, 784 voxels, some of them cut by the border.
@@ -197,12 +197,12 @@ def test_instances_without_a_cloud_have_no_centroid_and_leave_the_others_alone()
     hole, far, speck = rectangle((20, 80), (20, 80)), rectangle((20, 80), (120, 180)), rectangle((150, 160), (10, 20))
     depth[0, hole] = 0.0
     depth[0, far] = 6.5
-    clouds = lift(depth, hole, far, rectangle(), speck, torch.zeros_like(hole))
+    clouds = lift(depth, hole, far, rectangle(), speck, torch.zeros_like(hole), stride=2)
     torch.testing.assert_close(torch.isnan(clouds.centroid).all(dim=1), torch.tensor([True, True, False, True, True]))
     assert clouds.valid.sum(dim=1)[[0, 1, 4]].tolist() == [0, 0, 0]
     assert not clouds.own[[0, 1, 4]].any()
     assert torch.equal(clouds.own[2], rectangle())
-    torch.testing.assert_close(clouds.centroid[2], lift(depth, rectangle()).centroid[0])
+    torch.testing.assert_close(clouds.centroid[2], lift(depth, rectangle(), stride=2).centroid[0])
 
 
 def test_no_depth_at_all() -> None:
@@ -245,7 +245,8 @@ def test_cloud_of_an_instance_does_not_depend_on_the_others() -> None:
 
 def test_hundred_instances_on_a_grid() -> None:
     places = [((64 * c, 64 * c + 48), (48 * r, 48 * r + 36)) for r in range(10) for c in range(10)]
-    clouds = lift(torch.full((1, CAMERA.height, CAMERA.width), OBJECT), *(rectangle(*place) for place in places))
+    masks = [rectangle(*place) for place in places]
+    clouds = lift(torch.full((1, CAMERA.height, CAMERA.width), OBJECT), *masks, stride=2)
     expected = torch.stack([true_centre(*place) for place in places])
     assert float((clouds.centroid - expected).norm(dim=1).max()) < 0.01
 

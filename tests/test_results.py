@@ -209,7 +209,10 @@ def test_an_interrupt_ends_the_run_and_keeps_it(tmp_path: Path) -> None:
 
 
 def test_masks_show_what_is_left_out(tmp_path: Path) -> None:
-    exactly = ["objects.mask.margin=0", "objects.mask.seam=0", "objects.background.enabled=false"]
+    exactly = [
+        *("objects.clouds.stride=1", "objects.mask.margin=0", "objects.mask.seam=0"),
+        "objects.background.enabled=false",
+    ]
     config = load_config(overrides=[*exactly, "objects.mask.confirm_still=100"])
     pipeline(masks=tmp_path / "masks", config=config)()
     paths = sorted((tmp_path / "masks").iterdir())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import pickle
 import socket
+import subprocess
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -119,3 +122,11 @@ def test_there_and_back(ends: Ends) -> None:
         here.send(value)
         there.send((there.receive(), value))
         assert here.receive() == (value, value)
+
+
+def test_only_what_is_of_this_package_is_opened(ends: Ends) -> None:
+    here, there = ends
+    for stranger in (os.system, subprocess.Popen, eval, Fraction(1, 2)):
+        here.send(stranger)
+        with pytest.raises(pickle.UnpicklingError, match="is not for other processes"):
+            there.receive()

@@ -52,7 +52,8 @@ def main() -> None:
     options = parser.parse_args()
 
     sequence = load_sequence(options.seq, data_root=options.data_root)
-    sequence = Replay(sequence, range(min(options.frames or len(sequence), len(sequence))))
+    if options.frames is not None and options.frames < len(sequence):
+        sequence = Replay(sequence, range(options.frames))
     contender = prepare(options.contender, sequence, options.seed, options.vocabulary)
     start, cpu_start = time.perf_counter(), cpu_time()
     contender()
