@@ -70,7 +70,7 @@ def pid_of(job: Job) -> int:
 
 
 def test_one_dies_one_ends_the_rest_is_stopped(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
-    """Of four jobs on two cores the first is killed; when another one has ended the batch is stopped."""
+    """Of four jobs on two cores the first is killed; when another has ended and one still runs the batch is stopped."""
     planned = jobs(repeated(moment, tmp_path / "long", frames=30), tmp_path / "out", seeds=4)
     stop = Event()
     began: set[int] = set()
@@ -80,14 +80,14 @@ def test_one_dies_one_ends_the_rest_is_stopped(nodes: Nodes, moment: Path, tmp_p
         seed = event.job.config.seed
         if isinstance(event, Ended):
             ends[seed] = event.failure
-            if event.failure is None:
-                stop.set()
         else:
             began.add(seed)
             assert len(began - set(ends)) <= 2
             if killed is None and event.frames:
                 killed = seed
                 os.kill(pid_of(event.job), signal.SIGKILL)
+            elif event.frames and None in ends.values():
+                stop.set()
     assert killed is not None and "died unexpectedly" in str(ends[killed])
     good = [seed for seed, failure in ends.items() if failure is None]
     stopped = [seed for seed, failure in ends.items() if failure is not None and "interrupted after" in failure]
