@@ -91,7 +91,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shown(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
     """Results of that second with the masks that come with it, and what the screen showed."""
     out = tmp_path_factory.mktemp("first") / "out [b]"
-    done = with_masks(sequence, "--out", out, "--save-masks", cwd=out.parent)
+    done = with_masks(sequence, "--out", out, "--save-masks", "--profile", cwd=out.parent)
     assert done.returncode == 0, done.stderr
     return out, done
 
@@ -141,6 +141,19 @@ def test_the_screen_shows_scores_and_where_the_results_are(
     assert done.stderr == ""
     for words in ("ATE rmse", "30 of 30", "30 tracked", f"results: {out}"):
         assert words in done.stdout
+
+
+def test_the_profile_shows_what_each_stage_took(shown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    out, done = shown
+    frames = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").to_numpy() * 1e3
+    rows = [line.strip("│ ").split() for line in done.stdout.partition("milliseconds of a frame")[2].splitlines()]
+    shown_rows = {row[0]: row[2::2] for row in rows if len(row) == 9 and row[-1].endswith("%")}
+    stages = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").columns.str.removeprefix("seconds_")
+    assert list(shown_rows) == [*stages, "all"]
+    for figures, taken in zip(shown_rows.values(), [*frames.T, frames.sum(axis=1)], strict=True):
+        expected = [taken.mean(), np.median(taken), np.quantile(taken, 0.95)]
+        assert list(map(float, figures[:3])) == pytest.approx(expected, abs=0.06)  # a digit of theirs
+        assert float(figures[3].rstrip("%")) == pytest.approx(100 * taken.sum() / frames.sum(), abs=0.6)
 
 
 def test_saved_masks_are_black_and_white_and_named_by_stamp(first: Path, sequence: Path) -> None:
@@ -343,6 +356,7 @@ def test_help_is_instant_and_names_every_option() -> None:
         "masks",
         "weights",
         "seed",
+        "profile",
         "out",
         "viz",
         "rerun",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -26,18 +26,28 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.request import Request
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.shortfall import shortfall
+from v3d_torch.stage_table import stage_table
 from v3d_torch.state import empty_map
 from v3d_torch.viz.viewer import make_viewer
 
 
+@dataclass(frozen=True)
+class Display:
+    """What a run shows beside its summary.
+
+    Attributes:
+        viz: program to look on with, rerun; None for none.
+        rerun_file: to record for rerun; None for none.
+        profile: whether to say what each stage took.
+    """
+
+    viz: str | None = None
+    rerun_file: Path | None = None
+    profile: bool = False
+
+
 def run_sequence(
-    request: Request,
-    *,
-    config_name: str | None,
-    overrides: Sequence[str],
-    out: Path | None,
-    viz: str | None,
-    rerun_file: Path | None,
+    request: Request, display: Display, *, config_name: str | None, overrides: Sequence[str], out: Path | None
 ) -> None:
     """Run one sequence with everything shown and written; see ``python -m v3d_torch.run --help``.
 
@@ -47,29 +57,27 @@ def run_sequence(
     config = load_config(find_config(config_name or FULL), overrides)
     if request.map_in is None and not config.mapping.enabled:
         raise ConfigError("mapping.enabled=false: there is no map to find the camera in; give one with --load-map")
-    _carry_out(request, config, out, None, viz, rerun_file)
+    _carry_out(request, config, out, None, display)
 
 
 def resume_run(
     folder: Path,
     given: Request,
+    display: Display,
     *,
     config_name: str | None,
     overrides: Sequence[str],
     out: Path | None,
-    viz: str | None,
-    rerun_file: Path | None,
 ) -> None:
     """Go on with a run that was killed or interrupted; see ``python -m v3d_torch.run --help``.
 
     Args:
         folder: of its results.
         given: options beside ``--resume``: where the sequence is now, if it was moved. Others change nothing.
+        display: of the frames that are left, but for the profile, which is of all.
         config_name: as the run was given it, or None.
         overrides: as the run was given them, or none.
         out: the same folder, or None.
-        viz: see `run_sequence`.
-        rerun_file: for the frames that are left.
 
     Raises:
         V3DError: there is nothing to go on with, an option says otherwise than the run did when it began, or as
@@ -91,7 +99,7 @@ def resume_run(
         if changed(checkpoint.config, [override]) != checkpoint.config:
             raise ConfigError(f"{override}: says otherwise {leave}")
     moved = {name: value for name in ("seq", "data_root") if (value := getattr(given, name))}
-    _carry_out(replace(stored, **moved), checkpoint.config, folder, checkpoint, viz, rerun_file)
+    _carry_out(replace(stored, **moved), checkpoint.config, folder, checkpoint, display)
 
 
 def _carry_out(
@@ -99,8 +107,7 @@ def _carry_out(
     config: Config,
     out: Path | None,
     checkpoint: Checkpoint | None,
-    viz: str | None,
-    rerun_file: Path | None,
+    display: Display,
 ) -> None:
     console = Console(soft_wrap=True)
     map_out, masks = _path(request.map_out), _path(request.masks)
@@ -121,7 +128,7 @@ def _carry_out(
         )
     known = _known_map(request, sequence, config, checkpoint)
     segment = make_segmenter(config.segmentation, weights=_path(request.weights), masks_dir=masks)
-    viewer = make_viewer(viz, rerun_file, sequence)
+    viewer = make_viewer(display.viz, display.rerun_file, sequence)
     folder = result_folder(out, sequence.name)
     if masks is not None and masks.resolve() == (folder / "masks").resolve():
         raise OutputError(f"{masks}: would be written to while it is read; choose another folder with --out")
@@ -141,7 +148,7 @@ def _carry_out(
     )
     if map_out is not None:
         save_map(map_out, pipeline.slam.mapper.map, pipeline.views)
-    _say(request, folder, pipeline, evaluation, console)
+    _say(request, display, folder, pipeline, evaluation, console)
 
 
 def _known_map(
@@ -159,7 +166,14 @@ def _path(text: str | None) -> Path | None:
     return None if text is None else Path(text)
 
 
-def _say(request: Request, folder: Path, pipeline: Pipeline, evaluation: Evaluation | None, console: Console) -> None:
+def _say(
+    request: Request,
+    display: Display,
+    folder: Path,
+    pipeline: Pipeline,
+    evaluation: Evaluation | None,
+    console: Console,
+) -> None:
     """Show how a run ended.
 
     Raises:
@@ -169,6 +183,8 @@ def _say(request: Request, folder: Path, pipeline: Pipeline, evaluation: Evaluat
     console.print(_summary(pipeline, evaluation))
     if evaluation is not None and (table := paper_table(pipeline.sequence.name, evaluation)) is not None:
         console.print(table)
+    if display.profile and run.frames:
+        console.print(stage_table(run))
     for note in evaluation.notes if evaluation is not None else ():
         console.print(f"note: {note}", markup=False)
     if run.unsaved is not None:

@@ -52,6 +52,7 @@ def main(
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write what is left out of tracking.")] = False,
     viz: Annotated[str | None, typer.Option(help="Look on while it runs, with: rerun.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="File (.rrd) to record for rerun, to look at it later.")] = None,
+    profile: Annotated[bool, typer.Option("--profile", help="Show what each stage took.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the room, too.")] = False,
     map_out: Annotated[
         Path | None, typer.Option("--save-map", metavar="FILE", help="Write the map, for later runs.")
@@ -72,7 +73,7 @@ def main(
 ) -> None:
     """Track an RGB-D camera where people move; map what stands still."""
     from v3d_torch.console import exit_on_error
-    from v3d_torch.one_run import resume_run, run_sequence
+    from v3d_torch.one_run import Display, resume_run, run_sequence
     from v3d_torch.request import Request
 
     if seq is None and resume is None:
@@ -99,13 +100,14 @@ def main(
         map_out=_text(map_out),
         save_masks=save_masks,
     )
+    display = Display(viz, rerun, profile)
     with exit_on_error():
         if resume is not None:
             if (source := context.get_parameter_source("data_root")) is not None and source.name == "ENVIRONMENT":
                 request = replace(request, data_root=None)  # the run knows its own
-            resume_run(resume, request, config_name=config, overrides=overrides, out=out, viz=viz, rerun_file=rerun)
+            resume_run(resume, request, display, config_name=config, overrides=overrides, out=out)
         else:
-            run_sequence(request, config_name=config, overrides=overrides, out=out, viz=viz, rerun_file=rerun)
+            run_sequence(request, display, config_name=config, overrides=overrides, out=out)
 
 
 def _text(path: Path | None) -> str | None:
