@@ -56,22 +56,41 @@ class BundleResult:
 
 
 @dataclass(frozen=True)
-class NormalEquations:
-    r"""Blocks of :math:`J^T W J` and :math:`J^T W r` for F free poses and P points.
+class Linearised:
+    """All errors at some poses and points, and how they change. In all that follows the observations come last.
 
     Attributes:
-        U: pose by pose, shape :math:`(F, 6, 6)`.
-        V: point by point, shape :math:`(P, 3, 3)`.
-        W: point by pose, shape :math:`(P, 3, 6F)`: dense, as a local map is small and most poses see much of it.
-        pose_gradient: shape :math:`(6F,)`.
-        point_gradient: shape :math:`(P, 3)`.
+        in_camera: point of each observation in its camera, metres, shape :math:`(3, M)`.
+        residuals: errors in sigmas, shape :math:`(3, M)`.
+        by_pose: their change by the pose, shape :math:`(6, 3, M)`.
+        by_point: their change by the point, shape :math:`(3, 3, M)`.
+        weights: of Huber's kernel, shape :math:`(M,)`.
+    """
+
+    in_camera: Tensor
+    residuals: Tensor
+    by_pose: Tensor
+    by_point: Tensor
+    weights: Tensor
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    r"""Blocks of :math:`J^T W J` and, behind the last column of the square ones, of :math:`J^T W r`.
+
+    Attributes:
+        U: pose by pose, for F free poses, shape :math:`(F, 6, 7)`.
+        V: point by point, shape :math:`(3, 4, P)`.
+        W: point by pose, for each of the N observations by free poses, shape :math:`(3, 6, N)`.
+        pose: which of the free poses that is, int64, shape :math:`(N,)`.
+        point: which point, int64, shape :math:`(N,)`.
     """
 
     U: Tensor
     V: Tensor
     W: Tensor
-    pose_gradient: Tensor
-    point_gradient: Tensor
+    pose: Tensor
+    point: Tensor
 
 
 State = tuple[Tensor, Tensor]  # T_cw (K, 4, 4), points (P, 3)
@@ -102,63 +121,72 @@ def bundle_adjust(
         Poses and points at the least robust cost found.
     """
     free = torch.nonzero(~fixed)[:, 0]
-    problem = partial(normal_equations, observations=observations, camera=camera, free=free)
-    found = levenberg_marquardt((T_cw, points), problem, partial(_step, free=free), iterations, tolerance)
+    problem = partial(linearise, observations=observations, camera=camera)
+    step = partial(_step, observations=observations, free=free)
+    found = levenberg_marquardt((T_cw, points), problem, step, iterations, tolerance)
     T_cw, points = found.state
-    in_camera, _ = _to_camera(T_cw, points, observations)
-    chi2 = chi_square(in_camera, reprojection(in_camera, observations, camera)[0])
+    chi2 = chi_square(found.system.in_camera.T, found.system.residuals.T)
     return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations)
 
 
-def _to_camera(T_cw: Tensor, points: Tensor, observations: Observations) -> tuple[Tensor, Tensor]:
-    """The point of each observation in its camera, (M, 3), and the rotation that brought it there, (M, 3, 3)."""
-    T = T_cw[observations.pose]
-    R = T[:, :3, :3]
-    return (R @ points[observations.point, :, None])[..., 0] + T[:, :3, 3], R
+def linearise(state: State, observations: Observations, camera: PinholeCamera) -> tuple[float, Linearised]:
+    """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what its derivatives are made of."""
+    T_cw, points = state
+    T = T_cw[:, :3].flatten(1).T[:, observations.pose].unflatten(0, (3, 4))
+    R = T[:, :3]
+    in_camera = (R * points.T[:, observations.point]).sum(dim=1) + T[:, 3]
+    residuals, jacobian = reprojection(in_camera.T, observations, camera)
+    r, by_pose = residuals.T, jacobian.permute(2, 1, 0)
+    costs, weights = huber((r * r).sum(dim=0), observations.limit)
+    by_point = _inner(R.transpose(0, 1), by_pose[:3].transpose(0, 1))
+    return float(costs.sum()), Linearised(in_camera, r, by_pose, by_point, weights)
 
 
 def normal_equations(
-    state: State, observations: Observations, camera: PinholeCamera, free: Tensor
-) -> tuple[float, NormalEquations]:
-    """Linearise the robust cost.
+    at: Linearised, observations: Observations, free: Tensor, poses: int, points: int
+) -> NormalEquations:
+    """The normal equations of the free poses and of all points.
 
     Args:
-        state: poses :math:`(K, 4, 4)` and points :math:`(P, 3)`.
-        observations: of the points by the poses.
-        camera: intrinsics.
+        at: errors and their derivatives.
+        observations: that they are of.
         free: indices of the poses that may move, int64, shape :math:`(F,)`.
-
-    Returns:
-        Cost, and normal equations with Huber's weights in W.
+        poses: how many there are.
+        points: how many there are.
     """
-    T_cw, points = state
-    in_camera, R = _to_camera(T_cw, points, observations)
-    residuals, by_pose = reprojection(in_camera, observations, camera)
-    costs, weights = huber((residuals * residuals).sum(dim=-1), observations.limit)
-    by_point = by_pose[..., :3] @ R
+    errors = at.residuals[None]
+    V = _inner(at.by_point * at.weights, torch.cat([at.by_point, errors]))
 
-    # Fixed poses get a last column of their own, which is cut off at the end.
-    F, P = free.shape[0], points.shape[0]
-    column = torch.full((T_cw.shape[0],), F)
-    column[free] = torch.arange(F)
-    pose, point = column[observations.pose], observations.point
-
-    weighted_pose = (by_pose * weights[:, None, None]).mT
-    weighted_point = (by_point * weights[:, None, None]).mT
-    gradients = residuals[..., None]
-    pose_gradient = _sum_by(pose, F + 1, (weighted_pose @ gradients)[..., 0])
-    W = _sum_by(point * (F + 1) + pose, P * (F + 1), weighted_point @ by_pose)
-    return float(costs.sum()), NormalEquations(
-        U=_sum_by(pose, F + 1, weighted_pose @ by_pose)[:F],
-        V=_sum_by(point, P, weighted_point @ by_point),
-        W=W.unflatten(0, (P, F + 1))[:, :F].transpose(1, 2).flatten(2),
-        pose_gradient=pose_gradient[:F].flatten(),
-        point_gradient=_sum_by(point, P, (weighted_point @ gradients)[..., 0]),
+    row = torch.full((poses,), -1)
+    row[free] = torch.arange(len(free))
+    pose = row[observations.pose]
+    by_free = torch.nonzero(pose >= 0)[:, 0]
+    pose, by_pose = pose[by_free], at.by_pose[..., by_free]
+    weighted = by_pose * at.weights[by_free]
+    U = _inner(weighted, torch.cat([by_pose, errors[..., by_free]]))
+    return NormalEquations(
+        U=_sum_by(pose, len(free), U).permute(2, 0, 1),
+        V=_sum_by(observations.point, points, V),
+        W=_inner(at.by_point[..., by_free], weighted),
+        pose=pose,
+        point=observations.point[by_free],
     )
 
 
-def _sum_by(index: Tensor, count: int, values: Tensor) -> Tensor:
-    return values.new_zeros(count, *values.shape[1:]).index_add_(0, index, values)
+def _inner(a: Tensor, b: Tensor) -> Tensor:
+    """Sums over the errors of products of derivatives, (A, 3, M) and (B, 3, M) to (A, B, M).
+
+    Error by error: as matrix products of three by three, one for each observation, it takes three times as long.
+    """
+    total = a[:, None, 0] * b[:, 0]
+    return total.addcmul_(a[:, None, 1], b[:, 1]).addcmul_(a[:, None, 2], b[:, 2])
+
+
+def _sum_by(index: Tensor, count: int, blocks: Tensor) -> Tensor:
+    """Sums of those blocks (n, m, N) that have the same index, (n, m, count)."""
+    rows = blocks.flatten(0, 1)
+    sums = rows.new_zeros(len(rows), count).scatter_add_(1, index.expand(len(rows), -1), rows)
+    return sums.unflatten(0, blocks.shape[:2])
 
 
 def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Tensor, Tensor]:
@@ -174,25 +202,61 @@ def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Ten
     Returns:
         Steps of the poses, shape :math:`(F, 6)`, and of the points, shape :math:`(P, 3)`.
     """
-    F, P = system.U.shape[0], system.V.shape[0]
-    L = torch.linalg.cholesky(_damp(system.V, damping))
-    right = torch.cat([system.W, system.point_gradient[..., None]], dim=-1)
-    right = torch.linalg.solve_triangular(L, right, upper=False).reshape(3 * P, 6 * F + 1)
-    Y, h = right[:, :-1], right[:, -1]
-    S = -(Y.T @ Y)
-    S.view(F, 6, F, 6).diagonal(dim1=0, dim2=2).add_(_damp(system.U, damping).permute(1, 2, 0))
-    xi = torch.linalg.solve(S, Y.T @ h - system.pose_gradient)
-    moved = torch.linalg.solve_triangular(L.mT, -(h + Y @ xi).reshape(P, 3, 1), upper=True)
-    return xi.reshape(F, 6), moved[..., 0]
+    F, P = system.U.shape[0], system.V.shape[-1]
+    U, V = _damp(system.U[..., :6].permute(1, 2, 0), damping), _damp(system.V[:, :3], damping)
+    L = _cholesky(V)
+    h = _forward(L, system.V[:, 3])
+    blocks = _forward(L[:, :, system.point], system.W)
+    # Y is dense, as a local map is small and most poses see much of it; transposed, so that its blocks lie apart.
+    place = (
+        (18 * P * system.pose + system.point) + P * torch.arange(3)[:, None, None] + 3 * P * torch.arange(6)[:, None]
+    )
+    Yt = blocks.new_zeros(18 * F * P).scatter_add_(0, place.flatten(), blocks.flatten()).view(6 * F, 3 * P)
+    S = -(Yt @ Yt.T)
+    S.view(F, 6, F, 6).diagonal(dim1=0, dim2=2).add_(U)
+    xi = torch.linalg.solve(S, Yt @ h.flatten() - system.U[..., 6].flatten())
+    moved = _backward(L, -(h + (Yt.T @ xi).view(3, P)))
+    return xi.view(F, 6), moved.T
 
 
 def _damp(blocks: Tensor, damping: float) -> Tensor:
+    """Blocks (n, n, count) with more on their diagonals."""
     # Next to information of 1e4 per square metre and more, 1e-6 is nothing; a block that nothing observes needs it.
-    return blocks + torch.diag_embed(damping * blocks.diagonal(dim1=-2, dim2=-1) + 1e-6)
+    blocks = blocks.clone()
+    diagonal = blocks.diagonal(dim1=0, dim2=1)
+    diagonal.mul_(1 + damping).add_(1e-6)
+    return blocks
 
 
-def _step(state: State, system: NormalEquations, damping: float, free: Tensor) -> State:
+def _cholesky(V: Tensor) -> Tensor:
+    """Lower triangles of positive definite 3x3 blocks, both :math:`(3, 3, P)`: LAPACK takes longer for small ones."""
+    L = torch.zeros_like(V)
+    for row in range(3):
+        for column in range(row + 1):
+            rest = V[row, column] - (L[row, :column] * L[column, :column]).sum(dim=0)
+            L[row, column] = rest.sqrt() if row == column else rest / L[column, column]
+    return L
+
+
+def _forward(L: Tensor, b: Tensor) -> Tensor:
+    """Solve L x = b, block by block, for :math:`(3, 3, N)` and :math:`(3, ..., N)`."""
+    x = torch.empty_like(b)
+    for row in range(3):
+        x[row] = b[row]
+        for column in range(row):
+            x[row].addcmul_(L[row, column], x[column], value=-1)
+        x[row] /= L[row, row]
+    return x
+
+
+def _backward(L: Tensor, b: Tensor) -> Tensor:
+    """Solve L^T x = b."""
+    return _forward(L.transpose(0, 1).flip(0, 1), b.flip(0)).flip(0)
+
+
+def _step(state: State, at: Linearised, damping: float, observations: Observations, free: Tensor) -> State:
     T_cw, points = state
+    system = normal_equations(at, observations, free, len(T_cw), len(points))
     xi, moved = solve_normal_equations(system, damping)
     T_cw = T_cw.index_copy(0, free, se3_exp(xi) @ T_cw[free])
     return T_cw, points + moved
