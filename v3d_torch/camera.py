@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.geometry.calibration import distort_points, undistort_points
+from kornia.geometry.calibration import distort_points
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -83,10 +84,9 @@ class PinholeCamera:
             uv: shape :math:`(N, 2)`, floating point.
 
         Returns:
-            Shape :math:`(N, 2)`, float64.
+            Shape :math:`(N, 2)`, float64, without gradients.
         """
-        # 20 fixed-point steps: with the strong lens of TUM's fr1 the corners need more than kornia's default of 5.
-        return self._bend(uv, partial(undistort_points, num_iters=20))
+        return self._bend(uv, _undistorted)
 
     def distort(self, uv: Tensor) -> Tensor:
         """Pixels of an ideal pinhole camera to pixels of the image as delivered: the inverse of `undistort`.
@@ -171,6 +171,13 @@ class PinholeCamera:
         pixels = self.undistort(torch.stack([u, v], dim=-1).reshape(-1, 2))
         ones = torch.ones(pixels.shape[0], dtype=torch.float64)
         return self.lift(pixels, ones).reshape(self.height, self.width, 3).to(torch.float32)
+
+
+def _undistorted(uv: Tensor, K: Tensor, lens: Tensor) -> Tensor:
+    """Pixels without the lens, all :math:`(1, N, ...)`: by OpenCV, which takes a tenth of the time of kornia's."""
+    # With the strong lens of TUM's fr1 the corners need up to 20 steps, and a millionth of a pixel is enough.
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
+    return torch.from_numpy(cv2.undistortImagePoints(uv.numpy(), K[0].numpy(), lens.numpy(), None, until)).view_as(uv)
 
 
 def back_project(depth: Tensor, rays: Tensor) -> Tensor:

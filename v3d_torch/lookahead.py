@@ -9,6 +9,8 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 
+import torch
+
 from v3d_torch.datasets.stored import Following
 from v3d_torch.mapping.recorder import Outlook
 from v3d_torch.percept import Percept
@@ -38,6 +40,7 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
     """
     second: SecondProcess | None = None
     stack = ExitStack()
+    inference = torch.is_inference_mode_enabled()  # in this thread
 
     def look(outlook: Outlook | None) -> Percept | None:
         nonlocal second
@@ -53,7 +56,8 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
             frame = next(frames, None)
         if frame is None:
             return None
-        percept = slam.perceive(frame, outlook)
+        with torch.inference_mode(inference):
+            percept = slam.perceive(frame, outlook)
         return replace(percept, seconds={**clock.seconds, **percept.seconds})
 
     with stack, ThreadPoolExecutor(1, "perception") as thread:

@@ -114,6 +114,7 @@ class SecondProcess:
         return self._ready
 
 
+@torch.inference_mode()
 def serve(connection: int, arena: int | None = None) -> None:
     """The whole life of the process: it ends with the connection, or with the first thing that goes wrong.
 
