@@ -59,7 +59,7 @@ class Minimum(Generic[State, System]):
 
     Attributes:
         state: at the least cost.
-        system: normal equations there, undamped.
+        system: what the steps from there are found by.
         cost_before: at the start.
         cost_after: at ``state``.
         iterations: steps tried.
@@ -85,8 +85,8 @@ def levenberg_marquardt(
 
     Args:
         state: where to start.
-        linearise: state to its cost and normal equations.
-        step: state, its normal equations and the damping (relative to their diagonal) to the next state.
+        linearise: state to its cost and normal equations, or what they are made of.
+        step: state, what ``linearise`` gave and the damping (relative to the diagonal) to the next state.
         iterations: most steps tried.
         tolerance: relative change of the cost that ends the search.
     """

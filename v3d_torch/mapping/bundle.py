@@ -17,7 +17,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.levenberg import huber, levenberg_marquardt
 from v3d_torch.lie import se3_exp
-from v3d_torch.odometry.refine import Measurements, chi_square, reprojection
+from v3d_torch.odometry.refine import Measurements, chi_square, reprojection, reprojection_jacobian
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,21 +56,19 @@ class BundleResult:
 
 
 @dataclass(frozen=True)
-class Linearised:
-    """All errors at some poses and points, and how they change. In all that follows the observations come last.
+class Errors:
+    """The errors at some poses and points. In all that follows the observations come last.
 
     Attributes:
         in_camera: point of each observation in its camera, metres, shape :math:`(3, M)`.
-        residuals: errors in sigmas, shape :math:`(3, M)`.
-        by_pose: their change by the pose, shape :math:`(6, 3, M)`.
-        by_point: their change by the point, shape :math:`(3, 3, M)`.
+        R: rotations from the world into its camera, shape :math:`(3, 3, M)`.
+        residuals: in sigmas, shape :math:`(3, M)`.
         weights: of Huber's kernel, shape :math:`(M,)`.
     """
 
     in_camera: Tensor
+    R: Tensor
     residuals: Tensor
-    by_pose: Tensor
-    by_point: Tensor
     weights: Tensor
 
 
@@ -121,53 +119,54 @@ def bundle_adjust(
         Poses and points at the least robust cost found.
     """
     free = torch.nonzero(~fixed)[:, 0]
-    problem = partial(linearise, observations=observations, camera=camera)
-    step = partial(_step, observations=observations, free=free)
+    problem = partial(errors_at, observations=observations, camera=camera)
+    step = partial(_step, observations=observations, camera=camera, free=free)
     found = levenberg_marquardt((T_cw, points), problem, step, iterations, tolerance)
     T_cw, points = found.state
     chi2 = chi_square(found.system.in_camera.T, found.system.residuals.T)
     return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations)
 
 
-def linearise(state: State, observations: Observations, camera: PinholeCamera) -> tuple[float, Linearised]:
-    """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what its derivatives are made of."""
+def errors_at(state: State, observations: Observations, camera: PinholeCamera) -> tuple[float, Errors]:
+    """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""
     T_cw, points = state
     T = T_cw[:, :3].flatten(1).T[:, observations.pose].unflatten(0, (3, 4))
     R = T[:, :3]
     in_camera = (R * points.T[:, observations.point]).sum(dim=1) + T[:, 3]
-    residuals, jacobian = reprojection(in_camera.T, observations, camera)
-    r, by_pose = residuals.T, jacobian.permute(2, 1, 0)
-    costs, weights = huber((r * r).sum(dim=0), observations.limit)
-    by_point = _inner(R.transpose(0, 1), by_pose[:3].transpose(0, 1))
-    return float(costs.sum()), Linearised(in_camera, r, by_pose, by_point, weights)
+    residuals = reprojection(in_camera.T, observations, camera).T
+    costs, weights = huber((residuals * residuals).sum(dim=0), observations.limit)
+    return float(costs.sum()), Errors(in_camera, R, residuals, weights)
 
 
 def normal_equations(
-    at: Linearised, observations: Observations, free: Tensor, poses: int, points: int
+    state: State, errors: Errors, observations: Observations, camera: PinholeCamera, free: Tensor
 ) -> NormalEquations:
-    """The normal equations of the free poses and of all points.
+    """Linearise the robust cost.
 
     Args:
-        at: errors and their derivatives.
-        observations: that they are of.
+        state: K poses and P points.
+        errors: there.
+        observations: of the points by the poses.
+        camera: intrinsics.
         free: indices of the poses that may move, int64, shape :math:`(F,)`.
-        poses: how many there are.
-        points: how many there are.
     """
-    errors = at.residuals[None]
-    V = _inner(at.by_point * at.weights, torch.cat([at.by_point, errors]))
+    poses, points = map(len, state)
+    by_pose = reprojection_jacobian(errors.in_camera.T, observations, camera).permute(2, 1, 0)
+    by_point = _inner(errors.R.transpose(0, 1), by_pose[:3].transpose(0, 1))
+    residuals = errors.residuals[None]
+    V = _inner(by_point * errors.weights, torch.cat([by_point, residuals]))
 
     row = torch.full((poses,), -1)
     row[free] = torch.arange(len(free))
     pose = row[observations.pose]
     by_free = torch.nonzero(pose >= 0)[:, 0]
-    pose, by_pose = pose[by_free], at.by_pose[..., by_free]
-    weighted = by_pose * at.weights[by_free]
-    U = _inner(weighted, torch.cat([by_pose, errors[..., by_free]]))
+    pose, by_pose = pose[by_free], by_pose[..., by_free]
+    weighted = by_pose * errors.weights[by_free]
+    U = _inner(weighted, torch.cat([by_pose, residuals[..., by_free]]))
     return NormalEquations(
         U=_sum_by(pose, len(free), U).permute(2, 0, 1),
         V=_sum_by(observations.point, points, V),
-        W=_inner(at.by_point[..., by_free], weighted),
+        W=_inner(by_point[..., by_free], weighted),
         pose=pose,
         point=observations.point[by_free],
     )
@@ -254,9 +253,10 @@ def _backward(L: Tensor, b: Tensor) -> Tensor:
     return _forward(L.transpose(0, 1).flip(0, 1), b.flip(0)).flip(0)
 
 
-def _step(state: State, at: Linearised, damping: float, observations: Observations, free: Tensor) -> State:
+def _step(
+    state: State, errors: Errors, damping: float, observations: Observations, camera: PinholeCamera, free: Tensor
+) -> State:
     T_cw, points = state
-    system = normal_equations(at, observations, free, len(T_cw), len(points))
-    xi, moved = solve_normal_equations(system, damping)
+    xi, moved = solve_normal_equations(normal_equations(state, errors, observations, camera, free), damping)
     T_cw = T_cw.index_copy(0, free, se3_exp(xi) @ T_cw[free])
     return T_cw, points + moved

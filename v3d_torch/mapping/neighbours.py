@@ -51,7 +51,7 @@ class NeighbourSearch:
         row, feature = self._search(features, keyframe.T_cw, local, config.mapping.fuse_radius).unbind(dim=1)
         in_camera = local.points[row] @ keyframe.T_cw[:3, :3].T + keyframe.T_cw[:3, 3]
         measured = measurements(features[feature], config.tracking, config.features)
-        fits = chi_square(in_camera, reprojection(in_camera, measured, self._camera)[0]) <= measured.limit
+        fits = chi_square(in_camera, reprojection(in_camera, measured, self._camera)) <= measured.limit
         found = torch.full_like(keyframe.landmarks, -1)
         found[feature[fits]] = local.ids[row[fits]]
         sparse_map.fuse(keyframe, found)

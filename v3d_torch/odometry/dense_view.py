@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d, pixel_unshuffle
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import DenseConfig
-from v3d_torch.odometry.refine import Measurements, reprojection
+from v3d_torch.odometry.refine import Measurements, reprojection_jacobian
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Level:
         points = self.lens.camera.rays.flatten(0, 1)[index] / values[1, :, None]
         one = torch.ones_like(values[1])
         unit = Measurements(uv=one[:, None].expand(-1, 2), inverse_depth=one, pixel_sigma=one, inverse_depth_sigma=1.0)
-        _, moved = reprojection(points, unit, self.lens.camera)  # how (u, v, 1/z) move, M x 3 x 6
+        moved = reprojection_jacobian(points, unit, self.lens.camera)  # how (u, v, 1/z) move, M x 3 x 6
         flow = self.lens.unbend.flatten(0, 1)[index] @ moved[:, :2]
         slopes = (gradient.flatten(2)[:, :, index].permute(2, 0, 1) @ flow).transpose(0, 1)
         slopes[1] -= moved[:, 2]  # of a point that comes nearer more inverse depth is expected

@@ -66,8 +66,8 @@ def measurements(features: Features, config: TrackingConfig, pyramid: FeaturesCo
     )
 
 
-def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Errors of (u, v, 1/z) in standard deviations, and how they change when the camera moves.
+def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
+    """Errors of (u, v, 1/z) in standard deviations.
 
     Args:
         points: landmark of each observation in the camera frame, metres, float64, shape :math:`(M, 3)`.
@@ -75,25 +75,33 @@ def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) 
         camera: intrinsics.
 
     Returns:
-        residuals, shape :math:`(M, 3)`, the third 0 where no depth was measured, and their Jacobian by the left
-        perturbation of ``T_cw``, shape :math:`(M, 3, 6)`. Its first three columns are the Jacobian by ``points``. In
-        memory the observations come last.
+        Shape :math:`(M, 3)`, the third 0 where no depth was measured. In memory the observations come last.
     """
     X, Y, Z = points.unbind(-1)
     w = 1 / Z.clamp(min=_NEAREST)
-    x, y = X * w, Y * w
     u, v = measured.uv.unbind(-1)
-    fx, fy = camera.fx / measured.pixel_sigma, camera.fy / measured.pixel_sigma
-    per_depth = (measured.inverse_depth > 0).to(w.dtype) / measured.inverse_depth_sigma
-    residuals = torch.stack(
+    return torch.stack(
         [
-            fx * x + (camera.cx - u) / measured.pixel_sigma,
-            fy * y + (camera.cy - v) / measured.pixel_sigma,
-            (w - measured.inverse_depth) * per_depth,
+            (camera.fx * X * w + camera.cx - u) / measured.pixel_sigma,
+            (camera.fy * Y * w + camera.cy - v) / measured.pixel_sigma,
+            torch.where(measured.inverse_depth > 0, w - measured.inverse_depth, 0) / measured.inverse_depth_sigma,
         ]
-    )
-    a, b, d, o = fx * w, fy * w, -per_depth * w * w, torch.zeros_like(w)
-    ax, by = -a * x, -b * y
+    ).T
+
+
+def reprojection_jacobian(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
+    """How the errors of `reprojection` change when the camera moves.
+
+    Returns:
+        By the left perturbation of ``T_cw``, shape :math:`(M, 3, 6)`. Its first three columns are the Jacobian by
+        ``points``. In memory the observations come last.
+    """
+    X, Y, Z = points.unbind(-1)
+    w = 1 / Z.clamp(min=_NEAREST)
+    scaled = w / measured.pixel_sigma
+    a, b, o = camera.fx * scaled, camera.fy * scaled, torch.zeros_like(w)
+    d = torch.where(measured.inverse_depth > 0, w * w, 0) / -measured.inverse_depth_sigma
+    ax, by = -a * X * w, -b * Y * w
     # A small motion moves a point p by translation + rotation x p, and a . (rotation x p) = rotation . (p x a). Number
     # by number, so that all observations of one lie side by side: three times as fast as row by row.
     jacobian = torch.stack(
@@ -106,7 +114,7 @@ def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) 
             *(-Y * a, X * b, o),
         ]
     )
-    return residuals.T, jacobian.unflatten(0, (6, 3)).permute(2, 1, 0)
+    return jacobian.unflatten(0, (6, 3)).permute(2, 1, 0)
 
 
 def chi_square(points: Tensor, residuals: Tensor) -> Tensor:
@@ -155,32 +163,38 @@ def refine_pose(
         The pose; the prediction itself, without inliers, where nothing supports any pose.
     """
 
-    def linearise(T_cw: Tensor, kept: Tensor, limit: Tensor | float) -> tuple[float, _PoseSystem]:
+    def linearise(T_cw: Tensor, kept: Tensor, limit: Tensor | float) -> tuple[float, _Errors]:
         in_camera = points @ T_cw[:3, :3].T + T_cw[:3, 3]
-        residuals, jacobian = reprojection(in_camera, measured, camera)
-        chi2 = chi_square(in_camera, residuals)
+        residuals = reprojection(in_camera, measured, camera)
         costs, weights = huber((residuals * residuals).sum(dim=-1), limit)
-        J = jacobian.permute(2, 1, 0).flatten(1)  # (6, 3 M), as it lies in memory
-        weighted = J * (weights * kept).repeat(3)
-        return float((costs * kept).sum()), (weighted @ J.T, weighted @ residuals.T.flatten(), chi2)
+        return float((costs * kept).sum()), _Errors(in_camera, residuals, weights * kept)
+
+    def normal_equations(at: _Errors) -> tuple[Tensor, Tensor]:
+        J = reprojection_jacobian(at.in_camera, measured, camera).permute(2, 1, 0).flatten(1)  # as it lies in memory
+        weighted = J * at.weights.repeat(3)
+        return weighted @ J.T, weighted @ at.residuals.T.flatten()
+
+    def step(T_cw: Tensor, at: _Errors, damping: float) -> Tensor:
+        H, gradient = normal_equations(at)
+        diagonal = damping * H.diagonal() + 1e-9  # solvable even where nothing is seen
+        return se3_exp(-torch.linalg.solve(H + diagonal.diag(), gradient)) @ T_cw
 
     inliers = torch.ones(points.shape[0], dtype=torch.bool)
     for turn in range(rounds):
         robust = 2 * turn < rounds
         problem = partial(linearise, kept=inliers, limit=measured.limit if robust else torch.inf)
         # Convergence is quadratic: after a step that gained a thousandth nothing worth a step is left.
-        found = levenberg_marquardt(T_cw, problem, _step, iterations, tolerance=1e-3)
-        T_cw, before, (information, _, chi2) = found.state, inliers, found.system
+        found = levenberg_marquardt(T_cw, problem, step, iterations, tolerance=1e-3)
+        T_cw, before = found.state, inliers
+        chi2 = chi_square(found.system.in_camera, found.system.residuals)
         inliers = chi2 <= measured.limit
         if not robust and torch.equal(inliers, before):
             break
-    return PoseRefinement(rigid(T_cw), inliers, chi2, information)
+    return PoseRefinement(rigid(T_cw), inliers, chi2, normal_equations(found.system)[0])
 
 
-_PoseSystem = tuple[Tensor, Tensor, Tensor]  # J^T W J, J^T W r, and the squared error of each observation
-
-
-def _step(T_cw: Tensor, system: _PoseSystem, damping: float) -> Tensor:
-    H, gradient, _ = system
-    diagonal = damping * H.diagonal() + 1e-9  # solvable even where nothing is seen
-    return se3_exp(-torch.linalg.solve(H + diagonal.diag(), gradient)) @ T_cw
+@dataclass(frozen=True)
+class _Errors:
+    in_camera: Tensor  # (M, 3), metres
+    residuals: Tensor  # (M, 3), sigmas
+    weights: Tensor  # (M,), 0 for outliers
