@@ -11,7 +11,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import FeaturesConfig, TrackingConfig
 from v3d_torch.odometry.guided import GuidedSearch, LocalMap
 from v3d_torch.odometry.orb import Features
-from v3d_torch.odometry.refine import measurements, refine_pose
+from v3d_torch.odometry.refine import PoseRefinement, measurements, refine_pose
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,25 @@ class MapTracker:
         """
         row = torch.searchsorted(local.ids, carried).clamp(max=max(len(local.ids) - 1, 0))
         feature = torch.nonzero((carried >= 0) & (local.ids[row] == carried))[:, 0] if len(local.ids) else row[:0]
-        first = self._refine(features, T_cw, local, torch.stack([row[feature], feature], dim=1))
+        first = self._refine(features, T_cw, local, torch.stack([row[feature], feature], dim=1), rounds=2)
         if first is None:
-            first = self._refine(features, T_cw, local, self._search(features, T_cw, local, self._config.search_radius))
+            pairs = self._search(features, T_cw, local, self._config.search_radius)
+            first = self._refine(features, T_cw, local, pairs, rounds=2)
         if first is None:
             return None
         # From the refined pose, what the prediction had put out of reach is found as well, within half the radius.
         pairs = self._search(features, first.T_cw, local, 0.5 * self._config.search_radius)
-        return self._refine(features, first.T_cw, local, pairs)
+        found = self._refine(features, first.T_cw, local, pairs, rounds=4)
+        if found is None:
+            return None
+        landmark, feature = pairs[found.inliers].unbind(dim=1)
+        ids = torch.full((len(features),), -1, dtype=torch.int64)
+        ids[feature] = local.ids[landmark]
+        return Tracking(found.T_cw, ids, local.ids[self._search.project(found.T_cw, local).rows])
 
-    def _refine(self, features: Features, T_cw: Tensor, local: LocalMap, pairs: Tensor) -> Tracking | None:
+    def _refine(
+        self, features: Features, T_cw: Tensor, local: LocalMap, pairs: Tensor, *, rounds: int
+    ) -> PoseRefinement | None:
         """Pose from pairs (row in ``local``, feature); None when too few agree."""
         config = self._config
         if pairs.shape[0] < config.min_inliers:
@@ -84,9 +93,6 @@ class MapTracker:
             local.points[landmark],
             measurements(features[feature], config, self._features),
             self._camera,
+            rounds=rounds,
         )
-        if int(refined.inliers.sum()) < config.min_inliers:
-            return None
-        ids = torch.full((len(features),), -1, dtype=torch.int64)
-        ids[feature[refined.inliers]] = local.ids[landmark[refined.inliers]]
-        return Tracking(refined.T_cw, ids, local.ids[self._search.project(refined.T_cw, local).rows])
+        return refined if int(refined.inliers.sum()) >= config.min_inliers else None
