@@ -264,30 +264,48 @@ class Walk:
         return (T_wc - invert(self.T_cw))[:, :3, 3].norm(dim=1)
 
 
+def adjust(sparse_map: SparseMap, config: Config) -> None:
+    """Adjust the neighbourhood of the newest keyframe."""
+    adjustment = adjust_locally(sparse_map, sparse_map.keyframes[-1], config, CAMERA)
+    assert adjustment is not None
+    adjustment.take_in(sparse_map)
+
+
 def test_local_adjustment_finds_the_true_poses() -> None:
     walk = Walk(keyframes=6, error=0.01)
     before = walk.errors()
     for _ in range(3):
-        adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)
+        adjust(walk.map, Config())
     assert before.max() > 0.02
     assert walk.errors().max() < 0.003
     assert torch.equal(walk.map.keyframes[0].T_cw, EYE)  # the first is the world
+
+
+def test_while_an_adjustment_is_solved_the_map_stays_as_it_is() -> None:
+    walk = Walk(keyframes=6, error=0.01)
+    before, points = walk.map.T_cw, walk.map.landmarks["point"].clone()
+    adjustment = adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)
+    assert adjustment is not None
+    assert torch.equal(walk.map.T_cw, before) and torch.equal(walk.map.landmarks["point"], points)
+    assert walk.map.observations["valid"].all()
+    adjustment.take_in(walk.map)
+    torch.testing.assert_close(walk.map.T_cw, adjustment.T_cw, rtol=0, atol=0)
+    assert (walk.map.T_cw - before).abs().max() > 0.005
 
 
 def test_local_adjustment_moves_the_neighbourhood_only() -> None:
     walk = Walk(keyframes=12, error=0.01)
     before = [keyframe.T_cw.clone() for keyframe in walk.map.keyframes]
     config = load_config(overrides=["mapping.bundle_keyframes=4"])
-    adjust_locally(walk.map, walk.map.keyframes[-1], config, CAMERA)
+    adjust(walk.map, config)
     moved = [not torch.equal(keyframe.T_cw, old) for keyframe, old in zip(walk.map.keyframes, before, strict=True)]
     assert moved == [False] * 8 + [True] * 4
 
 
 def test_without_bundle_keyframes_nothing_is_adjusted() -> None:
     walk = Walk(keyframes=4, error=0.01)
-    before = walk.errors()
-    adjust_locally(walk.map, walk.map.keyframes[-1], load_config(overrides=["mapping.bundle_keyframes=0"]), CAMERA)
-    assert torch.equal(walk.errors(), before)
+    config = load_config(overrides=["mapping.bundle_keyframes=0"])
+    assert adjust_locally(walk.map, walk.map.keyframes[-1], config, CAMERA) is None
 
 
 def test_local_adjustment_forgets_what_does_not_fit() -> None:
@@ -295,13 +313,13 @@ def test_local_adjustment_forgets_what_does_not_fit() -> None:
     table = walk.map.observations
     wrong = torch.nonzero((table["keyframe"] == 5) & (table["landmark"] % 20 == 0))[:, 0]
     table["uv"][wrong] += 50.0
-    adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)
+    adjust(walk.map, Config())
     assert len(wrong) > 5
     assert not table["valid"][wrong].any()
     assert table["valid"].double().mean() > 0.98
     assert (walk.map.keyframes[5].landmarks[table["feature"][wrong]] == -1).all()
     assert walk.errors().max() < 0.006
-    adjust_locally(walk.map, walk.map.keyframes[-1], Config(), CAMERA)  # without them
+    adjust(walk.map, Config())  # without them
     assert walk.errors().max() < 0.003
 
 

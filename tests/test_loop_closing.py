@@ -110,7 +110,9 @@ class Walker:
         keyframe = self.map.insert(len(self.true), len(self.true) / 3, T_cw, features, known[which])
         keyframe.adrift = adrift
         self.true.append(T_wc)
-        self.corrections.append(self.closer.close(keyframe, self.map))
+        closure = self.closer.look(keyframe, self.map, self.map.T_cw)
+        self.corrections.append(None if closure is None else self.closer.close(closure, self.map))
+        self.closer.learn(keyframe)
         self._seen.append(which)
         return keyframe
 

@@ -341,9 +341,9 @@ class MappingConfig(Section):
     map of fr1_rpy bends by a fifth more."""
     bundle_iterations: int = Field(5, gt=0)
     """Levenberg-Marquardt steps of a local bundle adjustment, at most."""
-    bundle_tolerance: float = Field(1e-4, gt=0)
+    bundle_tolerance: float = Field(1e-5, gt=0)
     """A step that changes the cost by a smaller share is the last. The cost is some thousands of squared standard
-    deviations: less than one is left to gain, and the next keyframe goes on from there."""
+    deviations: a small part of one is left to gain, and the next keyframe goes on from there."""
 
 
 class MeshConfig(Section):

@@ -24,7 +24,7 @@ from v3d_torch.types import RGBDFrame
 
 STAGES = frozenset(
     {"segment", "smooth", "detect", "lift", "match", "move", "watch", "propose", "judge", "track"}
-    | {"mapper", "loops", "localise"}
+    | {"mapper", "loops", "back_end", "localise"}
 )
 """Attributes of `V3DSLAM` that are its stages."""
 

@@ -90,6 +90,7 @@ def run_logged(
 
     run = pipeline(note)
     autosave.end()
+    pipeline.settle()
     evaluation = write_results(folder, pipeline)
     autosave.discard()
     if run.failure:

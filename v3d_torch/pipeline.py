@@ -150,6 +150,11 @@ class Pipeline:
             self.run.failure = self.run.failure or str(error)
         return self.run
 
+    @torch.inference_mode()
+    def settle(self) -> None:
+        """After the last frame: take in what is still being solved for it."""
+        self.slam.settle()
+
     def _coming(self) -> Iterator[RGBDFrame]:
         done = len(self.slam.poses.statuses) if isinstance(self.sequence, RGBDSequence) else 0
         if isinstance(self.sequence, StoredFrames):

@@ -7,6 +7,7 @@ from functools import partial
 
 from torch import Tensor
 
+from v3d_torch.back_end import BackEnd
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.depth import DepthSmoother
@@ -22,7 +23,7 @@ from v3d_torch.objects.dynamics import ObjectDynamics
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.objects.witnesses import Witnesses
-from v3d_torch.odometry.motion import MotionEstimator
+from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, View
 from v3d_torch.odometry.orb import ORB
 from v3d_torch.odometry.tracker import MapTracker
@@ -88,6 +89,7 @@ class V3DSLAM:
         self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
         for keyframe in self.mapper.map.kept:
             self.loops.learn(keyframe)
+        self.back_end = BackEnd(config, camera, self.mapper.map, self.loops)
         self.localise = Localiser(self.track, self.loops, self.mapper.map, config.tracking.local_keyframes)
         vars(self).update(given)  # a stage that the user put in place before the camera was known stays
         self.camera = camera
@@ -147,9 +149,9 @@ class V3DSLAM:
         self.clock.add(percept.seconds)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             seen = View(frame, depth, features)
-            last, T_lw, predicted = self._last, self.poses.T_cw, self.poses.predict(frame.stamp)
-            motion = None if last is None else self.move(last, seen, predicted @ invert(T_lw))
-            T_cw = predicted if motion is None else rigid(motion.T_ba @ T_lw)
+            last, predicted = self._last, self.poses.predict(frame.stamp)
+            motion = None if last is None else self.move(last, seen, predicted @ invert(self.poses.T_cw))
+            T_cw = self._expect(frame.stamp, motion)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             view = self.watch.look(frame.stamp, depth, T_cw)
             arrivals = self.watch(view, trusted=motion is not None)
@@ -160,10 +162,12 @@ class V3DSLAM:
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
             scene = self.judge(instances, clouds, view, arrivals, Witnesses(features.pixel, seen.matched(motion)))
             keep = features.on(scene.static)
+        self.settle()  # III-E: bundle adjustment, loops, pose graph, begun with the frame before
         with self.clock("tracking"):  # III-E: the pose in the local map
+            T_cw = self._expect(frame.stamp, motion)
             static, carried = features[keep], seen.carried(motion, last)[keep]
             estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
-        with self.clock("mapping"):  # keyframes, landmarks, local bundle adjustment
+        with self.clock("mapping"):  # keyframes and landmarks
             reference = self.localise.reference(estimate)
             T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)
             if T_new_old is not None:
@@ -173,14 +177,25 @@ class V3DSLAM:
                 self.watch.remember(replace(view, T_cw=self.poses.T_cw))
             landmarks = estimate.landmarks if keyframe is None else keyframe.landmarks
             self._last = View(frame, depth, static, scene.static, landmarks)
-        if keyframe is not None:
-            self.poses.anchor(keyframe)
-            with self.clock("loop"):  # III-E: loop detection, pose graph
-                T_new_old = self.loops.close(keyframe, self.mapper.map)
-                if T_new_old is not None:
-                    self._move_world(T_new_old)
+            if keyframe is not None:
+                self.poses.anchor(keyframe)
+                self.back_end.begin(keyframe)
         status = self.poses.statuses[-1]
         return Tracked(**vars(scene), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)
+
+    def settle(self) -> None:
+        """Take in what is being solved for the last keyframe. The next frame does that; after the last one, call it."""
+        if self.camera is None or (solved := self.back_end.result()) is None:
+            return
+        self.clock.add(solved.seconds)
+        with self.clock("mapping"):
+            T_new_old = self.back_end.take_in(solved)
+            if T_new_old is not None:
+                self._move_world(T_new_old)
+
+    def _expect(self, stamp: float, motion: Motion | None) -> Tensor:
+        """Pose of the camera by its motion since the last frame; predicted, where that is not known."""
+        return self.poses.predict(stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
 
     def _move_world(self, T_new_old: Tensor) -> None:
         """Carry what is remembered along when the world is corrected under it."""

@@ -37,7 +37,7 @@ State = dict[str, Any]
 OF_SLAM = (
     *("clock", "poses", "next_outlook", "_memory", "_last"),
     *("mapper.map.keyframes", "mapper.map.landmarks", "mapper.map.observations", "mapper.map.loops"),
-    *("mapper._most_tracked", "mapper._untracked_since", "loops.count"),
+    *("mapper._most_tracked", "mapper._untracked_since", "loops.count", "back_end.keyframe"),
     *("watch._views", "judge._last_stamp", "judge.tracker.tracks", "judge.tracker._next_id"),
 )
 """Attributes of `V3DSLAM` and its stages. Of the places that it recognises the keyframes tell, see `restore`."""
@@ -69,9 +69,13 @@ def put_back(owner: object, state: Mapping[str, Any]) -> None:
 
 
 def refresh(slam: V3DSLAM) -> None:
-    """Let a system whose attributes were put back follow them: places that it recognises, memory of its segmenter."""
+    """Let a system whose attributes were put back follow them: what it recognises, solves and segments with."""
+    newest = slam.back_end.keyframe
     for keyframe in slam.mapper.map.kept:
-        slam.loops.learn(keyframe)
+        if keyframe is not newest:
+            slam.loops.learn(keyframe)
+    if newest is not None:
+        slam.back_end.begin(newest)
     segment: object = slam.segment
     if isinstance(segment, Remembering):
         segment.memory = slam._memory

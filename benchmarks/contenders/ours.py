@@ -57,6 +57,7 @@ class Ours:
         failure = self.pipeline(on_frame).failure
         if failure is not None:
             raise RuntimeError(failure)
+        self.pipeline.settle()
 
     def trajectory(self) -> Trajectory:
         """A pose for every frame."""

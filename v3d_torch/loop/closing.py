@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,6 +29,23 @@ class Place:
 
     keyframe: Keyframe
     tracking: Tracking
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A loop, and what the map has to be to close it.
+
+    Attributes:
+        place: where it begins.
+        keyframe: that it ends at.
+        loop: the motion between the two.
+        T_cw: world to camera of all keyframes, float64, shape :math:`(K, 4, 4)`; of retired ones it does not count.
+    """
+
+    place: Place
+    keyframe: Keyframe
+    loop: Loop
+    T_cw: Tensor
 
 
 class LoopCloser:
@@ -75,25 +92,37 @@ class LoopCloser:
                 return Place(keyframe, tracking)
         return None
 
-    def close(self, keyframe: Keyframe, sparse_map: SparseMap) -> Tensor | None:
-        """Look for a loop that ends at ``keyframe``, and correct keyframes and landmarks when there is one.
+    def forget(self, keyframes: Iterable[int]) -> None:
+        """Recognise keyframes, given by their indices, no more."""
+        self._index.forget(keyframes)
 
-        The keyframe becomes a place that can be recognised from now on.
+    def look(self, keyframe: Keyframe, sparse_map: SparseMap, T_cw: Tensor) -> Closure | None:
+        """Look for a loop that ends at ``keyframe``, and solve the pose graph with it.
 
-        Returns:
-            The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`; None without a loop.
+        Args:
+            keyframe: newest.
+            sparse_map: stays as it is.
+            T_cw: of its keyframes, by which they are joined beside loops, float64, shape :math:`(K, 4, 4)`.
         """
-        self._index.forget({known.index for known in sparse_map.keyframes if known.retired})
         place = self._find(keyframe, sparse_map) if self._config.enabled else None
-        self.learn(keyframe)
         if place is None:
             return None
         # T_ij is the pose of camera j in camera i: old keyframe i, new keyframe j, as the place says it.
         T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
-        sparse_map.loops.append(Loop(place.keyframe.index, keyframe.index, T_ij))
-        self.count += 1
+        loop = Loop(place.keyframe.index, keyframe.index, T_ij)
+        return Closure(place, keyframe, loop, self._corrected(sparse_map, T_cw, [*sparse_map.loops, loop]))
+
+    def close(self, closure: Closure, sparse_map: SparseMap) -> Tensor:
+        """Correct keyframes and landmarks, in place.
+
+        Returns:
+            The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`.
+        """
+        place, keyframe = closure.place, closure.keyframe
         T_cw_before = keyframe.T_cw
-        self._correct(sparse_map)
+        sparse_map.loops.append(closure.loop)
+        self.count += 1
+        sparse_map.move_keyframes(closure.T_cw)
         sparse_map.fuse(keyframe, place.tracking.landmarks)
         for other in sparse_map.keyframes:
             other.adrift &= place.keyframe.adrift
@@ -110,19 +139,18 @@ class LoopCloser:
             return None
         return place
 
-    def _correct(self, sparse_map: SparseMap) -> None:
-        T_cw = sparse_map.T_cw
+    def _corrected(self, sparse_map: SparseMap, T_cw: Tensor, loops: Sequence[Loop]) -> Tensor:
+        """Poses of all keyframes that agree best with covisibility and loops, (K, 4, 4)."""
         edges = sparse_map.covisibility(self._COVISIBLE)
         measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
         carrier = sparse_map.carriers
-        i, j = torch.tensor([[loop.i, loop.j] for loop in sparse_map.loops]).unbind(dim=1)
+        i, j = torch.tensor([[loop.i, loop.j] for loop in loops]).unbind(dim=1)
         # Between those kept: a retired keyframe stays where it is beside the one that it goes along with.
         to_i, to_j = T_cw[carrier[i]] @ invert(T_cw[i]), T_cw[j] @ invert(T_cw[carrier[j]])
-        loops = to_i @ torch.stack([loop.T_ij for loop in sparse_map.loops]) @ to_j
+        told = to_i @ torch.stack([loop.T_ij for loop in loops]) @ to_j
         kept, node = carrier.unique(return_inverse=True)
         ends = torch.stack([node[i], node[j]], dim=1)
         apart = ends[:, 0] != ends[:, 1]
-        ends, loops = torch.cat([node[edges], ends[apart]]), torch.cat([measured, loops[apart]])
-        solved = optimise_pose_graph(invert(T_cw[kept]), ends, loops)
-        T_cw[kept] = invert(solved.T_wc)
-        sparse_map.move_keyframes(T_cw)
+        ends, told = torch.cat([node[edges], ends[apart]]), torch.cat([measured, told[apart]])
+        solved = optimise_pose_graph(invert(T_cw[kept]), ends, told)
+        return T_cw.index_copy(0, kept, invert(solved.T_wc))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -13,22 +15,51 @@ from v3d_torch.mapping.local_map import Keyframe, SparseMap
 from v3d_torch.odometry.refine import pixel_sigma
 
 
-def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, camera: PinholeCamera) -> None:
-    """Adjust the keyframes around a new one together with their landmarks, and drop what does not fit.
+@dataclass(frozen=True)
+class Adjustment:
+    """What a local bundle adjustment has found.
+
+    Attributes:
+        T_cw: world to camera of all keyframes, those adjusted and those left alone, float64, shape :math:`(K, 4, 4)`.
+        landmarks: ids of those adjusted, int64, shape :math:`(P,)`.
+        points: where they are, world frame, metres, float64, shape :math:`(P, 3)`.
+        outliers: rows of the observations that do not fit, int64, shape :math:`(O,)`.
+    """
+
+    T_cw: Tensor
+    landmarks: Tensor
+    points: Tensor
+    outliers: Tensor
+
+    def take_in(self, sparse_map: SparseMap) -> None:
+        """Change the map that was adjusted, in place; it has got no new keyframe since."""
+        # Landmarks with one observation do not take part: they go along with the keyframe that made them.
+        sparse_map.move_keyframes(self.T_cw)
+        sparse_map.landmarks["point"][self.landmarks] = self.points
+        sparse_map.forget(self.outliers)
+
+
+def adjust_locally(
+    sparse_map: SparseMap, keyframe: Keyframe, config: Config, camera: PinholeCamera
+) -> Adjustment | None:
+    """Adjust the keyframes around a new one together with their landmarks, and find what does not fit.
 
     Keyframes further off that see the same landmarks take part and stay where they are.
 
     Args:
-        sparse_map: whose keyframes, landmarks and observations are changed in place.
+        sparse_map: stays as it is.
         keyframe: the new one.
         config: size of the neighbourhood, noise.
         camera: intrinsics.
+
+    Returns:
+        None where there is nothing to adjust.
     """
     window = sparse_map.covisible(keyframe.landmarks[keyframe.landmarks >= 0], config.mapping.bundle_keyframes)
     table = sparse_map.observations
     rows = _observations_around(sparse_map, window)
     if len(window) < 2 or len(rows) == 0:
-        return
+        return None
     poses, pose = table["keyframe"][rows].unique(return_inverse=True)
     landmarks, point = table["landmark"][rows].unique(return_inverse=True)
     T_cw = sparse_map.T_cw
@@ -52,11 +83,8 @@ def adjust_locally(sparse_map: SparseMap, keyframe: Keyframe, config: Config, ca
         config.mapping.bundle_iterations,
         config.mapping.bundle_tolerance,
     )
-    # Landmarks with one observation do not take part: they go along with the keyframe that made them.
     T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
-    sparse_map.move_keyframes(T_cw)
-    sparse_map.landmarks["point"][landmarks] = found.points
-    sparse_map.forget(rows[found.chi2 > observations.limit])
+    return Adjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit])
 
 
 def _observations_around(sparse_map: SparseMap, window: Tensor) -> Tensor:

@@ -1,11 +1,9 @@
-"""Decides when a frame becomes a keyframe, and grows and adjusts the map with it (ORB-SLAM2, local mapping)."""
+"""Decides when a frame becomes a keyframe, and grows the map with it (ORB-SLAM2, local mapping)."""
 
 from __future__ import annotations
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
-from v3d_torch.mapping.adjust import adjust_locally
-from v3d_torch.mapping.culling import cull_keyframes
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
 from v3d_torch.mapping.neighbours import NeighbourSearch
 from v3d_torch.mapping.recorder import Estimate, Status
@@ -24,7 +22,6 @@ class Mapper:
 
     def __init__(self, config: Config, camera: PinholeCamera, known: SparseMap | None = None) -> None:
         self._config = config
-        self._camera = camera
         self._most_tracked = 0  # landmarks found by a frame since the last keyframe
         self._untracked_since: float | None = None
         self._search_neighbours = NeighbourSearch(config, camera)
@@ -50,9 +47,6 @@ class Mapper:
         keyframe.adrift = reference is not None and (estimate.status is Status.LOST or reference.adrift)
         self._most_tracked, self._untracked_since = 0, None
         self._search_neighbours(self.map, keyframe)
-        adjust_locally(self.map, keyframe, self._config, self._camera)
-        self.map.cull()
-        cull_keyframes(self.map, keyframe, self._config.mapping)
         return keyframe
 
     def _wants(self, frame: RGBDFrame, static: Features, estimate: Estimate) -> bool:
