@@ -17,7 +17,7 @@ from v3d_torch.errors import OutputError
 from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.report import is_oriented
 from v3d_torch.lie import invert
-from v3d_torch.mapping.local_map import poses_of
+from v3d_torch.mapping.local_map import Keyframe, poses_of
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.objects.dynamics import Scene
 from v3d_torch.slam import V3DSLAM
@@ -40,15 +40,15 @@ class RerunViewer:
     ``world/camera/image``                    pinhole; below it ``rgb``, ``depth``, ``masks`` and boxes of ``objects``
     ``world/objects``, ``world/centroids``    clouds and centroids of the objects; their class is the verdict
     ``world/votes``                           lines between who voted for what is dynamic; others: ``without_effect``
-    ``world/map``                             ``landmarks`` and ``keyframes``, all again with each new keyframe
-    ``world/trajectory``                      all poses, again with each new keyframe; ``newest``: those since
+    ``world/map``                             ``landmarks`` and ``keyframes``, all again after each new keyframe
+    ``world/trajectory``                      all poses, again after each new keyframe; ``newest``: those since
     ``world/groundtruth``                     true way of the camera, aligned at the first pose that has a true one
     ``seconds``, ``votes``, ``chamfer``       curves, by stage and by id of the object
     ``verdicts``, ``log``                     the frame in words
     ========================================  ==========================================================================
 
-    A loop is closed with a new keyframe, so that what it corrects is logged again. The lens' distortion is not shown:
-    the image is as the camera delivers it.
+    What is adjusted for a keyframe, and a loop that ends there, is taken in with the frame after it: then all is logged
+    again. The lens' distortion is not shown: the image is as the camera delivers it.
 
     Args:
         stream: recording, from `open_stream`.
@@ -63,7 +63,8 @@ class RerunViewer:
         self._stream = stream
         self._camera = camera
         self._unaligned = groundtruth if groundtruth is not None and is_oriented(groundtruth) else None
-        self._newest: list[NDArray[np.float64]] = []  # positions since the last keyframe, and its own
+        self._newest: list[NDArray[np.float64]] = []  # positions since the map was logged, and the last before
+        self._unsettled: Keyframe | None = None  # keyframe that the map was not adjusted to yet
         self._loops = 0
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -85,10 +86,11 @@ class RerunViewer:
             T_wc = invert(slam.poses.T_cw)
             self._show_camera(frame, T_wc)
             log_scene(self._stream, scene)
-            if kept:
+            if self._unsettled is not None:
                 self._show_map(slam)
             else:
                 self._newest.append(T_wc[:3, 3].numpy())
+            self._unsettled = slam.back_end.keyframe
             self._stream.log("world/trajectory/newest", _way([np.array(self._newest)], "tab:blue"))
             self._align(frame.stamp, T_wc, slam.poses.status)
             for stage, elapsed in seconds.items():
