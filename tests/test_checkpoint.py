@@ -260,7 +260,7 @@ def test_a_state_comes_back_and_what_was_shared_is(tmp_path: Path) -> None:
 def test_damage_is_told(tmp_path: Path) -> None:
     whole = small(tmp_path / "s", torch.ones(50))
     for content in (
-        *(b"", b"v3d_torch state 3\n", b"\xff" * 300, whole[:100], whole[: len(whole) // 2], whole[:-1]),
+        *(b"", b"v3d_torch state 4\n", b"\xff" * 300, whole[:100], whole[: len(whole) // 2], whole[:-1]),
         *(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :] for place in range(3, len(whole), 97)),
     ):
         (tmp_path / "s").write_bytes(content)
@@ -291,8 +291,8 @@ def test_no_code_of_a_file_is_run_and_no_other_class_made(tmp_path: Path) -> Non
 
 def test_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = small(tmp_path / "s")
-    (tmp_path / "s").write_bytes(whole.replace(b"state 3 ", b"state 4 ", 1))
-    with pytest.raises(InputError, match=r"/s: is a state in version 4 .* knows version 3"):
+    (tmp_path / "s").write_bytes(whole.replace(b"state 4 ", b"state 5 ", 1))
+    with pytest.raises(InputError, match=r"/s: is a state in version 5 .* knows version 4"):
         read_state(tmp_path / "s", [])
     with monkeypatch.context() as patch:
         patch.setattr("v3d_torch.state_file.version", lambda _: "9.9")
