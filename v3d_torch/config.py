@@ -404,7 +404,7 @@ class Config(Section):
     """Threads of torch: the tensors of a frame are so small that more threads wait for each other."""
     lookahead: bool = True
     """Whether the next frame is read, segmented and lifted while one is tracked, in another thread and, where a stored
-    sequence is long enough, another process, and the map is adjusted behind in a third; the results are the same."""
+    sequence is long enough, another process, and the map adjusted behind in a thread; the results are the same."""
     check_numerics: bool = False
     """Debug mode: whatever leaves a stage is looked through for NaN and infinity, and the first stage that gives some
     is named. The results are the same. In Python it is `v3d_torch.doors.CheckedSLAM`."""

@@ -38,29 +38,12 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
     Raises:
         V3DError: a frame cannot be read; those before have been given.
     """
-    second: SecondProcess | None = None
-    stack = ExitStack()
-    inference = torch.is_inference_mode_enabled()  # in this thread
-
-    def look(outlook: Outlook | None) -> Percept | None:
-        nonlocal second
-        if ahead and isinstance(frames, Following) and frames.left:
-            if frames.given == 0 and frames.left >= _WORTH and _cores() > 1:
-                second = stack.enter_context(closing(SecondProcess(slam, frames.sequence)))
-            percept = None if second is None else second.look(frames.index, outlook)
-            if percept is not None:
-                frames.index += 1
-                return percept
-        clock = StageClock()
-        with clock("read"):
-            frame = next(frames, None)
-        if frame is None:
-            return None
-        with torch.inference_mode(inference):
-            percept = slam.perceive(frame, outlook)
-        return replace(percept, seconds={**clock.seconds, **percept.seconds})
-
-    with stack, ThreadPoolExecutor(1, "perception") as thread:
+    look = partial(_look, frames, slam, torch.is_inference_mode_enabled())
+    with ExitStack() as stack:
+        if ahead and isinstance(frames, Following) and frames.left >= _WORTH and _cores() > 1:
+            second = stack.enter_context(closing(SecondProcess(slam, frames.sequence)))
+            look = partial(_look_there, second, frames, look)
+        thread = stack.enter_context(ThreadPoolExecutor(1, "perception"))
 
         def begin() -> Callable[[], Percept | None]:
             outlook = slam.next_outlook
@@ -71,6 +54,32 @@ def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Gene
             slam.next_outlook = slam.outlook()
             upcoming = begin()
             yield percept
+
+
+def _look(frames: Iterator[RGBDFrame], slam: V3DSLAM, inference: bool, outlook: Outlook | None) -> Percept | None:
+    """Read the next frame and look at it, here; None behind the last. ``inference`` tells whether without gradients."""
+    clock = StageClock()
+    with clock("read"):
+        frame = next(frames, None)
+    if frame is None:
+        return None
+    with torch.inference_mode(inference):
+        percept = slam.perceive(frame, outlook)
+    return replace(percept, seconds={**clock.seconds, **percept.seconds})
+
+
+def _look_there(
+    second: SecondProcess,
+    frames: Following,
+    look_here: Callable[[Outlook | None], Percept | None],
+    outlook: Outlook | None,
+) -> Percept | None:
+    """Let the second process do that, as soon as it is up and as long as it can."""
+    percept = second.look(frames.index, outlook) if frames.left else None
+    if percept is None:
+        return look_here(outlook)
+    frames.index += 1
+    return percept
 
 
 def _cores() -> int:

@@ -22,7 +22,7 @@ from v3d_torch.mapping.recorder import Outlook
 from v3d_torch.percept import Percept
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.timing import StageClock
-from v3d_torch.types import Remembering
+from v3d_torch.types import memory_of, remind
 from v3d_torch.wire import Channel, new_arena
 
 _LOG = logging.getLogger(__name__)
@@ -79,19 +79,17 @@ class SecondProcess:
         Returns:
             None while the process is not up, and when it cannot.
         """
-        segment: object = self._slam.segment
+        segment = self._slam.segment
         try:
             if self._gone or not self._is_ready():
                 return None
-            memory = segment.memory if isinstance(segment, Remembering) else None
-            self._channel.send((index, outlook, memory))
+            self._channel.send((index, outlook, memory_of(segment)))
             percept: Percept = self._channel.receive()
         except Exception:  # it has ended, or is to look with what cannot be sent
             _LOG.debug("the second process looks at no more frames", exc_info=True)
             self._gone = True
             return None
-        if isinstance(segment, Remembering):
-            segment.memory = percept.memory
+        remind(segment, percept.memory)
         return replace(percept, frame=replace(percept.frame, camera=self._sequence.camera))
 
     def close(self) -> None:
@@ -128,12 +126,10 @@ def serve(connection: int, arena: int | None = None) -> None:
     torch.set_num_threads(config.threads)
     slam: V3DSLAM = kind(camera, stages["segment"], config)
     vars(slam).update(stages)
-    segment: object = slam.segment
     channel.send(None)
     while True:
         index, outlook, memory = channel.receive()
-        if isinstance(segment, Remembering):
-            segment.memory = memory
+        remind(slam.segment, memory)
         clock = StageClock()
         with clock("read"):
             frame = sequence[index]

@@ -30,7 +30,7 @@ from v3d_torch.odometry.tracker import MapTracker
 from v3d_torch.percept import Percept, Tracked
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
-from v3d_torch.types import Remembering, RGBDFrame, Segmenter
+from v3d_torch.types import RGBDFrame, Segmenter, memory_of
 
 
 class V3DSLAM:
@@ -134,8 +134,7 @@ class V3DSLAM:
             features = self.detect(frame.image, depth)
         with clock("clouds"):  # III-B.2: instances lifted to clean clouds
             clouds = self.lift(depth, instances)
-        memory = self.segment.memory if isinstance(self.segment, Remembering) else None
-        return Percept(frame, instances, depth, features, clouds, clock.seconds, memory)
+        return Percept(frame, instances, depth, features, clouds, clock.seconds, memory_of(self.segment))
 
     def take_in(self, percept: Percept) -> Tracked:
         """Follow the camera and the objects on to the next frame.
@@ -164,7 +163,7 @@ class V3DSLAM:
             keep = features.on(scene.static)
         self.settle()  # III-E: bundle adjustment, loops, pose graph, begun with the frame before
         with self.clock("tracking"):  # III-E: the pose in the local map
-            T_cw = self._expect(frame.stamp, motion)
+            T_cw = self._expect(frame.stamp, motion)  # in the map as it is now
             static, carried = features[keep], seen.carried(motion, last)[keep]
             estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
         with self.clock("mapping"):  # keyframes and landmarks

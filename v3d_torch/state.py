@@ -29,7 +29,7 @@ from v3d_torch.odometry.orb import Features
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.state_file import read_state, write_state
 from v3d_torch.timing import StageClock
-from v3d_torch.types import Remembering, RGBDFrame, Segmenter
+from v3d_torch.types import RGBDFrame, Segmenter, remind
 
 State = dict[str, Any]
 """Values of attributes by their names, one graph: what two of them share is shared."""
@@ -40,7 +40,7 @@ OF_SLAM = (
     *("mapper._most_tracked", "mapper._untracked_since", "loops.count", "back_end.keyframe"),
     *("watch._views", "judge._last_stamp", "judge.tracker.tracks", "judge.tracker._next_id"),
 )
-"""Attributes of `V3DSLAM` and its stages. Of the places that it recognises the keyframes tell, see `restore`."""
+"""Attributes of `V3DSLAM` and its stages. Of the places that it recognises the keyframes tell, see `refresh`."""
 
 CLASSES: tuple[type, ...] = (
     *(StageClock, PoseRecorder, _Entry, Status, Outlook, View, RGBDFrame, PinholeCamera, Features),
@@ -76,9 +76,7 @@ def refresh(slam: V3DSLAM) -> None:
             slam.loops.learn(keyframe)
     if newest is not None:
         slam.back_end.begin(newest)
-    segment: object = slam.segment
-    if isinstance(segment, Remembering):
-        segment.memory = slam._memory
+    remind(slam.segment, slam._memory)
 
 
 def save_state(path: StrPath, slam: V3DSLAM) -> None:

@@ -161,6 +161,17 @@ class Remembering(Protocol):
     memory: object
 
 
+def memory_of(segment: object) -> object:
+    """What a segmenter remembers; None where it does not go by the frames before."""
+    return segment.memory if isinstance(segment, Remembering) else None
+
+
+def remind(segment: object, memory: object) -> None:
+    """Give a segmenter, where it goes by the frames before, what one made alike remembered of them."""
+    if isinstance(segment, Remembering):
+        segment.memory = memory
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Camera poses over time. Arrays, and lists of them, become tensors.

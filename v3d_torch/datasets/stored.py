@@ -134,12 +134,7 @@ class Following(Iterator[RGBDFrame]):
 
     def __init__(self, sequence: StoredFrames, first: int) -> None:
         self.sequence = sequence
-        self.index = self._first = first
-
-    @property
-    def given(self) -> int:
-        """Frames before the next."""
-        return self.index - self._first
+        self.index = first
 
     @property
     def left(self) -> int:

@@ -37,13 +37,11 @@ class Closure:
 
     Attributes:
         place: where it begins.
-        keyframe: that it ends at.
-        loop: the motion between the two.
+        loop: the motion from there to the keyframe that it ends at.
         T_cw: world to camera of all keyframes, float64, shape :math:`(K, 4, 4)`; of retired ones it does not count.
     """
 
     place: Place
-    keyframe: Keyframe
     loop: Loop
     T_cw: Tensor
 
@@ -110,7 +108,7 @@ class LoopCloser:
         # T_ij is the pose of camera j in camera i: old keyframe i, new keyframe j, as the place says it.
         T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
         loop = Loop(place.keyframe.index, keyframe.index, T_ij)
-        return Closure(place, keyframe, loop, self._corrected(sparse_map, T_cw, [*sparse_map.loops, loop]))
+        return Closure(place, loop, self._corrected(sparse_map, T_cw, [*sparse_map.loops, loop]))
 
     def close(self, closure: Closure, sparse_map: SparseMap) -> Tensor:
         """Correct keyframes and landmarks, in place.
@@ -118,7 +116,7 @@ class LoopCloser:
         Returns:
             The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`.
         """
-        place, keyframe = closure.place, closure.keyframe
+        place, keyframe = closure.place, sparse_map.keyframes[closure.loop.j]
         T_cw_before = keyframe.T_cw
         sparse_map.loops.append(closure.loop)
         self.count += 1
