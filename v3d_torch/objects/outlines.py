@@ -46,7 +46,7 @@ class Outliner:
         self._view = view
         self._config = config
         self._stride = arrivals.stride
-        self._open = _smooth(view.depth[0], self._stride, config.edge) & ~arrivals.still
+        self._open = _smooth(view, self._stride, config.edge) & ~arrivals.still
         located = [track for track in tracks if track.newest.located]
         R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
         clouds = [track.cloud_at(view.stamp) @ R.T + t for track in located]
@@ -86,10 +86,10 @@ class Outliner:
         return enlarged(grown(torch.from_numpy(taken[parts]), 1).numpy(), step, reached.shape)
 
 
-def _smooth(depth: Tensor, step: int, edge: float) -> Tensor:
+def _smooth(view: DepthView, step: int, edge: float) -> Tensor:
     """Every n-th pixel around which, halfway to the next ones, depth differs by less than this share of it."""
-    side = np.ones((step + 1, step + 1), np.uint8)
-    nearest = cv2.erode(torch.where(depth > 0, depth, torch.inf).numpy(), side)[::step, ::step]
-    farthest = cv2.dilate(depth.numpy(), side)[::step, ::step]
+    depth, side = view.depth[0].numpy(), step + 1
+    nearest = view.least(side)[::step, ::step]
+    farthest = cv2.dilate(depth, np.ones((side, side), np.uint8))[::step, ::step]
     at = depth[::step, ::step]
-    return (at > 0) & torch.from_numpy(farthest - nearest < edge * at.numpy())
+    return torch.from_numpy((at > 0) & (farthest - nearest < edge * at))
