@@ -69,10 +69,10 @@ def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
     component = np.arange(size, dtype=np.int32)  # it is read for every pair: half the size, as they are
     borders: list[Pairs] = []  # (border point, core point that reaches it)
     for a, b in blocks:
-        inner = core[a] & core[b]
-        component = _join(component, a[inner], b[inner])
-        for point, other in ((a, b), (b, a)):
-            outer = core[other] & ~core[point]
+        a_core, b_core = core[a], core[b]
+        inner = a_core & b_core
+        component = _join(component, component[a[inner]], component[b[inner]])
+        for outer, point, other in ((a_core > b_core, b, a), (b_core > a_core, a, b)):
             borders.append((point[outer], other[outer]))
 
     cores = np.flatnonzero(core)[::-1]
@@ -93,7 +93,7 @@ def _neighbours(points: NDArray[np.float64], eps: float) -> tuple[Ints, Iterable
     if _most_pairs(points, eps) <= _MAX_PAIRS:
         pairs = tree.query_pairs(eps, output_type="ndarray")
         a, b = pairs.T.astype(np.int32)  # contiguous and half the size: they are read many times from here on
-        return np.bincount(a, minlength=len(points)) + np.bincount(b, minlength=len(points)) + 1, [(a, b)]
+        return np.bincount(pairs.ravel(), minlength=len(points)) + 1, [(a, b)]
     counts = tree.query_ball_point(points, eps, return_length=True)
     return counts, _pairs_in_blocks(tree, counts, eps)
 
@@ -124,23 +124,21 @@ def _pairs_in_blocks(tree: cKDTree, counts: Ints, eps: float) -> Iterator[Pairs]
 
 
 def _join(component: Ints, a: Ints, b: Ints) -> Ints:
-    """Components, numbered below N, after connecting points ``a[k]`` and ``b[k]`` for every k.
+    """Components, numbered below N, after connecting components ``a[k]`` and ``b[k]`` for every k.
 
     Most pairs tell nothing new. If every component follows one partner of lower number, and that one its own to the
     end, nearly all that belongs together has met; the pairs that still connect two components after that are few, and
     are taken in the same way, until there are none.
     """
-    joined = component
     while len(a):
-        a, b = joined[a], joined[b]
-        apart = a != b
-        a, b = a[apart], b[apart]
         follows = np.arange(len(component), dtype=component.dtype)
         follows[np.maximum(a, b)] = np.minimum(a, b)
         while not np.array_equal(follows, further := follows[follows]):
             follows = further
-        joined = follows[joined]
-    return joined
+        component, a, b = follows[component], follows[a], follows[b]
+        apart = a != b
+        a, b = a[apart], b[apart]
+    return component
 
 
 class DBSCAN(torch.nn.Module):
