@@ -37,17 +37,15 @@ def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float)
     """
     if not clouds:
         return []
-    points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
+    # Each coordinate in a row of its own: points are located in half the time.
+    points = torch.cat([cloud.T for cloud in clouds], dim=1).to(torch.float64).T
     pixels, inside = camera.locate(points, _NEAREST)
+    seen = inside.numpy()
     # Pixel centres lie at integers: a cell begins half a pixel before its first.
-    cells = np.floor((pixels.numpy() + 0.5) / _CELL).astype(np.int64)
-    z, seen = points[:, 2].numpy().astype(np.float32), inside.numpy()
-    ends = np.cumsum([len(cloud) for cloud in clouds]).tolist()
-    drawn = []
-    for begin, end in pairwise([0, *ends]):
-        own = seen[begin:end]
-        drawn.append(Silhouette(cells[begin:end][own], z[begin:end][own], camera, spacing))
-    return drawn
+    cells = np.floor((pixels.numpy()[seen] + 0.5) / _CELL).astype(np.int64)
+    z = points[:, 2].numpy()[seen].astype(np.float32)
+    ends = np.concatenate([[0], seen.cumsum()])[np.cumsum([0, *map(len, clouds)])]
+    return [Silhouette(cells[begin:end], z[begin:end], camera, spacing) for begin, end in pairwise(ends.tolist())]
 
 
 class Silhouette:
@@ -62,11 +60,19 @@ class Silhouette:
 
     def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
         self._cells, self._z = cells, z
-        self._gap = 0.0
-        if len(z):
-            middle = len(z) // 2
-            self._gap = spacing * camera.fx / float(np.partition(z, middle)[middle])
-            self._first, self._last = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
+        if len(z) == 0:
+            return
+        middle = len(z) // 2
+        self._gap = spacing * camera.fx / float(np.partition(z, middle)[middle])
+        self._first = cells.min(axis=0)
+        columns, rows = (cells.max(axis=0) - self._first + 1).tolist()
+        # The least of the depths in each cell, and of their opposites: one look around finds nearest and farthest.
+        column, row = (cells - self._first).T
+        least = np.full(2 * rows * columns, _NONE, np.float32)
+        place = 2 * (row * columns + column)
+        np.minimum.at(least, place, z)
+        np.minimum.at(least, place + 1, -z)
+        self._least = least.reshape(rows, columns, 2)
 
     def __call__(
         self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, or_missing: bool = False
@@ -83,31 +89,28 @@ class Silhouette:
         Returns:
             bool, shape :math:`(h, w)`; none where no point is in the image.
         """
-        explained = torch.zeros(depth.shape[1:], dtype=torch.bool)
+        explained = np.zeros(depth.shape[1:], np.bool_)
         if len(self._z) == 0:
-            return explained
+            return torch.from_numpy(explained)
         radius = max(round((margin + self._gap) / _CELL), 1)
         # Nothing is near beyond the radius: all that follows looks at this part of the image only.
-        left, top = (max(first - radius, 0) for first in self._first)
-        right, bottom = (last + radius + 1 for last in self._last)
-        rows, columns = bottom - top, right - left
-        cell = (self._cells[:, 1] - top) * columns + self._cells[:, 0] - left
-        front, back = np.full(rows * columns, _NONE, np.float32), np.full(rows * columns, -_NONE, np.float32)
-        np.minimum.at(front, cell, self._z)
-        np.maximum.at(back, cell, self._z)
+        border = (radius, radius, radius, radius)
+        wide = cv2.copyMakeBorder(self._least, *border, cv2.BORDER_CONSTANT, value=(_NONE, _NONE))
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-        nearest = cv2.erode(front.reshape(rows, columns), around, borderValue=_NONE)
-        farthest = cv2.dilate(back.reshape(rows, columns), around, borderValue=-_NONE)
-        v, of_row = _pixels(top, bottom, step, depth.shape[1])
-        u, of_column = _pixels(left, right, step, depth.shape[2])
+        nearest, opposite = np.moveaxis(cv2.erode(wide, around), 2, 0)
+        left, top = (self._first - radius).tolist()
+        v, of_row = _pixels(top, len(wide), step, depth.shape[1])
+        u, of_column = _pixels(left, wide.shape[1], step, depth.shape[2])
         # Columns first, while there are few rows.
-        low, high = (cells.take(of_column, axis=1).take(of_row, axis=0) for cells in (nearest, farthest))
+        low, high = (
+            cells.take(of_column, axis=1).take(of_row, axis=0) for cells in (nearest - tolerance, tolerance - opposite)
+        )
         z = depth[0].numpy()[v, u]  # NumPy compares in a third of torch's time
-        fits = (z > low - tolerance) & (z < high + tolerance)
+        fits = (z > low) & (z < high)
         if or_missing:
-            fits |= (z <= 0) & (low < _NONE)
-        explained.numpy()[v, u] = fits
-        return explained
+            fits |= (z <= 0) & (low < _NONE / 2)
+        explained[v, u] = fits
+        return torch.from_numpy(explained)
 
     def share_seen(self, depth: Tensor, tolerance: float) -> float:
         """Share of the points where the depth is theirs; 0 where no point is in the image.
@@ -123,7 +126,7 @@ class Silhouette:
         return float((np.abs(depth[0].numpy()[v, u] - self._z) < tolerance).mean())
 
 
-def _pixels(first: int, last: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
-    """Along one axis, which of every n-th pixel lie in the cells from ``first`` to before ``last``, and their cells."""
-    begin, end = -(-first * _CELL // step), min(-(-last * _CELL // step), size)
+def _pixels(first: int, count: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
+    """Along one axis, which of every n-th pixel lie in so many cells from the first on, and in which of them."""
+    begin, end = max(-(-first * _CELL // step), 0), min(-(-(first + count) * _CELL // step), size)
     return slice(begin, end), np.arange(begin, end) * step // _CELL - first
