@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from v3d_torch.camera import PinholeCamera, back_project
+from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import CloudConfig
 from v3d_torch.objects.clusters import largest_clusters
 from v3d_torch.objects.dbscan import dbscan
@@ -60,7 +61,7 @@ class CloudLifter:
 
     def __init__(self, config: CloudConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._rays = camera.rays[:: config.stride, :: config.stride]
+        self._rays = camera.rays[:: config.stride, :: config.stride].reshape(-1, 3).numpy()
 
     def __call__(self, depth: Tensor, instances: Instances) -> ObjectClouds:
         """Lift all instances of a frame at once.
@@ -95,16 +96,11 @@ class CloudLifter:
             Points :math:`(N, P, 3)`, which exist :math:`(N, P)`, and their pixels, numbered row by row, :math:`(N, P)`.
         """
         step = self._config.stride
-        z = depth[:, ::step, ::step]
-        cloud = back_project(z[None], self._rays).reshape(-1, 3)
-        masks = instances.masks[:, ::step, ::step] & (z > 0) & (z <= self._config.max_depth)
-        masks = masks.flatten(1)
-        instance, pixel = torch.nonzero(masks, as_tuple=True)
-        count = masks.sum(dim=1)
-        longest = int(count.max()) if len(instances) else 0
-        place = torch.arange(instance.shape[0]) - (count.cumsum(0) - count)[instance]
-        points = torch.zeros(len(instances), max(longest, 1), 3)
-        points[instance, place] = cloud[pixel]
-        pixels = torch.zeros(len(instances), max(longest, 1), dtype=torch.int64)
-        pixels[instance, place] = pixel
-        return points, torch.arange(max(longest, 1)) < count[:, None], pixels
+        z = depth[0, ::step, ::step].numpy()
+        masks = instances.masks.numpy()[:, ::step, ::step] & ((z > 0) & (z <= self._config.max_depth))
+        count = np.count_nonzero(masks, axis=(1, 2))
+        valid = np.arange(max(count.max(initial=0), 1)) < count[:, None]
+        pixel = np.flatnonzero(masks) % z.size
+        pixels, points = np.zeros(valid.shape, np.int64), np.zeros((*valid.shape, 3), np.float32)
+        pixels[valid], points[valid] = pixel, self._rays[pixel] * z.ravel()[pixel, None]
+        return torch.from_numpy(points), torch.from_numpy(valid), torch.from_numpy(pixels)

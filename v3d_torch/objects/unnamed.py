@@ -42,7 +42,7 @@ def unnamed_instances(
     step, (height, width) = arrivals.stride, depth.shape[-2:]
     came = (arrivals.came == 1).any(dim=0).to(torch.uint8).numpy()
     came = cv2.morphologyEx(came, cv2.MORPH_OPEN, _APART)
-    covered = named.masks[:, ::step, ::step].any(dim=0).to(torch.uint8).numpy()
+    covered = np.asarray(named.masks.numpy()[:, ::step, ::step].any(axis=0), np.uint8)
     came[cv2.dilate(covered, _RIM) > 0] = 0
     count, region = cv2.connectedComponents(came)
     footprint = np.square(depth[0, ::step, ::step].to(torch.float64).numpy() * step) / (camera.fx * camera.fy)
