@@ -60,8 +60,7 @@ class Outliner:
             return track.mask if track.missed else grown(track.mask, config.margin)
         silhouette, distance = self._seen[track]
         tolerance = config.tolerance + config.tolerance_growth * distance**2
-        reached = silhouette(depth, config.reach, tolerance)
-        outline = self._going_on(track, reached) & reached
+        outline = self._going_on(track, silhouette(depth, config.reach, tolerance))
         if track.missed:  # a mask that is predicted by its depth is as it is
             return outline.logical_or_(track.mask)
         explained = silhouette(depth, config.margin, tolerance).logical_or_(self._view.missing)
@@ -71,19 +70,26 @@ class Outliner:
     def _going_on(self, track: Track, reached: Tensor) -> Tensor:
         """Where an object's pixels go on within reach, up to the next edge, bool, shape (H, W)."""
         if self._config.reach == 0:
-            return track.own
+            return track.own & reached
         step = self._stride
         seed = track.own[::step, ::step]
         near = grown(track.mask[::step, ::step], self._config.reach // step)
-        region = (seed | (near & reached[::step, ::step] & self._open)).to(torch.uint8)
-        count, parts = cv2.connectedComponents(region.numpy(), connectivity=4)
+        region = (seed | (near & reached[::step, ::step] & self._open)).view(torch.uint8).numpy()
+        # With a cell to spare, to grow into.
+        left, top, width, height = cv2.boundingRect(region)
+        rows, columns = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
+        count, parts = cv2.connectedComponents(region[rows, columns], connectivity=4)
         size = np.bincount(parts.ravel(), minlength=count)
-        seeds = np.bincount(parts[seed.numpy()], minlength=count)
+        seeds = np.bincount(parts[seed.numpy()[rows, columns]], minlength=count)
         # A surface of which the object is but a small part is what it stands on or leans against.
         taken = seeds >= self._config.least_part * size
         taken[0] = False
+        outline = torch.zeros_like(reached)
+        part = tuple(slice(step * cells.start, step * cells.stop) for cells in (rows, columns))
+        within = reached[part]
         # Up to the edge: the pixels between the last one looked at and it.
-        return enlarged(grown(torch.from_numpy(taken[parts]), 1).numpy(), step, reached.shape)
+        outline[part] = enlarged(grown(torch.from_numpy(taken[parts]), 1).numpy(), step, within.shape) & within
+        return outline
 
 
 def _smooth(view: DepthView, step: int, edge: float) -> Tensor:

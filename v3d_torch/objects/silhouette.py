@@ -97,13 +97,14 @@ class Silhouette:
         border = (radius, radius, radius, radius)
         wide = cv2.copyMakeBorder(self._least, *border, cv2.BORDER_CONSTANT, value=(_NONE, _NONE))
         around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-        nearest, opposite = np.moveaxis(cv2.erode(wide, around), 2, 0)
+        least = cv2.erode(wide, around)
         left, top = (self._first - radius).tolist()
         v, of_row = _pixels(top, len(wide), step, depth.shape[1])
         u, of_column = _pixels(left, wide.shape[1], step, depth.shape[2])
         # Columns first, while there are few rows.
         low, high = (
-            cells.take(of_column, axis=1).take(of_row, axis=0) for cells in (nearest - tolerance, tolerance - opposite)
+            cells.take(of_column, axis=1).take(of_row, axis=0)
+            for cells in (least[..., 0] - tolerance, tolerance - least[..., 1])
         )
         z = depth[0].numpy()[v, u]  # NumPy compares in a third of torch's time
         fits = (z > low) & (z < high)
