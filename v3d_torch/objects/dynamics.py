@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from math import isnan
 
 import torch
 from torch import Tensor
@@ -22,6 +23,8 @@ from v3d_torch.objects.voting import hough_vote
 from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.segmentation.coco import LIVING, PERSON, THINGS, class_name
 from v3d_torch.types import Instances
+
+Pairs = dict[Track, tuple[Sighting, Sighting]]
 
 
 class Verdict(StrEnum):
@@ -111,11 +114,12 @@ class ObjectDynamics:
         stamp = view.stamp
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
         shares = arrivals.shares([track.own for track in tracks], self._config.background.min_points)
-        came = dict(zip(tracks, shares, strict=True))
+        came = dict(zip(tracks, shares.tolist(), strict=True))
         seen = [track for track in tracks if not track.missed]
-        left = self._vacated(seen, view)
-        votes, ballots = self._vote(seen, came, left, stamp)
-        chamfer = self._deform(seen, came, left, stamp)
+        pairs = self._pairs(seen)
+        left = self._vacated(pairs, view)
+        votes, ballots = self._vote(seen, pairs, came, left, stamp)
+        chamfer = self._deform(pairs, came, left, stamp)
         self._last_stamp = stamp
         fits = self._fit(tracks, witnesses)
         verdicts = {track: self._judge(track, came[track], stamp, fits[track]) for track in tracks}
@@ -150,8 +154,21 @@ class ObjectDynamics:
         vouched = witnesses.vouch_for([track.own for track in tracks], config.fit_share, config.fit_least)
         return dict(zip(tracks, vouched.tolist(), strict=True))
 
+    def _pairs(self, tracks: list[Track]) -> dict[float, Pairs]:
+        """For each baseline, the sightings of each object that are compared."""
+        baselines = {*self._config.voting.baselines, self._config.chamfer.baseline}
+        return {
+            baseline: {track: pair for track in tracks if (pair := track.pair(baseline)) is not None}
+            for baseline in baselines
+        }
+
     def _vote(
-        self, tracks: list[Track], came: dict[Track, Tensor], left: dict[Sighting, float], stamp: float
+        self,
+        tracks: list[Track],
+        compared: dict[float, Pairs],
+        came: dict[Track, list[float]],
+        left: dict[Sighting, float],
+        stamp: float,
     ) -> tuple[dict[Track, int], list[tuple[int, int]]]:
         """Votes of each object, the most over all baselines, and who cast them; marks those that are voted dynamic."""
         config, background = self._config.voting, self._config.background
@@ -161,10 +178,12 @@ class ObjectDynamics:
             return most, []
         # What is seen for the first time has no distance that could have changed: the background alone has a vote.
         voted = {
-            track for track in tracks if background.enabled and bool((came[track] >= background.moved_share).any())
+            track
+            for track in tracks
+            if background.enabled and any(share >= background.moved_share for share in came[track])
         }
         for baseline in config.baselines:
-            pairs = {track: pair for track in tracks if (pair := track.pair(baseline)) is not None}
+            pairs = compared[baseline]
             if baseline == 0:  # the frame before: what it has not is not compared (Alg. 1)
                 pairs = {track: pair for track, pair in pairs.items() if pair[0].stamp >= self._last_stamp}
             if not pairs:
@@ -188,46 +207,43 @@ class ObjectDynamics:
         return most, sorted(cast)
 
     def _deform(
-        self, tracks: list[Track], came: dict[Track, Tensor], left: dict[Sighting, float], stamp: float
+        self, compared: dict[float, Pairs], came: dict[Track, list[float]], left: dict[Sighting, float], stamp: float
     ) -> dict[Track, float]:
         """Root mean Chamfer distance of each living object to its own past; marks those that deform."""
         config = self._config.chamfer
         share = self._config.background.deformed_share
         measured: dict[Track, float] = {}
-        for track in tracks if config.enabled else ():
-            pair = track.pair(config.baseline)
-            if pair is None or track.label not in LIVING:
+        for track, (then, now) in compared[config.baseline].items() if config.enabled else ():
+            if track.label not in LIVING:
                 continue
-            then, now = pair
             motion = intra_object_motion(then.cloud[None], now.cloud[None], config.distance_threshold)
             measured[track] = float(motion.distance)
             if motion.deforming and self._has_moved(came[track], left[then], share):
                 track.last_deforming = stamp
         return measured
 
-    def _vacated(self, tracks: list[Track], view: DepthView) -> dict[Sighting, float]:
+    def _vacated(self, compared: dict[float, Pairs], view: DepthView) -> dict[Sighting, float]:
         """Share of its places that each object has left since the sightings that are compared with it now."""
-        baselines = {*self._config.voting.baselines, self._config.chamfer.baseline}
-        pairs = (track.pair(baseline) for track in tracks for baseline in baselines)
-        then = list(dict.fromkeys(pair[0] for pair in pairs if pair is not None))
+        then = list(dict.fromkeys(then for pairs in compared.values() for then, _ in pairs.values()))
         shares = vacated_shares([sighting.cloud for sighting in then], view, self._camera, self._config.background)
         return dict(zip(then, shares.tolist(), strict=True))
 
-    def _has_moved(self, came: Tensor, left: float, share: float) -> bool:
+    def _has_moved(self, came: list[float], left: float, share: float) -> bool:
         """Whether so much of an object has come, or has left its places; always, where the background has no say."""
-        return not self._config.background.enabled or bool((came >= share).any()) or left >= share
+        return not self._config.background.enabled or any(part >= share for part in (*came, left))
 
-    def _judge(self, track: Track, came: Tensor, stamp: float, fits: bool) -> Verdict:
+    def _judge(self, track: Track, came: list[float], stamp: float, fits: bool) -> Verdict:
         config = self._config.mask
         if track.last_dynamic == stamp:
             return Verdict.DYNAMIC
-        filled = came < self._config.background.still_share
+        filled = [share < self._config.background.still_share for share in came]
         # Over every baseline its places were filled: it stands there since the longest of them.
-        still = len(came) > 0 and bool(filled.all())
+        still = len(came) > 0 and all(filled)
         if track.missed and (still or (track.score < config.bridge_score and track.last_dynamic == -torch.inf)):
             return Verdict.STATIC
         # Gaits pause, things do not: one whose places are filled, and are not known to have been empty, is at rest.
-        if track.label in THINGS and bool(filled.any()) and bool((filled | came.isnan()).all()):
+        known = [was for was, share in zip(filled, came, strict=True) if not isnan(share)]
+        if track.label in THINGS and known and all(known):
             return Verdict.STATIC
         if stamp - track.last_dynamic <= config.hold_dynamic and track.evidence >= config.confirm_moving:
             return Verdict.DYNAMIC
