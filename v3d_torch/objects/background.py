@@ -21,7 +21,7 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import BackgroundConfig
-from v3d_torch.lie import invert, se3_log
+from v3d_torch.lie import invert
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class BackgroundWatch:
         if not self._views:
             return DepthView(stamp, depth, T_cw)
         last = self._views[-1]
-        angle = float(se3_log(T_cw @ invert(last.T_cw))[3:].norm())
+        angle = float(np.linalg.norm(cv2.Rodrigues((T_cw @ invert(last.T_cw))[:3, :3].numpy())[0]))
         rate = angle / max(stamp - last.stamp, 1e-3)
         return DepthView(stamp, depth, T_cw, round(self._camera.fx * rate * self._config.sync))
 
