@@ -24,7 +24,7 @@ def huber(squared: Tensor, limit: Tensor | float) -> tuple[Tensor, Tensor]:
         costs rho(s) and weights d rho / d s, both :math:`(M,)`.
     """
     weights = (limit / squared.clamp(min=1e-300)).sqrt().clamp(max=1.0)
-    return torch.where(weights < 1, 2 * weights * squared - limit, squared), weights
+    return squared * weights * (2 - weights), weights  # beyond the limit weights * weights * squared is the limit
 
 
 def student_t(squared: Tensor, freedom: float) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,8 @@ _GENERATORS[(3, 4, 5), (2, 0, 1), (1, 2, 0)] = 1.0
 _GENERATORS[(3, 4, 5), (1, 2, 0), (2, 0, 1)] = -1.0
 _GENERATORS = _GENERATORS.flatten(1)
 
-_TINY = 1e-8  # squared angle below which the limits of the closed forms are exact to float64
+_SMALL = 1e-4  # angle below which the limits of the closed forms are exact to float64
+_TINY = _SMALL**2
 
 
 def invert(T: Tensor) -> Tensor:
@@ -52,14 +53,12 @@ def se3_exp(xi: Tensor) -> Tensor:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
     X = _twist(xi)
-    square = xi[..., 3:].square().sum(dim=-1)[..., None, None]
-    # torch.where evaluates both branches: the 1 keeps the one not taken, and its gradient, finite.
-    safe = torch.where(square < _TINY, 1.0, square)
-    angle = safe.sqrt()
-    b = torch.where(square < _TINY, 1 / 2 - square / 24, 2 * (angle / 2).sin().square() / safe)
-    c = torch.where(square < _TINY, 1 / 6 - square / 120, (angle - angle.sin()) / (safe * angle))
+    # Below, the coefficients are multiplied by next to nothing: those of a small angle are exact enough at any smaller.
+    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL)
+    b = 2 * ((angle / 2).sin() / angle).square()
+    c = (angle - angle.sin()) / angle**3
     X2 = X @ X
-    return torch.eye(4, dtype=xi.dtype) + X + b * X2 + c * (X2 @ X)
+    return (torch.eye(4, dtype=xi.dtype) + X).addcmul(b, X2).addcmul(c, X2 @ X)
 
 
 def se3_log(T: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -66,6 +67,67 @@ def measurements(features: Features, config: TrackingConfig, pyramid: FeaturesCo
     )
 
 
+@dataclass(frozen=True)
+class Whitened:
+    """Measurements as the errors count them: in sigmas, error = ``scale * (x/z, y/z, 1/z) + offset``.
+
+    Attributes:
+        scale: float64, shape :math:`(3, M)`; 0 where no depth was measured.
+        offset: the same, of what was measured.
+    """
+
+    scale: Tensor
+    offset: Tensor
+
+    def errors(self, seen: Tensor) -> Tensor:
+        """Errors of (u, v, 1/z) in sigmas, of points seen at `perspective`, both :math:`(3, M)`."""
+        return torch.addcmul(self.offset, self.scale, seen)
+
+
+def whitened(measured: Measurements, camera: PinholeCamera) -> Whitened:
+    """What makes `perspective` errors. All that is the same wherever the camera is, worked out once."""
+    u, v = measured.uv.unbind(-1)
+    known, sigma = measured.inverse_depth > 0, measured.pixel_sigma
+    inverse_depth = torch.where(known, measured.inverse_depth, 0)
+    return Whitened(
+        scale=torch.stack([camera.fx / sigma, camera.fy / sigma, known.to(u.dtype) / measured.inverse_depth_sigma]),
+        offset=torch.stack(
+            [(camera.cx - u) / sigma, (camera.cy - v) / sigma, inverse_depth / -measured.inverse_depth_sigma]
+        ),
+    )
+
+
+def perspective(points: Tensor) -> Tensor:
+    """(x/z, y/z, 1/z) of points in the camera frame, metres, both :math:`(3, M)`."""
+    w = 1 / points[2:].clamp(min=_NEAREST)
+    return torch.cat([points[:2] * w, w])
+
+
+def perspective_jacobian(seen: Tensor) -> Tensor:
+    """How `perspective` changes when the camera moves, by the left perturbation of ``T_cw``.
+
+    Args:
+        seen: where the points are seen, shape :math:`(3, M)`.
+
+    Returns:
+        Derivatives by translation and rotation, shape :math:`(6, 3, M)`.
+    """
+    constant, linear, turn = (numbers.to(seen.dtype) for numbers in (_CONSTANT, _LINEAR, _TURN))
+    jacobian = torch.addmm(constant, linear, seen).unflatten(0, (6, 3))
+    jacobian[2:5].addcmul_((turn @ seen)[:, None], seen)
+    return jacobian
+
+
+# With (a, b, w) = (x/z, y/z, 1/z) the derivatives by the six perturbations are the rows
+#   (w, 0, 0), (0, w, 0), -w (a, b, w), -b (a, b, w) - (0, 1, 0), a (a, b, w) + (1, 0, 0), (-b, a, 0):
+# constant, linear in (a, b, w), and the products of that with (-w, -b, a). So they take three operations.
+_CONSTANT, _LINEAR = torch.zeros(6, 3, 1, dtype=torch.float64), torch.zeros(6, 3, 3, dtype=torch.float64)
+_CONSTANT[3, 1], _CONSTANT[4, 0] = -1.0, 1.0
+_LINEAR[0, 0, 2], _LINEAR[1, 1, 2], _LINEAR[5, 0, 1], _LINEAR[5, 1, 0] = 1.0, 1.0, -1.0, 1.0
+_CONSTANT, _LINEAR = _CONSTANT.flatten(0, 1), _LINEAR.flatten(0, 1)
+_TURN = torch.tensor([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+
+
 def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
     """Errors of (u, v, 1/z) in standard deviations.
 
@@ -77,16 +139,7 @@ def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) 
     Returns:
         Shape :math:`(M, 3)`, the third 0 where no depth was measured. In memory the observations come last.
     """
-    X, Y, Z = points.unbind(-1)
-    w = 1 / Z.clamp(min=_NEAREST)
-    u, v = measured.uv.unbind(-1)
-    return torch.stack(
-        [
-            (camera.fx * X * w + camera.cx - u) / measured.pixel_sigma,
-            (camera.fy * Y * w + camera.cy - v) / measured.pixel_sigma,
-            torch.where(measured.inverse_depth > 0, w - measured.inverse_depth, 0) / measured.inverse_depth_sigma,
-        ]
-    ).T
+    return whitened(measured, camera).errors(perspective(points.T)).T
 
 
 def reprojection_jacobian(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
@@ -96,30 +149,24 @@ def reprojection_jacobian(points: Tensor, measured: Measurements, camera: Pinhol
         By the left perturbation of ``T_cw``, shape :math:`(M, 3, 6)`. Its first three columns are the Jacobian by
         ``points``. In memory the observations come last.
     """
-    X, Y, Z = points.unbind(-1)
-    w = 1 / Z.clamp(min=_NEAREST)
-    scaled = w / measured.pixel_sigma
-    a, b, o = camera.fx * scaled, camera.fy * scaled, torch.zeros_like(w)
-    d = torch.where(measured.inverse_depth > 0, w * w, 0) / -measured.inverse_depth_sigma
-    ax, by = -a * X * w, -b * Y * w
-    # A small motion moves a point p by translation + rotation x p, and a . (rotation x p) = rotation . (p x a). Number
-    # by number, so that all observations of one lie side by side: three times as fast as row by row.
-    jacobian = torch.stack(
-        [
-            *(a, o, o),
-            *(o, b, o),
-            *(ax, by, d),
-            *(Y * ax, Y * by - Z * b, Y * d),
-            *(Z * a - X * ax, -X * by, -X * d),
-            *(-Y * a, X * b, o),
-        ]
-    )
-    return jacobian.unflatten(0, (6, 3)).permute(2, 1, 0)
+    scale = whitened(measured, camera).scale
+    return (perspective_jacobian(perspective(points.T)) * scale).permute(2, 1, 0)
 
 
 def chi_square(points: Tensor, residuals: Tensor) -> Tensor:
     """Squared error of each observation in sigmas, :math:`(M,)`; infinite for points that are not in front."""
     return torch.where(points[:, 2] > _NEAREST, (residuals * residuals).sum(dim=-1), torch.inf)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A camera's pose, and the errors there. The N observations come last."""
+
+    T_cw: Tensor  # (4, 4)
+    in_camera: Tensor  # (3, N), metres
+    seen: Tensor  # (3, N), as `perspective` gives it
+    errors: Tensor  # (3, N), sigmas
+    squared: Tensor  # (N,)
 
 
 @dataclass(frozen=True)
@@ -130,13 +177,17 @@ class PoseRefinement:
         T_cw: world to camera, float64, shape :math:`(4, 4)`.
         inliers: observations that agree with it, bool, shape :math:`(N,)`.
         chi2: squared error of each in sigmas, float64, shape :math:`(N,)`; infinite behind the camera.
-        information: inverse covariance of the pose's left perturbation, float64, shape :math:`(6, 6)`.
     """
 
     T_cw: Tensor
     inliers: Tensor
     chi2: Tensor
-    information: Tensor
+    _system: Callable[[], tuple[Tensor, Tensor]]
+
+    @property
+    def information(self) -> Tensor:
+        """Inverse covariance of the pose's left perturbation, float64, shape :math:`(6, 6)`."""
+        return self._system()[0]
 
 
 @torch.no_grad()
@@ -162,39 +213,36 @@ def refine_pose(
     Returns:
         The pose; the prediction itself, without inliers, where nothing supports any pose.
     """
+    target, limits = whitened(measured, camera), measured.limit
 
-    def linearise(T_cw: Tensor, kept: Tensor, limit: Tensor | float) -> tuple[float, _Errors]:
-        in_camera = points @ T_cw[:3, :3].T + T_cw[:3, 3]
-        residuals = reprojection(in_camera, measured, camera)
-        costs, weights = huber((residuals * residuals).sum(dim=-1), limit)
-        return float((costs * kept).sum()), _Errors(in_camera, residuals, weights * kept)
+    def view(T_cw: Tensor) -> _View:
+        in_camera = torch.addmm(T_cw[:3, 3:], T_cw[:3, :3], points.T)
+        seen = perspective(in_camera)
+        errors = target.errors(seen)
+        return _View(T_cw, in_camera, seen, errors, (errors * errors).sum(dim=0))
 
-    def normal_equations(at: _Errors) -> tuple[Tensor, Tensor]:
-        J = reprojection_jacobian(at.in_camera, measured, camera).permute(2, 1, 0).flatten(1)  # as it lies in memory
-        weighted = J * at.weights.repeat(3)
-        return weighted @ J.T, weighted @ at.residuals.T.flatten()
+    def weigh(at: _View, kept: Tensor, limit: Tensor | float) -> tuple[float, Tensor]:
+        costs, weights = huber(at.squared, limit)
+        return float(costs @ kept), weights * kept
 
-    def step(T_cw: Tensor, at: _Errors, damping: float) -> Tensor:
-        H, gradient = normal_equations(at)
-        diagonal = damping * H.diagonal() + 1e-9  # solvable even where nothing is seen
-        return se3_exp(-torch.linalg.solve(H + diagonal.diag(), gradient)) @ T_cw
+    def normal_equations(at: _View, weights: Tensor) -> tuple[Tensor, Tensor]:
+        J, weighted = perspective_jacobian(at.seen).flatten(1), weights * target.scale
+        return (J * (weighted * target.scale).flatten()) @ J.T, J @ (weighted * at.errors).flatten()
 
-    inliers = torch.ones(points.shape[0], dtype=torch.bool)
+    def step(at: _View, weights: Tensor, damping: float) -> _View:
+        H, gradient = normal_equations(at, weights)
+        H.diagonal().mul_(1 + damping).add_(1e-9)  # solvable even where nothing is seen
+        return view(se3_exp(-torch.linalg.solve(H, gradient)) @ at.T_cw)
+
+    at, inliers = view(T_cw), torch.ones(points.shape[0], dtype=torch.bool)
     for turn in range(rounds):
         robust = 2 * turn < rounds
-        problem = partial(linearise, kept=inliers, limit=measured.limit if robust else torch.inf)
+        problem = partial(weigh, kept=inliers.to(points.dtype), limit=limits if robust else torch.inf)
         # Convergence is quadratic: after a step that gained a thousandth nothing worth a step is left.
-        found = levenberg_marquardt(T_cw, problem, step, iterations, tolerance=1e-3)
-        T_cw, before = found.state, inliers
-        chi2 = chi_square(found.system.in_camera, found.system.residuals)
-        inliers = chi2 <= measured.limit
+        found = levenberg_marquardt(at, problem, step, iterations, tolerance=1e-3)
+        at, before = found.state, inliers
+        chi2 = chi_square(at.in_camera.T, at.errors.T)
+        inliers = chi2 <= limits
         if not robust and torch.equal(inliers, before):
             break
-    return PoseRefinement(rigid(T_cw), inliers, chi2, normal_equations(found.system)[0])
-
-
-@dataclass(frozen=True)
-class _Errors:
-    in_camera: Tensor  # (M, 3), metres
-    residuals: Tensor  # (M, 3), sigmas
-    weights: Tensor  # (M,), 0 for outliers
+    return PoseRefinement(rigid(at.T_cw), inliers, chi2, partial(normal_equations, at, found.system))
