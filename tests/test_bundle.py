@@ -15,10 +15,9 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.levenberg import huber
 from v3d_torch.lie import invert, se3_exp, se3_log
 from v3d_torch.mapping.bundle import (
+    Bundle,
     Observations,
     bundle_adjust,
-    errors_at,
-    normal_equations,
     solve_normal_equations,
 )
 from v3d_torch.odometry.refine import reprojection
@@ -90,9 +89,9 @@ def test_step_equals_dense_solution() -> None:
     expected = torch.linalg.solve(H + damping * H.diagonal().diag(), -weighted @ r.flatten())
 
     state = scene.start, scene.start_points
-    _, errors = errors_at(state, scene.observations, CAMERA)
-    system = normal_equations(state, errors, scene.observations, CAMERA, free)
-    xi, shift = solve_normal_equations(system, damping)
+    bundle = Bundle(scene.observations, CAMERA, ~torch.isin(torch.arange(4), free), points=12)
+    _, errors = bundle.errors_at(state)
+    xi, shift = solve_normal_equations(errors.normal_equations, damping)
     torch.testing.assert_close(torch.cat([xi.flatten(), shift.flatten()]), expected, rtol=1e-7, atol=1e-9)
 
 

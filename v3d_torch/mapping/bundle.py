@@ -9,7 +9,7 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -17,7 +17,14 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.levenberg import huber, levenberg_marquardt
 from v3d_torch.lie import se3_exp
-from v3d_torch.odometry.refine import Measurements, chi_square, reprojection, reprojection_jacobian
+from v3d_torch.odometry.refine import (
+    Measurements,
+    Whitened,
+    chi_square,
+    perspective,
+    perspective_jacobian,
+    whitened,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,19 +64,28 @@ class BundleResult:
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors at some poses and points. In all that follows the observations come last.
+    """The errors at some poses and points. In all that follows the observations come last, sorted as in `Bundle`.
 
     Attributes:
         in_camera: point of each observation in its camera, metres, shape :math:`(3, M)`.
+        seen: where, as `perspective` gives it, shape :math:`(3, M)`.
         R: rotations from the world into its camera, shape :math:`(3, 3, M)`.
         residuals: in sigmas, shape :math:`(3, M)`.
         weights: of Huber's kernel, shape :math:`(M,)`.
+        bundle: they are of.
     """
 
     in_camera: Tensor
+    seen: Tensor
     R: Tensor
     residuals: Tensor
     weights: Tensor
+    bundle: Bundle
+
+    @cached_property
+    def normal_equations(self) -> NormalEquations:
+        """The robust cost linearised, once for however many steps are tried from there."""
+        return self.bundle.linearise(self)
 
 
 @dataclass(frozen=True)
@@ -118,58 +134,80 @@ def bundle_adjust(
     Returns:
         Poses and points at the least robust cost found.
     """
-    free = torch.nonzero(~fixed)[:, 0]
-    problem = partial(errors_at, observations=observations, camera=camera)
-    step = partial(_step, observations=observations, camera=camera, free=free)
-    found = levenberg_marquardt((T_cw, points), problem, step, iterations, tolerance)
+    bundle = Bundle(observations, camera, fixed, len(points))
+    found = levenberg_marquardt((T_cw, points), bundle.errors_at, bundle.step, iterations, tolerance)
     T_cw, points = found.state
-    chi2 = chi_square(found.system.in_camera.T, found.system.residuals.T)
+    chi2 = bundle.as_given(chi_square(found.system.in_camera.T, found.system.residuals.T))
     return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations)
 
 
-def errors_at(state: State, observations: Observations, camera: PinholeCamera) -> tuple[float, Errors]:
-    """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""
-    T_cw, points = state
-    T = T_cw[:, :3].flatten(1).T[:, observations.pose].unflatten(0, (3, 4))
-    R = T[:, :3]
-    in_camera = (R * points.T[:, observations.point]).sum(dim=1) + T[:, 3]
-    residuals = reprojection(in_camera.T, observations, camera).T
-    costs, weights = huber((residuals * residuals).sum(dim=0), observations.limit)
-    return float(costs.sum()), Errors(in_camera, R, residuals, weights)
-
-
-def normal_equations(
-    state: State, errors: Errors, observations: Observations, camera: PinholeCamera, free: Tensor
-) -> NormalEquations:
-    """Linearise the robust cost.
+class Bundle:
+    """The least-squares problem. Its observations are sorted: those of free poses first, pose by pose.
 
     Args:
-        state: K poses and P points.
-        errors: there.
         observations: of the points by the poses.
         camera: intrinsics.
-        free: indices of the poses that may move, int64, shape :math:`(F,)`.
+        fixed: poses that stay as they are, bool, shape :math:`(K,)`.
+        points: how many there are.
     """
-    poses, points = map(len, state)
-    by_pose = reprojection_jacobian(errors.in_camera.T, observations, camera).permute(2, 1, 0)
-    by_point = _inner(errors.R.transpose(0, 1), by_pose[:3].transpose(0, 1))
-    residuals = errors.residuals[None]
-    V = _inner(by_point * errors.weights, torch.cat([by_point, residuals]))
 
-    row = torch.full((poses,), -1)
-    row[free] = torch.arange(len(free))
-    pose = row[observations.pose]
-    by_free = torch.nonzero(pose >= 0)[:, 0]
-    pose, by_pose = pose[by_free], by_pose[..., by_free]
-    weighted = by_pose * errors.weights[by_free]
-    U = _inner(weighted, torch.cat([by_pose, residuals[..., by_free]]))
-    return NormalEquations(
-        U=_sum_by(pose, len(free), U).permute(2, 0, 1),
-        V=_sum_by(observations.point, points, V),
-        W=_inner(by_point[..., by_free], weighted),
-        pose=pose,
-        point=observations.point[by_free],
-    )
+    def __init__(self, observations: Observations, camera: PinholeCamera, fixed: Tensor, points: int) -> None:
+        self._points = points
+        self._free = torch.nonzero(~fixed)[:, 0]
+        row = torch.full((len(fixed),), len(self._free))
+        row[self._free] = torch.arange(len(self._free))
+        self._row, self._order = row[observations.pose].sort(stable=True)
+        self._counts = torch.bincount(self._row, minlength=len(self._free))[: len(self._free)].tolist()
+        self._pose, self._point = observations.pose[self._order], observations.point[self._order]
+        target = whitened(observations, camera)
+        self._target = Whitened(target.scale[:, self._order], target.offset[:, self._order])
+        self._limit = observations.limit[self._order]
+
+    def as_given(self, of_each: Tensor) -> Tensor:
+        """Numbers of the sorted observations, (M,), in the order in which these were given."""
+        return torch.empty_like(of_each).index_copy_(0, self._order, of_each)
+
+    def errors_at(self, state: State) -> tuple[float, Errors]:
+        """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""
+        T_cw, points = state
+        T = _columns(T_cw[:, :3].flatten(1).T, self._pose).unflatten(0, (3, 4))
+        x, y, z = _columns(points.T.contiguous(), self._point)
+        in_camera = T[:, 3].addcmul(T[:, 0], x).addcmul_(T[:, 1], y).addcmul_(T[:, 2], z)
+        seen = perspective(in_camera)
+        residuals = self._target.errors(seen)
+        costs, weights = huber((residuals * residuals).sum(dim=0), self._limit)
+        return float(costs.sum()), Errors(in_camera, seen, T[:, :3], residuals, weights, self)
+
+    def linearise(self, errors: Errors) -> NormalEquations:
+        """The robust cost linearised at some errors."""
+        root, free = errors.weights.sqrt(), sum(self._counts)
+        by_pose = perspective_jacobian(errors.seen) * (self._target.scale * root)
+        by_point = _inner(errors.R.transpose(0, 1), by_pose[:3].transpose(0, 1))
+        residuals = (errors.residuals * root)[None]
+        V = _inner(by_point, torch.cat([by_point, residuals]))
+        by_pose = by_pose[..., :free]
+        # Pose by pose, as the errors of one lie side by side: adding up outer products of single errors takes long.
+        of_each = torch.cat([by_pose, residuals[..., :free]]).split(self._counts, dim=-1)
+        U = [rows[None, :6] @ rows.T for rows in (of_one.flatten(1) for of_one in of_each)]
+        index = self._point.expand(12, -1)
+        return NormalEquations(
+            U=torch.cat([V.new_zeros(0, 6, 7), *U]),
+            V=V.new_zeros(12, self._points).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, 4)),
+            W=_inner(by_point[..., :free], by_pose),
+            pose=self._row[:free],
+            point=self._point[:free],
+        )
+
+    def step(self, state: State, errors: Errors, damping: float) -> State:
+        """The state after a damped Gauss-Newton step from errors there."""
+        T_cw, points = state
+        xi, moved = solve_normal_equations(errors.normal_equations, damping)
+        return T_cw.index_copy(0, self._free, se3_exp(xi) @ T_cw[self._free]), points + moved
+
+
+def _columns(rows: Tensor, index: Tensor) -> Tensor:
+    """Columns of (n, K) chosen by (M,), shape (n, M); to gather by an index for each takes a quarter of indexing."""
+    return rows.gather(1, index.expand(len(rows), -1))
 
 
 def _inner(a: Tensor, b: Tensor) -> Tensor:
@@ -179,13 +217,6 @@ def _inner(a: Tensor, b: Tensor) -> Tensor:
     """
     total = a[:, None, 0] * b[:, 0]
     return total.addcmul_(a[:, None, 1], b[:, 1]).addcmul_(a[:, None, 2], b[:, 2])
-
-
-def _sum_by(index: Tensor, count: int, blocks: Tensor) -> Tensor:
-    """Sums of those blocks (n, m, N) that have the same index, (n, m, count)."""
-    rows = blocks.flatten(0, 1)
-    sums = rows.new_zeros(len(rows), count).scatter_add_(1, index.expand(len(rows), -1), rows)
-    return sums.unflatten(0, blocks.shape[:2])
 
 
 def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Tensor, Tensor]:
@@ -205,7 +236,7 @@ def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Ten
     U, V = _damp(system.U[..., :6].permute(1, 2, 0), damping), _damp(system.V[:, :3], damping)
     L = _cholesky(V)
     h = _forward(L, system.V[:, 3])
-    blocks = _forward(L[:, :, system.point], system.W)
+    blocks = _forward(_columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
     # Y is dense, as a local map is small and most poses see much of it; transposed, so that its blocks lie apart.
     place = (
         (18 * P * system.pose + system.point) + P * torch.arange(3)[:, None, None] + 3 * P * torch.arange(6)[:, None]
@@ -251,12 +282,3 @@ def _forward(L: Tensor, b: Tensor) -> Tensor:
 def _backward(L: Tensor, b: Tensor) -> Tensor:
     """Solve L^T x = b."""
     return _forward(L.transpose(0, 1).flip(0, 1), b.flip(0)).flip(0)
-
-
-def _step(
-    state: State, errors: Errors, damping: float, observations: Observations, camera: PinholeCamera, free: Tensor
-) -> State:
-    T_cw, points = state
-    xi, moved = solve_normal_equations(normal_equations(state, errors, observations, camera, free), damping)
-    T_cw = T_cw.index_copy(0, free, se3_exp(xi) @ T_cw[free])
-    return T_cw, points + moved
