@@ -11,6 +11,9 @@ from torch import Tensor
 _CELL = 8.0
 """Side of the cells in which features are looked up, pixels: about half a search radius."""
 
+_BITS = 1 << 9
+"""More than descriptors differ by."""
+
 
 def hamming(a: Tensor, b: Tensor) -> Tensor:
     """Hamming distance of descriptors row by row.
@@ -22,8 +25,12 @@ def hamming(a: Tensor, b: Tensor) -> Tensor:
     Returns:
         Bits that differ, int64, shape :math:`(N,)`.
     """
-    differing = np.bitwise_xor(a.contiguous().numpy().view(np.uint64), b.contiguous().numpy().view(np.uint64))
-    return torch.from_numpy(np.bitwise_count(differing).sum(axis=1, dtype=np.int64))
+    return torch.from_numpy(np.bitwise_count(_words(a) ^ _words(b))).sum(dim=1)
+
+
+def _words(descriptors: Tensor) -> NDArray[np.uint64]:
+    """Descriptors (N, 32) as four numbers each, (N, 4)."""
+    return descriptors.contiguous().numpy().view(np.uint64)
 
 
 def match_descriptors(a: Tensor, b: Tensor, *, max_hamming: int, max_ratio: float) -> Tensor:
@@ -86,63 +93,65 @@ def match_near(
     Returns:
         Pairs (landmark, feature), each at most once, int64, shape :math:`(K, 2)`, sorted by landmark.
     """
-    landmark, feature = _near(projected, radius, uv)
-    alike = (levels[landmark] - octave[feature]).abs() <= 1
+    landmark, feature = _near(projected.numpy(), radius.numpy(), uv.numpy())
+    alike = np.flatnonzero(np.abs(levels.numpy()[landmark] - octave.numpy()[feature]) <= 1)
     landmark, feature = landmark[alike], feature[alike]
-    if landmark.shape[0] == 0:
-        return torch.zeros(0, 2, dtype=torch.int64)
-    distance = hamming(descriptors[landmark], candidates[feature])
+    ours, theirs = (torch.from_numpy(of_each) for of_each in (landmark, feature))
+    # Rows by index_select: plain indexing takes nine times as long for them.
+    distance = hamming(descriptors.index_select(0, ours), candidates.index_select(0, theirs)).numpy()
 
-    infinite = 1 << 20
-    best = torch.full((projected.shape[0],), infinite).scatter_reduce_(0, landmark, distance, "amin")
-    is_best = distance == best[landmark]
-    second = torch.full((projected.shape[0],), infinite)
-    second = second.scatter_reduce_(0, landmark, torch.where(is_best, infinite, distance), "amin")
-    tied = torch.zeros(projected.shape[0], dtype=torch.int64).scatter_add_(0, landmark, is_best.long()) > 1
-    second = torch.where(tied, best, second)
-    keep = is_best & (distance <= max_hamming) & (distance <= max_ratio * second[landmark])
-    landmark, feature, distance = landmark[keep], feature[keep], distance[keep]
+    # The best of each landmark, and the second best; the pairs come sorted by landmark.
+    order = np.argsort(landmark * _BITS + distance, kind="stable")
+    landmark, feature, distance = landmark[order], feature[order], distance[order]
+    following = np.append(np.where(landmark[1:] == landmark[:-1], distance[1:], np.inf), np.inf)[: len(order)]
+    clear = _first(landmark) & (distance <= max_hamming) & (distance <= max_ratio * following)
+    landmark, feature, distance = landmark[clear], feature[clear], distance[clear]
 
     # A feature goes to the landmark it resembles most; ties to the lower index, so that the order is defined.
-    rank = distance * projected.shape[0] + landmark
-    winner = torch.full((uv.shape[0],), rank.max().item() + 1 if rank.shape[0] else 0)
-    winner = winner.scatter_reduce_(0, feature, rank, "amin")
-    keep = rank == winner[feature]
-    return torch.stack([landmark[keep], feature[keep]], dim=1)
+    order = np.lexsort((landmark, distance, feature))
+    kept = np.sort(order[_first(feature[order])])
+    return torch.from_numpy(np.stack([landmark[kept], feature[kept]], axis=1))
 
 
-def _near(centre: Tensor, radius: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+def _first(ordered: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Where a number stands for the first time in a sorted row of them, (N,)."""
+    return np.concatenate([np.ones(len(ordered[:1]), dtype=np.bool_), ordered[1:] != ordered[:-1]])
+
+
+def _near(
+    centre: NDArray[np.float64], radius: NDArray[np.float64], uv: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Every pair of a centre (L, 2) and a place (N, 2) within its radius (L,), sorted by centre.
 
     Places are sorted into the cells of a grid: those of neighbouring cells of a row stand side by side.
     """
     if not len(centre) or not len(uv):
-        none = torch.zeros(0, dtype=torch.int64)
-        return none, none
-    origin = uv.amin(dim=0)
-    last_column, last_row = _cell(uv.amax(dim=0), origin).tolist()
-    column, row = _cell(uv, origin).unbind(dim=1)
-    key, order = torch.sort(row * (last_column + 1) + column)
-    low, high = _cell(centre - radius[:, None], origin), _cell(centre + radius[:, None], origin)
-    beside = torch.zeros(2, dtype=torch.int64), torch.tensor([last_column, last_row])
-    in_grid = ((high >= beside[0]) & (low <= beside[1])).all(dim=1)
-    (left, top), (right, bottom) = (cells.clamp(*beside).unbind(dim=1) for cells in (low, high))
-    owner, rows = _ranges(top, torch.where(in_grid, bottom + 1, top))
-    first, last = (rows * (last_column + 1) + cells[owner] for cells in (left, right))
-    of_owner, place = _ranges(torch.searchsorted(key, first), torch.searchsorted(key, last, right=True))
-    owner = owner[of_owner]
-    # Column by column: a gather of pairs, and the sum of each, would take three times as long.
-    off = ((uv[order, axis])[place] - centre[:, axis].contiguous()[owner] for axis in (0, 1))
-    near = sum(difference * difference for difference in off) <= radius.square()[owner]
-    return owner[near], order[place[near]]
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    origin = uv.min(axis=0)
+    column, row = _cell(uv, origin)
+    last_column, last_row = column.max(), row.max()
+    width = last_column + 1
+    key = row * width + column
+    order = np.argsort(key, kind="stable")
+    begin = np.append(0, np.bincount(key, minlength=width * (last_row + 1)).cumsum())  # of each cell in that order
+    (left, top), (right, bottom) = (_cell(centre + side * radius[:, None], origin) for side in (-1, 1))
+    left, top = np.maximum(left, 0), np.maximum(top, 0)
+    right, bottom = np.minimum(right, last_column), np.minimum(bottom, last_row)
+    owner, rows = _ranges(top, np.where(left <= right, bottom + 1, top))
+    of_owner, place = _ranges(begin[rows * width + left[owner]], begin[rows * width + right[owner] + 1])
+    owner, place = owner[of_owner], order[place]
+    u, v = (uv[:, axis].take(place) - centre[:, axis].take(owner) for axis in (0, 1))
+    near = np.flatnonzero(u * u + v * v <= (radius * radius)[owner])
+    return owner[near], place[near]
 
 
-def _cell(places: Tensor, origin: Tensor) -> Tensor:
-    return ((places - origin) / _CELL).floor().to(torch.int64)
+def _cell(places: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Columns and rows of the cells that places (N, 2) are in, (2, N)."""
+    return np.floor((places - origin) / _CELL).astype(np.int64).T
 
 
-def _ranges(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+def _ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The numbers from ``first`` to before ``last`` of every row, one row after the other, and whose they are."""
-    count = last - first
-    owner = torch.arange(len(first)).repeat_interleave(count)
-    return owner, torch.arange(len(owner)) - (count.cumsum(0) - count - first)[owner]
+    count = np.maximum(last - first, 0)
+    owner = np.repeat(np.arange(len(count)), count)
+    return owner, np.arange(len(owner)) - (count.cumsum() - count - first)[owner]
