@@ -17,6 +17,29 @@ _GENERATORS[(3, 4, 5), (2, 0, 1), (1, 2, 0)] = 1.0
 _GENERATORS[(3, 4, 5), (1, 2, 0), (2, 0, 1)] = -1.0
 _GENERATORS = _GENERATORS.flatten(1)
 
+# 4 q q^T of the quaternion q = (w, x, y, z) of a rotation, less the identity, is made of its nine numbers, row by row.
+_SQUARES = torch.tensor(
+    [
+        [1, 0, 0, 0, 1, 0, 0, 0, 1],  # ww
+        [0, 0, 0, 0, 0, -1, 0, 1, 0],  # wx
+        [0, 0, 1, 0, 0, 0, -1, 0, 0],  # wy
+        [0, -1, 0, 1, 0, 0, 0, 0, 0],  # wz
+        [0, 0, 0, 0, 0, -1, 0, 1, 0],  # xw
+        [1, 0, 0, 0, -1, 0, 0, 0, -1],  # xx
+        [0, 1, 0, 1, 0, 0, 0, 0, 0],  # xy
+        [0, 0, 1, 0, 0, 0, 1, 0, 0],  # xz
+        [0, 0, 1, 0, 0, 0, -1, 0, 0],  # yw
+        [0, 1, 0, 1, 0, 0, 0, 0, 0],  # yx
+        [-1, 0, 0, 0, 1, 0, 0, 0, -1],  # yy
+        [0, 0, 0, 0, 0, 1, 0, 1, 0],  # yz
+        [0, -1, 0, 1, 0, 0, 0, 0, 0],  # zw
+        [0, 0, 1, 0, 0, 0, 1, 0, 0],  # zx
+        [0, 0, 0, 0, 0, 1, 0, 1, 0],  # zy
+        [-1, 0, 0, 0, -1, 0, 0, 0, 1],  # zz
+    ],
+    dtype=torch.float64,
+).T
+
 _SMALL = 1e-4  # angle below which the limits of the closed forms are exact to float64
 _TINY = _SMALL**2
 
@@ -89,17 +112,8 @@ def _twist(xi: Tensor) -> Tensor:
 
 def _so3_log(R: Tensor) -> Tensor:
     """Rotation vectors, :math:`(..., 3, 3)` to :math:`(..., 3)`, by way of quaternions: well conditioned up to pi."""
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in R.unbind(-2))
     # The sixteen numbers 4 q q^T of the quaternion q = (w, x, y, z): each row a multiple of q, the longest the safest.
-    rows = torch.stack(
-        [
-            *(1 + a + e + i, h - f, c - g, d - b),
-            *(h - f, 1 + a - e - i, b + d, c + g),
-            *(c - g, b + d, 1 - a + e - i, f + h),
-            *(d - b, c + g, f + h, 1 - a - e + i),
-        ],
-        dim=-1,
-    ).unflatten(-1, (4, 4))
+    rows = (R.flatten(-2) @ _SQUARES.to(R.dtype)).unflatten(-1, (4, 4)) + torch.eye(4, dtype=R.dtype)
     longest = rows.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
     q = torch.take_along_dim(rows, longest[..., None, None], dim=-2)[..., 0, :]
     q = q / q.norm(dim=-1, keepdim=True)

@@ -7,6 +7,7 @@ tells nothing new, but costs memory, and time in each adjustment.
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from v3d_torch.config import MappingConfig
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
@@ -23,11 +24,13 @@ def cull_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfi
     neighbours = sparse_map.covisible(newest.seen, config.bundle_keyframes).tolist()
     around = _Neighbourhood(sparse_map, neighbours)
     carriers: dict[int, int] = {}
+    shares = around.redundancy(config.redundant_views)
     for index in neighbours:
-        if index in (0, newest.index) or around.redundancy(index, config.redundant_views) <= config.redundant_share:
+        if index in (0, newest.index) or shares[index] <= config.redundant_share:
             continue
         carriers[index] = around.nearest(index)
         around.drop(index)
+        shares = around.redundancy(config.redundant_views)
         carriers = {gone: carriers.get(carrier, carrier) for gone, carrier in carriers.items()}
     if carriers:
         sparse_map.retire(carriers)
@@ -44,16 +47,16 @@ class _Neighbourhood:
         rows = usable & theirs[table["landmark"]]
         self._keyframe, self._octave = table["keyframe"][rows], table["octave"][rows]
         self._landmarks, self._landmark = table["landmark"][rows].unique(return_inverse=True)
-        self._levels = sparse_map.features.levels
+        self._levels, self._keyframes = sparse_map.features.levels, len(sparse_map.keyframes)
 
-    def redundancy(self, keyframe: int, views: int) -> float:
-        """Share of a keyframe's landmarks that so many others see on its level of scale, the next or a finer one."""
-        own = self._keyframe == keyframe
-        place = self._landmark[~own] * self._levels + self._octave[~own]
+    def redundancy(self, views: int) -> Tensor:
+        """Share of each keyframe's landmarks that so many others see on its level of scale, the next or a finer one."""
+        place = self._landmark * self._levels + self._octave
         counts = torch.bincount(place, minlength=len(self._landmarks) * self._levels)
         up_to = counts.view(-1, self._levels).cumsum(dim=1)
-        seen_by = up_to[self._landmark[own], (self._octave[own] + 1).clamp(max=self._levels - 1)]
-        return float((seen_by >= views).double().mean()) if len(seen_by) else 0.0
+        others = up_to[self._landmark, (self._octave + 1).clamp(max=self._levels - 1)] - 1
+        enough = torch.bincount(self._keyframe[others >= views], minlength=self._keyframes)
+        return enough / torch.bincount(self._keyframe, minlength=self._keyframes).clamp(min=1)
 
     def nearest(self, keyframe: int) -> int:
         """The other keyframe that shares most landmarks with one; of those that share as many, the newest."""

@@ -199,13 +199,11 @@ class SparseMap:
             landmarks: ids, ascending, int64, shape :math:`(L,)`.
         """
         ids = landmarks[self.landmarks["alive"][landmarks]]
-        return LocalMap(
-            ids=ids,
-            points=self.landmarks["point"][ids],
-            directions=self.landmarks["direction"][ids],
-            reach=self.landmarks["reach"][ids],
-            descriptors=self.landmarks["descriptor"][ids],
+        # Rows by index_select: plain indexing takes up to nine times as long for them.
+        point, direction, reach, descriptor = (
+            self.landmarks[name].index_select(0, ids) for name in ("point", "direction", "reach", "descriptor")
         )
+        return LocalMap(ids, point, direction, reach, descriptor)
 
     def covisibility(self, least: int) -> Tensor:
         """Pairs (i, j), i < j, of keyframes that share at least so many landmarks, and consecutive ones of those kept.
@@ -245,7 +243,7 @@ class SparseMap:
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
-    def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> None:
+    def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> Tensor:
         """Let features of a keyframe show landmarks that turned out to be behind them.
 
         A feature without a landmark becomes an observation of it. Where it has another, the two become one, unless some
@@ -254,12 +252,15 @@ class SparseMap:
         Args:
             keyframe: whose features were found again.
             landmarks: id of the known landmark behind each of its features, -1 for none, int64, shape :math:`(N,)`.
+
+        Returns:
+            What every landmark of the map has become, itself most often, int64, shape :math:`(L,)`.
         """
-        known = (landmarks >= 0) & ~torch.isin(landmarks, keyframe.landmarks)
+        known = (landmarks >= 0) & ~self._among(landmarks, keyframe.seen)
         double = known & (keyframe.landmarks >= 0)
         self._observe(keyframe, torch.nonzero(known & ~double)[:, 0], landmarks)
         one, other = keyframe.landmarks[double], landmarks[double]
-        self._merge(torch.minimum(one, other), torch.maximum(one, other))
+        return self._merge(torch.minimum(one, other), torch.maximum(one, other))
 
     def _observe(self, keyframe: Keyframe, features: Tensor, landmarks: Tensor) -> None:
         """Note which landmarks, given for all features of a keyframe, are behind some of them, given by indices."""
@@ -275,8 +276,17 @@ class SparseMap:
             valid=torch.ones_like(features, dtype=torch.bool),
         )
 
-    def _merge(self, kept: Tensor, gone: Tensor) -> None:
-        """Let landmarks become others that they turned out to be; the ids are all different, shape (L,) each."""
+    def _among(self, landmarks: Tensor, some: Tensor) -> Tensor:
+        """Which landmarks are among some: by a table of all of them, as `torch.isin` would sort. -1 stands for none."""
+        table = torch.zeros(len(self.landmarks) + 1, dtype=torch.bool)
+        return table.index_fill_(0, some, True)[landmarks]
+
+    def _merge(self, kept: Tensor, gone: Tensor) -> Tensor:
+        """Let landmarks become others that they turned out to be; the ids are all different, shape (M,) each.
+
+        Returns:
+            What every landmark has become, (L,): some stay apart.
+        """
         becomes = torch.arange(len(self.landmarks))
         becomes[gone] = kept
         touched = torch.zeros_like(becomes, dtype=torch.bool)
@@ -284,10 +294,11 @@ class SparseMap:
         rows = torch.nonzero(self.observations["valid"] & touched[self.observations["landmark"]])[:, 0]
         keyframe, landmark = self.observations["keyframe"][rows], self.observations["landmark"][rows]
         places, times = (keyframe * len(becomes) + becomes[landmark]).unique(return_counts=True)
-        apart = ~torch.isin(kept, places[times > 1] % len(becomes))
-        kept, gone = kept[apart], gone[apart]
+        side_by_side = self._among(kept, places[times > 1] % len(becomes))
+        becomes[gone[side_by_side]] = gone[side_by_side]
+        kept, gone = kept[~side_by_side], gone[~side_by_side]
 
-        moves = torch.isin(landmark, gone)
+        moves = becomes[landmark] != landmark
         rows, keyframe, landmark = rows[moves], keyframe[moves], becomes[landmark[moves]]
         self.observations["landmark"][rows] = landmark
         feature = self.observations["feature"][rows]
@@ -297,6 +308,7 @@ class SparseMap:
         for counted in ("found", "visible"):
             self.landmarks[counted][kept] += self.landmarks[counted][gone]
         self.landmarks["alive"][gone] = False
+        return becomes
 
     def forget(self, rows: Tensor) -> None:
         """Take back observations that do not fit, given by their rows in the table."""
