@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.geometry.calibration import distort_points
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -86,7 +84,13 @@ class PinholeCamera:
         Returns:
             Shape :math:`(N, 2)`, float64, without gradients.
         """
-        return self._bend(uv, _undistorted)
+        uv = uv.to(torch.float64)
+        if not self.is_distorted or uv.shape[0] == 0:
+            return uv
+        # With the strong lens of TUM's fr1 the corners need up to 20 steps, and a millionth of a pixel is enough.
+        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
+        lens = np.array(self.distortion)
+        return torch.from_numpy(cv2.undistortImagePoints(uv.numpy(), self.K.numpy(), lens, None, until)).view_as(uv)
 
     def distort(self, uv: Tensor) -> Tensor:
         """Pixels of an ideal pinhole camera to pixels of the image as delivered: the inverse of `undistort`.
@@ -97,14 +101,24 @@ class PinholeCamera:
         Returns:
             Shape :math:`(N, 2)`, float64.
         """
-        return self._bend(uv, distort_points)
+        focal, centre = self._focal_and_centre
+        return self._image((uv.to(torch.float64) - centre) / focal) if self.is_distorted else uv.to(torch.float64)
 
-    def _bend(self, uv: Tensor, lens: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Tensor:
-        uv = uv.to(torch.float64)
-        if not self.is_distorted or uv.shape[0] == 0:
-            return uv
-        coefficients = torch.tensor(self.distortion, dtype=torch.float64)
-        return lens(uv[None], self.K[None], coefficients[None])[0]
+    @cached_property
+    def _focal_and_centre(self) -> Tensor:
+        """Focal lengths and principal point, float64, shape (2, 2)."""
+        return torch.tensor([[self.fx, self.fy], [self.cx, self.cy]], dtype=torch.float64)
+
+    def _image(self, slope: Tensor) -> Tensor:
+        """Directions (x / z, y / z) to pixels as delivered, by the Brown model, both (N, 2) and float64."""
+        focal, centre = self._focal_and_centre
+        if self.is_distorted:
+            k1, k2, p1, p2, k3 = self.distortion
+            tangential = slope.new_tensor([p2, p1])
+            square = slope.square().sum(dim=1, keepdim=True)
+            radial = 1 + square * (k1 + square * (k2 + square * k3))
+            slope = slope * (radial + 2 * (slope @ tangential)[:, None]) + square * tangential
+        return slope * focal + centre
 
     def project(self, points: Tensor) -> Tensor:
         """Points in the camera frame to undistorted pixels.
@@ -138,13 +152,16 @@ class PinholeCamera:
         Returns:
             (u, v), float64, shape :math:`(P, 2)`, and bool, shape :math:`(P,)`.
         """
-        before = points[:, 2] > min_depth
-        slope = torch.where(before[:, None], points[:, :2] / points[:, 2:], torch.inf)
+        slope = points[:, :2] / points[:, 2:]
         low, high = self._field
-        seen = ((slope >= low) & (slope <= high)).all(dim=1)
-        pixels = self.distort(self.project(torch.where(seen[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))))
-        u, v = pixels.unbind(dim=1)
-        return pixels, seen & (u >= -0.5) & (v >= -0.5) & (u < self.width - 0.5) & (v < self.height - 0.5)
+        seen = (points[:, 2] > min_depth) & ((slope >= low) & (slope <= high)).all(dim=1)
+        pixels = self._image(torch.where(seen[:, None], slope, 0.0).to(torch.float64))
+        return pixels, seen & ((pixels >= -0.5) & (pixels < self._size - 0.5)).all(dim=1)
+
+    @cached_property
+    def _size(self) -> Tensor:
+        """Width and height, pixels, float64, shape (2,)."""
+        return torch.tensor([self.width, self.height], dtype=torch.float64)
 
     def lift(self, uv: Tensor, depth: Tensor) -> Tensor:
         """Undistorted pixels with their depth to points in the camera frame.
@@ -171,13 +188,6 @@ class PinholeCamera:
         pixels = self.undistort(torch.stack([u, v], dim=-1).reshape(-1, 2))
         ones = torch.ones(pixels.shape[0], dtype=torch.float64)
         return self.lift(pixels, ones).reshape(self.height, self.width, 3).to(torch.float32)
-
-
-def _undistorted(uv: Tensor, K: Tensor, lens: Tensor) -> Tensor:
-    """Pixels without the lens, all :math:`(1, N, ...)`: by OpenCV, which takes a tenth of the time of kornia's."""
-    # With the strong lens of TUM's fr1 the corners need up to 20 steps, and a millionth of a pixel is enough.
-    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
-    return torch.from_numpy(cv2.undistortImagePoints(uv.numpy(), K[0].numpy(), lens.numpy(), None, until)).view_as(uv)
 
 
 def back_project(depth: Tensor, rays: Tensor) -> Tensor:
