@@ -93,7 +93,7 @@ def match_near(
     Returns:
         Pairs (landmark, feature), each at most once, int64, shape :math:`(K, 2)`, sorted by landmark.
     """
-    landmark, feature = _near(projected.numpy(), radius.numpy(), uv.numpy())
+    landmark, feature = _near(projected.T.contiguous().numpy(), radius.numpy(), uv.T.contiguous().numpy())
     alike = np.flatnonzero(np.abs(levels.numpy()[landmark] - octave.numpy()[feature]) <= 1)
     landmark, feature = landmark[alike], feature[alike]
     ours, theirs = (torch.from_numpy(of_each) for of_each in (landmark, feature))
@@ -121,33 +121,34 @@ def _first(ordered: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _near(
     centre: NDArray[np.float64], radius: NDArray[np.float64], uv: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every pair of a centre (L, 2) and a place (N, 2) within its radius (L,), sorted by centre.
+    """Every pair of a centre (2, L) and a place (2, N) within its radius (L,), sorted by centre.
 
     Places are sorted into the cells of a grid: those of neighbouring cells of a row stand side by side.
     """
-    if not len(centre) or not len(uv):
+    if not centre.size or not uv.size:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    origin = uv.min(axis=0)
-    column, row = _cell(uv, origin)
+    origin = uv.min(axis=1, keepdims=True)
+    column, row = _cell(uv - origin)
     last_column, last_row = column.max(), row.max()
-    width = last_column + 1
+    width, count = last_column + 1, len(row)
     key = row * width + column
-    order = np.argsort(key, kind="stable")
+    order = np.sort(key * count + np.arange(count)) % count  # by key: numbers sort five times as fast as indices
     begin = np.append(0, np.bincount(key, minlength=width * (last_row + 1)).cumsum())  # of each cell in that order
-    (left, top), (right, bottom) = (_cell(centre + side * radius[:, None], origin) for side in (-1, 1))
+    (left, top), (right, bottom) = _cell(centre - origin - radius), _cell(centre - origin + radius)
     left, top = np.maximum(left, 0), np.maximum(top, 0)
     right, bottom = np.minimum(right, last_column), np.minimum(bottom, last_row)
     owner, rows = _ranges(top, np.where(left <= right, bottom + 1, top))
-    of_owner, place = _ranges(begin[rows * width + left[owner]], begin[rows * width + right[owner] + 1])
+    rows *= width
+    of_owner, place = _ranges(begin[rows + left[owner]], begin[rows + right[owner] + 1])
     owner, place = owner[of_owner], order[place]
-    u, v = (uv[:, axis].take(place) - centre[:, axis].take(owner) for axis in (0, 1))
-    near = np.flatnonzero(u * u + v * v <= (radius * radius)[owner])
+    u, v = (uv[axis].take(place) - centre[axis].take(owner) for axis in (0, 1))
+    near = np.flatnonzero(u * u + v * v <= (radius * radius).take(owner))
     return owner[near], place[near]
 
 
-def _cell(places: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Columns and rows of the cells that places (N, 2) are in, (2, N)."""
-    return np.floor((places - origin) / _CELL).astype(np.int64).T
+def _cell(places: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Columns and rows of the cells that places, counted from the first, are in, both (2, N)."""
+    return np.floor(places / _CELL).astype(np.int64)
 
 
 def _ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
