@@ -47,6 +47,13 @@ def test_undistortion_inverts_opencvs_distortion() -> None:
     assert np.abs(FR1.undistort(torch.from_numpy(bent)).numpy() - ideal).max() < 1e-5
 
 
+def test_distortion_is_opencvs() -> None:
+    ideal = torch.rand(200, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 480
+    rays = FR1.lift(ideal, torch.ones(200, dtype=torch.float64)).numpy()
+    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
+    torch.testing.assert_close(FR1.distort(ideal), torch.from_numpy(bent), rtol=0, atol=1e-9)
+
+
 def test_undistortion_of_nothing_is_nothing() -> None:
     assert FR1.undistort(torch.zeros(0, 2)).shape == (0, 2)
 

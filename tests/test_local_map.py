@@ -18,7 +18,7 @@ from v3d_torch.mapping.adjust import adjust_locally
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.recorder import Estimate, Status
-from v3d_torch.mapping.table import Table
+from v3d_torch.mapping.table import Table, distinct
 from v3d_torch.odometry.orb import Features
 from v3d_torch.odometry.tracker import Tracking
 from v3d_torch.types import RGBDFrame
@@ -67,6 +67,13 @@ def test_table_keeps_what_is_appended(counts: list[int]) -> None:
     assert len(table) == len(expected)
     assert torch.equal(table["place"], expected)
     assert table["number"].tolist() == [number for count in counts for number in range(count)]
+
+
+@given(st.lists(st.integers(0, 30), max_size=40))
+def test_distinct_numbers_are_those_of_unique(numbers_: list[int]) -> None:
+    given_ = torch.tensor(numbers_, dtype=torch.int64)
+    for ours, theirs in zip(distinct(given_, 31), given_.unique(return_inverse=True), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_a_column_is_a_view_and_rows_are_whole() -> None:

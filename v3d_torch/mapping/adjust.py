@@ -12,6 +12,7 @@ from v3d_torch.config import Config
 from v3d_torch.lie import rigid
 from v3d_torch.mapping.bundle import Observations, bundle_adjust
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.table import distinct
 from v3d_torch.odometry.refine import pixel_sigma
 
 
@@ -60,14 +61,14 @@ def adjust_locally(
     rows = _observations_around(sparse_map, window)
     if len(window) < 2 or len(rows) == 0:
         return None
-    poses, pose = table["keyframe"][rows].unique(return_inverse=True)
-    landmarks, point = table["landmark"][rows].unique(return_inverse=True)
+    poses, pose = distinct(table["keyframe"][rows], len(sparse_map.keyframes))
+    landmarks, point = distinct(table["landmark"][rows], len(sparse_map.landmarks))
     T_cw = sparse_map.T_cw
     fixed = ~torch.isin(poses, window) | (poses == 0)
     if not fixed.any():
         fixed[0] = True  # the oldest, else the neighbourhood as a whole could drift
     observations = Observations(
-        uv=table["uv"][rows],
+        uv=table["uv"].index_select(0, rows),
         inverse_depth=table["inverse_depth"][rows],
         pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
         inverse_depth_sigma=config.tracking.inverse_depth_sigma,

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from v3d_torch.config import MappingConfig
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.table import distinct
 
 
 def cull_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfig) -> None:
@@ -46,13 +47,14 @@ class _Neighbourhood:
         theirs[table["landmark"][usable & torch.isin(table["keyframe"], torch.tensor(keyframes))]] = True
         rows = usable & theirs[table["landmark"]]
         self._keyframe, self._octave = table["keyframe"][rows], table["octave"][rows]
-        self._landmarks, self._landmark = table["landmark"][rows].unique(return_inverse=True)
+        landmarks, self._landmark = distinct(table["landmark"][rows], len(sparse_map.landmarks))
+        self._landmarks = len(landmarks)
         self._levels, self._keyframes = sparse_map.features.levels, len(sparse_map.keyframes)
 
     def redundancy(self, views: int) -> Tensor:
         """Share of each keyframe's landmarks that so many others see on its level of scale, the next or a finer one."""
         place = self._landmark * self._levels + self._octave
-        counts = torch.bincount(place, minlength=len(self._landmarks) * self._levels)
+        counts = torch.bincount(place, minlength=self._landmarks * self._levels)
         up_to = counts.view(-1, self._levels).cumsum(dim=1)
         others = up_to[self._landmark, (self._octave + 1).clamp(max=self._levels - 1)] - 1
         enough = torch.bincount(self._keyframe[others >= views], minlength=self._keyframes)

@@ -50,3 +50,17 @@ class Table:
         """Drop all rows but those where ``rows``, bool, is true; the others move up, and keep their order."""
         self._columns = {name: column[rows] for name, column in self.columns.items()}
         self._length = int(rows.sum())
+
+
+def distinct(numbers: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """What `torch.unique` tells of whole numbers from 0 to below ``count``, without sorting them.
+
+    Args:
+        numbers: int64, shape :math:`(N,)`.
+        count: beyond the greatest that there may be.
+
+    Returns:
+        The different ones, ascending, int64, shape :math:`(D,)`, and where each number is among them, :math:`(N,)`.
+    """
+    there = torch.zeros(count, dtype=torch.bool).index_fill_(0, numbers, True)
+    return torch.nonzero(there)[:, 0], (there.cumsum(0) - 1).index_select(0, numbers)
