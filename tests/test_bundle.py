@@ -18,8 +18,8 @@ from v3d_torch.mapping.bundle import (
     Bundle,
     Observations,
     bundle_adjust,
-    solve_normal_equations,
 )
+from v3d_torch.mapping.schur import solve_normal_equations
 from v3d_torch.odometry.refine import reprojection
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)

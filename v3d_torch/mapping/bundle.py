@@ -17,6 +17,7 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.levenberg import huber, levenberg_marquardt
 from v3d_torch.lie import se3_exp
+from v3d_torch.mapping.schur import NormalEquations, columns, solve_normal_equations
 from v3d_torch.odometry.refine import (
     Measurements,
     Whitened,
@@ -88,25 +89,6 @@ class Errors:
         return self.bundle.linearise(self)
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    r"""Blocks of :math:`J^T W J` and, behind the last column of the square ones, of :math:`J^T W r`.
-
-    Attributes:
-        U: pose by pose, for F free poses, shape :math:`(F, 6, 7)`.
-        V: point by point, shape :math:`(3, 4, P)`.
-        W: point by pose, for each of the N observations by free poses, shape :math:`(3, 6, N)`.
-        pose: which of the free poses that is, int64, shape :math:`(N,)`.
-        point: which point, int64, shape :math:`(N,)`.
-    """
-
-    U: Tensor
-    V: Tensor
-    W: Tensor
-    pose: Tensor
-    point: Tensor
-
-
 State = tuple[Tensor, Tensor]  # T_cw (K, 4, 4), points (P, 3)
 
 
@@ -170,8 +152,8 @@ class Bundle:
     def errors_at(self, state: State) -> tuple[float, Errors]:
         """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""
         T_cw, points = state
-        T = _columns(T_cw[:, :3].flatten(1).T, self._pose).unflatten(0, (3, 4))
-        x, y, z = _columns(points.T.contiguous(), self._point)
+        T = columns(T_cw[:, :3].flatten(1).T, self._pose).unflatten(0, (3, 4))
+        x, y, z = columns(points.T.contiguous(), self._point)
         in_camera = T[:, 3].addcmul(T[:, 0], x).addcmul_(T[:, 1], y).addcmul_(T[:, 2], z)
         seen = perspective(in_camera)
         residuals = self._target.errors(seen)
@@ -205,11 +187,6 @@ class Bundle:
         return T_cw.index_copy(0, self._free, se3_exp(xi) @ T_cw[self._free]), points + moved
 
 
-def _columns(rows: Tensor, index: Tensor) -> Tensor:
-    """Columns of (n, K) chosen by (M,), shape (n, M); to gather by an index for each takes a quarter of indexing."""
-    return rows.gather(1, index.expand(len(rows), -1))
-
-
 def _inner(a: Tensor, b: Tensor) -> Tensor:
     """Sums over the errors of products of derivatives, (A, 3, M) and (B, 3, M) to (A, B, M).
 
@@ -217,68 +194,3 @@ def _inner(a: Tensor, b: Tensor) -> Tensor:
     """
     total = a[:, None, 0] * b[:, 0]
     return total.addcmul_(a[:, None, 1], b[:, 1]).addcmul_(a[:, None, 2], b[:, 2])
-
-
-def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Tensor, Tensor]:
-    r"""Minimise the quadratic model with :math:`\lambda` times its diagonal added, by the Schur complement.
-
-    With :math:`V = L L^T` and :math:`Y = L^{-1} W`, the points are gone from
-    :math:`(U - Y^T Y)\, \xi = -g_{pose} + Y^T L^{-1} g_{point}`.
-
-    Args:
-        system: of F poses and P points.
-        damping: :math:`\lambda`; keeps directions that nothing observes (a point seen once, without depth) in place.
-
-    Returns:
-        Steps of the poses, shape :math:`(F, 6)`, and of the points, shape :math:`(P, 3)`.
-    """
-    F, P = system.U.shape[0], system.V.shape[-1]
-    U, V = _damp(system.U[..., :6].permute(1, 2, 0), damping), _damp(system.V[:, :3], damping)
-    L = _cholesky(V)
-    h = _forward(L, system.V[:, 3])
-    blocks = _forward(_columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
-    # Y is dense, as a local map is small and most poses see much of it; transposed, so that its blocks lie apart.
-    place = (
-        (18 * P * system.pose + system.point) + P * torch.arange(3)[:, None, None] + 3 * P * torch.arange(6)[:, None]
-    )
-    Yt = blocks.new_zeros(18 * F * P).scatter_add_(0, place.flatten(), blocks.flatten()).view(6 * F, 3 * P)
-    S = -(Yt @ Yt.T)
-    S.view(F, 6, F, 6).diagonal(dim1=0, dim2=2).add_(U)
-    xi = torch.linalg.solve(S, Yt @ h.flatten() - system.U[..., 6].flatten())
-    moved = _backward(L, -(h + (Yt.T @ xi).view(3, P)))
-    return xi.view(F, 6), moved.T
-
-
-def _damp(blocks: Tensor, damping: float) -> Tensor:
-    """Blocks (n, n, count) with more on their diagonals."""
-    # Next to information of 1e4 per square metre and more, 1e-6 is nothing; a block that nothing observes needs it.
-    blocks = blocks.clone()
-    diagonal = blocks.diagonal(dim1=0, dim2=1)
-    diagonal.mul_(1 + damping).add_(1e-6)
-    return blocks
-
-
-def _cholesky(V: Tensor) -> Tensor:
-    """Lower triangles of positive definite 3x3 blocks, both :math:`(3, 3, P)`: LAPACK takes longer for small ones."""
-    L = torch.zeros_like(V)
-    for row in range(3):
-        for column in range(row + 1):
-            rest = V[row, column] - (L[row, :column] * L[column, :column]).sum(dim=0)
-            L[row, column] = rest.sqrt() if row == column else rest / L[column, column]
-    return L
-
-
-def _forward(L: Tensor, b: Tensor) -> Tensor:
-    """Solve L x = b, block by block, for :math:`(3, 3, N)` and :math:`(3, ..., N)`."""
-    x = torch.empty_like(b)
-    for row in range(3):
-        x[row] = b[row]
-        for column in range(row):
-            x[row].addcmul_(L[row, column], x[column], value=-1)
-        x[row] /= L[row, row]
-    return x
-
-
-def _backward(L: Tensor, b: Tensor) -> Tensor:
-    """Solve L^T x = b."""
-    return _forward(L.transpose(0, 1).flip(0, 1), b.flip(0)).flip(0)

@@ -51,6 +51,7 @@ class NeighbourSearch:
         """Let keyframes show those landmarks that they see without knowing."""
         now = torch.arange(len(sparse_map.landmarks))  # what each has become with the keyframes before
         for keyframe, found in zip(keyframes, self._find(sparse_map, landmarks, keyframes), strict=True):
+            # Two that were found may have become one: it is behind the first of the features.
             _, first = np.unique(torch.where(found >= 0, now[found], -1), return_index=True)
             once = torch.full_like(found, -1).index_copy_(0, torch.from_numpy(first), found[first])
             now = sparse_map.fuse(keyframe, torch.where(once >= 0, now[once], -1))[now]
