@@ -84,19 +84,6 @@ def test_landmarks_of_one_point_become_one_the_oldest() -> None:
     assert room.map.shared(torch.tensor(oldest)).tolist() == 3 * [len(doubled)]
 
 
-def test_fusing_tells_what_landmarks_have_become() -> None:
-    room = Room(2)
-    first = room.map.keyframes[0]
-    theirs = torch.full_like(first.landmarks, -1)
-    points = [SHARED, SHARED + 1]
-    pairs = [sorted(room.landmarks_of(point)) for point in points]
-    for point, (_, other) in zip(points, pairs, strict=True):
-        theirs[room.seen[0] == point] = other
-    becomes = room.map.fuse(first, theirs)
-    assert [becomes[pair].tolist() for pair in pairs] == [[one, one] for one, _ in pairs]
-    assert int((becomes != torch.arange(len(becomes))).sum()) == 2
-
-
 def test_counts_of_what_was_found_add_up() -> None:
     room = Room(2)
     one, other = sorted(room.landmarks_of(SHARED))

@@ -184,6 +184,11 @@ class SparseMap:
         seeing = self.observations["keyframe"][self.observations["valid"] & wanted[self.observations["landmark"]]]
         return torch.bincount(seeing, minlength=len(self.keyframes))
 
+    def among(self, landmarks: Tensor, some: Tensor) -> Tensor:
+        """Which landmarks are among some, bool: by a table of all, as `torch.isin` would sort. -1 stands for none."""
+        table = torch.zeros(len(self.landmarks) + 1, dtype=torch.bool)
+        return table.index_fill_(0, some, True)[landmarks]
+
     def local(self, landmarks: Tensor, count: int) -> LocalMap:
         """What a frame may see that saw ``landmarks`` just now: all that its ``count`` best keyframes see."""
         chosen = torch.zeros(len(self.keyframes), dtype=torch.bool)
@@ -243,7 +248,7 @@ class SparseMap:
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
-    def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> Tensor:
+    def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> None:
         """Let features of a keyframe show landmarks that turned out to be behind them.
 
         A feature without a landmark becomes an observation of it. Where it has another, the two become one, unless some
@@ -252,15 +257,12 @@ class SparseMap:
         Args:
             keyframe: whose features were found again.
             landmarks: id of the known landmark behind each of its features, -1 for none, int64, shape :math:`(N,)`.
-
-        Returns:
-            What every landmark of the map has become, itself most often, int64, shape :math:`(L,)`.
         """
-        known = (landmarks >= 0) & ~self._among(landmarks, keyframe.seen)
+        known = (landmarks >= 0) & ~self.among(landmarks, keyframe.seen)
         double = known & (keyframe.landmarks >= 0)
         self._observe(keyframe, torch.nonzero(known & ~double)[:, 0], landmarks)
         one, other = keyframe.landmarks[double], landmarks[double]
-        return self._merge(torch.minimum(one, other), torch.maximum(one, other))
+        self._merge(torch.minimum(one, other), torch.maximum(one, other))
 
     def _observe(self, keyframe: Keyframe, features: Tensor, landmarks: Tensor) -> None:
         """Note which landmarks, given for all features of a keyframe, are behind some of them, given by indices."""
@@ -276,17 +278,8 @@ class SparseMap:
             valid=torch.ones_like(features, dtype=torch.bool),
         )
 
-    def _among(self, landmarks: Tensor, some: Tensor) -> Tensor:
-        """Which landmarks are among some: by a table of all of them, as `torch.isin` would sort. -1 stands for none."""
-        table = torch.zeros(len(self.landmarks) + 1, dtype=torch.bool)
-        return table.index_fill_(0, some, True)[landmarks]
-
-    def _merge(self, kept: Tensor, gone: Tensor) -> Tensor:
-        """Let landmarks become others that they turned out to be; the ids are all different, shape (M,) each.
-
-        Returns:
-            What every landmark has become, (L,): some stay apart.
-        """
+    def _merge(self, kept: Tensor, gone: Tensor) -> None:
+        """Let landmarks become others that they turned out to be; the ids are all different, shape (L,) each."""
         becomes = torch.arange(len(self.landmarks))
         becomes[gone] = kept
         touched = torch.zeros_like(becomes, dtype=torch.bool)
@@ -294,7 +287,7 @@ class SparseMap:
         rows = torch.nonzero(self.observations["valid"] & touched[self.observations["landmark"]])[:, 0]
         keyframe, landmark = self.observations["keyframe"][rows], self.observations["landmark"][rows]
         places, times = (keyframe * len(becomes) + becomes[landmark]).unique(return_counts=True)
-        side_by_side = self._among(kept, places[times > 1] % len(becomes))
+        side_by_side = self.among(kept, places[times > 1] % len(becomes))
         becomes[gone[side_by_side]] = gone[side_by_side]
         kept, gone = kept[~side_by_side], gone[~side_by_side]
 
@@ -308,7 +301,6 @@ class SparseMap:
         for counted in ("found", "visible"):
             self.landmarks[counted][kept] += self.landmarks[counted][gone]
         self.landmarks["alive"][gone] = False
-        return becomes
 
     def forget(self, rows: Tensor) -> None:
         """Take back observations that do not fit, given by their rows in the table."""

@@ -35,27 +35,21 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class Projection:
-    """Landmarks as they should appear in some views.
+    """Landmarks as they should appear in an image.
 
     Attributes:
-        view: of which each is in sight, int64, shape :math:`(S,)`.
-        rows: of the local map, int64, shape :math:`(S,)`.
-        pixels: shape :math:`(S, 2)`.
-        levels: of the scale pyramid, int64, shape :math:`(S,)`.
+        rows: of the local map, those in view, int64, shape :math:`(V,)`.
+        pixels: shape :math:`(V, 2)`.
+        levels: of the scale pyramid, int64, shape :math:`(V,)`.
     """
 
-    view: Tensor
     rows: Tensor
     pixels: Tensor
     levels: Tensor
 
-    def __getitem__(self, keep: Tensor) -> Projection:
-        """Those chosen by a boolean mask."""
-        return Projection(self.view[keep], self.rows[keep], self.pixels[keep], self.levels[keep])
-
 
 class GuidedSearch:
-    """Finds landmarks among the features of views whose poses are about known.
+    """Finds landmarks among the features of a view whose pose is about known.
 
     Args:
         config: what counts as alike.
@@ -90,49 +84,31 @@ class GuidedSearch:
         Returns:
             Each landmark and each feature at most once, int64, shape :math:`(K, 2)`.
         """
-        seen = self.project(T_cw[None], local)
-        pairs = self.match(features, torch.zeros(len(features), dtype=torch.int64), seen, local, radius)
-        return torch.stack([seen.rows[pairs[:, 0]], pairs[:, 1]], dim=1)
-
-    def project(self, T_cw: Tensor, local: LocalMap) -> Projection:
-        """The landmarks that cameras at ``T_cw``, :math:`(V, 4, 4)`, should see, about as they were seen before."""
-        R = T_cw[:, :3, :3]
-        points, directions = R @ local.points.T + T_cw[:, :3, 3:], R @ local.directions.T  # V x 3 x L
-        distance = points.square().sum(dim=1).sqrt()
-        z = points[:, 2]
-        u, v = ((self._camera.K[:2] @ points) / z[:, None]).unbind(dim=1)
-        cosine = (points * directions).sum(dim=1) / distance
-        level = torch.log(local.reach / distance) / math.log(self._scale)
-        found = torch.stack([z, u, v, cosine, level], dim=1)
-        in_sight = ((found >= self._least) & (found < self._beyond)).all(dim=1)
-        view, rows = in_sight.nonzero().unbind(dim=1)
-        _, u, v, _, level = found.permute(1, 0, 2)[:, in_sight]
-        levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
-        return Projection(view, rows, torch.stack([u, v], dim=1), levels)
-
-    def match(self, features: Features, view: Tensor, seen: Projection, local: LocalMap, radius: float) -> Tensor:
-        """Pairs (landmark in sight, feature) that lie near each other in a view and look alike.
-
-        Args:
-            features: of all views.
-            view: that each is from, int64, shape :math:`(N,)`.
-            seen: landmarks in sight of the views.
-            local: they are rows of.
-            radius: around their projections, pixels at level 0; grows with the level.
-
-        Returns:
-            Each landmark at most once in a view and each feature at most once, int64, shape :math:`(K, 2)`.
-        """
-        # Side by side, with room between them: so all views are searched like one.
-        aside = torch.tensor([2.0 * self._camera.width, 0.0], dtype=torch.float64)
-        return match_near(
-            seen.pixels + seen.view[:, None] * aside,
+        seen = self.project(T_cw, local)
+        pairs = match_near(
+            seen.pixels,
             radius * self._scale ** seen.levels.to(torch.float64),
             seen.levels,
             local.descriptors.index_select(0, seen.rows),
-            features.uv + view[:, None] * aside,
+            features.uv,
             features.octave,
             features.descriptors,
             max_hamming=self._config.max_hamming,
             max_ratio=self._config.max_ratio,
         )
+        return torch.stack([seen.rows[pairs[:, 0]], pairs[:, 1]], dim=1)
+
+    def project(self, T_cw: Tensor, local: LocalMap) -> Projection:
+        """The landmarks that a camera at ``T_cw`` should see, about as they were seen before."""
+        R = T_cw[:3, :3]
+        points, directions = torch.addmm(T_cw[:3, 3:], R, local.points.T), R @ local.directions.T  # 3 x L
+        distance = points.square().sum(dim=0).sqrt()
+        z = points[2]
+        u, v = (self._camera.K[:2] @ points) / z
+        cosine = (points * directions).sum(dim=0) / distance
+        level = torch.log(local.reach / distance) / math.log(self._scale)
+        found = torch.stack([z, u, v, cosine, level])
+        rows = torch.nonzero(((found >= self._least) & (found < self._beyond)).all(dim=0))[:, 0]
+        _, u, v, _, level = found.index_select(1, rows)
+        levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
+        return Projection(rows, torch.stack([u, v], dim=1), levels)

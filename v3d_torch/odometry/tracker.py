@@ -78,7 +78,7 @@ class MapTracker:
         landmark, feature = pairs[found.inliers].unbind(dim=1)
         ids = torch.full((len(features),), -1, dtype=torch.int64)
         ids[feature] = local.ids[landmark]
-        return Tracking(found.T_cw, ids, local.ids[self._search.project(found.T_cw[None], local).rows])
+        return Tracking(found.T_cw, ids, local.ids[self._search.project(found.T_cw, local).rows])
 
     def _refine(
         self, features: Features, T_cw: Tensor, local: LocalMap, pairs: Tensor, *, rounds: int
