@@ -238,8 +238,8 @@ def refine_pose(
     for turn in range(rounds):
         robust = 2 * turn < rounds
         problem = partial(weigh, kept=inliers.to(points.dtype), limit=limits if robust else torch.inf)
-        # Convergence is quadratic: after a step that gained a hundredth, a hundredth of a standard deviation is left.
-        found = levenberg_marquardt(at, problem, step, iterations, tolerance=1e-2)
+        # Convergence is quadratic: after a step that gained a thousandth nothing worth a step is left.
+        found = levenberg_marquardt(at, problem, step, iterations, tolerance=1e-3)
         at, before = found.state, inliers
         chi2 = chi_square(at.in_camera.T, at.errors.T)
         inliers = chi2 <= limits
