@@ -36,6 +36,7 @@ from v3d_torch.mapping.recorder import Status
 CONFIGURATIONS = {
     "full": [],
     "baseline": ["--segmenter", "none"],
+    "global_shutter": ["--config", "global_shutter"],
     "paper": ["--config", "paper"],
 }
 

@@ -48,6 +48,7 @@ def test_a_camera_that_turns_among_walkers_needs_to_know_who_moves(run: Run) -> 
     metrics, without = run("crowd_rpy"), run("crowd_rpy", "--segmenter", "none")
     assert metrics["frames"] == 180
     assert metrics["ate"]["rmse"] < 0.03
+    assert abs(metrics["readout"]) < 0.002  # a rendered camera has no rolling shutter
     assert metrics["ate"]["rmse"] < 0.6 * without["ate"]["rmse"]
     assert metrics["lost"] + metrics["adrift"] == 0
 
@@ -56,4 +57,5 @@ def test_fast_turns_before_a_desk(run: Run) -> None:
     """TUM's fr1_rpy: real noise, real blur, a strong lens."""
     metrics = run("fr1_rpy")
     assert metrics["frames"] == 694
-    assert metrics["ate"]["rmse"] < 0.05
+    assert metrics["ate"]["rmse"] < 0.015  # ORB-SLAM2 and 3, which know no rolling shutter: 0.021
+    assert 0.018 < metrics["readout"] < 0.032

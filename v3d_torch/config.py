@@ -346,6 +346,20 @@ class MappingConfig(Section):
     deviations: a small part of one is left to gain, and the next keyframe goes on from there."""
 
 
+class ShutterConfig(Section):
+    """The rolling shutter of the colour camera: its rows are read one after the other."""
+
+    enabled: bool = True
+    """Off: all rows are taken for read at once."""
+    readout: float = Field(0.015, ge=-0.05, le=0.05)
+    """Time from the first row to the last, seconds, that the first keyframes are taken with; then the map tells. Half
+    of the time between two frames, which is most that there can be: a Kinect has 0.026, a rendered image 0."""
+    sigma: float = Field(0.015, gt=0)
+    """How sure that is, standard deviation, seconds."""
+    keyframes: int = Field(20, ge=0)
+    """So many keyframes ask the map, and then every tenth: each time takes three bundle adjustments."""
+
+
 class MeshConfig(Section):
     """The triangle mesh of what stands still."""
 
@@ -415,6 +429,7 @@ class Config(Section):
     motion: MotionConfig = MotionConfig()
     dense: DenseConfig = DenseConfig()
     tracking: TrackingConfig = TrackingConfig()
+    shutter: ShutterConfig = ShutterConfig()
     mapping: MappingConfig = MappingConfig()
     loop: LoopConfig = LoopConfig()
     dense_map: DenseMapConfig = DenseMapConfig()

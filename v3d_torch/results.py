@@ -151,6 +151,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "known_keyframes": sum(keyframe.known for keyframe in slam.mapper.map.kept),
         "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
         "loops": slam.loops.count,
+        "readout": slam.mapper.map.readout.seconds,
         "failure": failure,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,

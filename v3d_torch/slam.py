@@ -26,6 +26,7 @@ from v3d_torch.objects.witnesses import Witnesses
 from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, View
 from v3d_torch.odometry.orb import ORB
+from v3d_torch.odometry.shutter import RollingShutter
 from v3d_torch.odometry.tracker import MapTracker
 from v3d_torch.percept import Percept, Tracked
 from v3d_torch.segmentation import make_segmenter
@@ -84,6 +85,7 @@ class V3DSLAM:
         self.watch = BackgroundWatch(config.objects.background, camera)
         self.propose = partial(unnamed_instances, camera=camera, min_area=config.objects.background.min_area)
         self.judge = ObjectDynamics(config.objects, camera)
+        self.unroll = RollingShutter(camera)
         self.track = MapTracker(config.tracking, config.features, camera)
         self.mapper = Mapper(config, camera, self._known)
         self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
@@ -143,13 +145,14 @@ class V3DSLAM:
             InputError: it is not after the last one.
         """
         check_order(percept.frame, self.poses.stamp)
-        frame, instances, depth, features = percept.frame, percept.instances, percept.depth, percept.features
+        frame, instances, depth = percept.frame, percept.instances, percept.depth
         self._memory = percept.memory  # not as the segmentation has it now: it may be a frame ahead
         self.clock.add(percept.seconds)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
-            seen = View(frame, depth, features)
-            last, predicted = self._last, self.poses.predict(frame.stamp)
-            motion = None if last is None else self.move(last, seen, predicted @ invert(self.poses.T_cw))
+            last, outlook = self._last, self.poses.outlook()
+            seen = View(frame, depth, self.unroll(percept.features, outlook.velocity, self.mapper.map.readout))
+            guess = outlook.at(frame.stamp) @ invert(outlook.T_cw)
+            motion = None if last is None else self.move(last, seen, guess)
             T_cw = self._expect(frame.stamp, motion)
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             view = self.watch.look(frame.stamp, depth, T_cw)
@@ -159,11 +162,13 @@ class V3DSLAM:
                 proposed = self.propose(arrivals, instances, depth)
                 instances, clouds = instances.joined(proposed), clouds.joined(self.lift(depth, proposed))
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
-            scene = self.judge(instances, clouds, view, arrivals, Witnesses(features.pixel, seen.matched(motion)))
-            keep = features.on(scene.static)
+            scene = self.judge(instances, clouds, view, arrivals, Witnesses(seen.features.pixel, seen.matched(motion)))
+            keep = seen.features.on(scene.static)
         self.settle()  # III-E: bundle adjustment, loops, pose graph, begun with the frame before
         with self.clock("tracking"):  # III-E: the pose in the local map
             T_cw = self._expect(frame.stamp, motion)  # in the map as it is now
+            velocity = outlook.velocity if motion is None else motion.velocity(frame.stamp - outlook.stamp)
+            features = self.unroll(percept.features, velocity, self.mapper.map.readout)
             static, carried = features[keep], seen.carried(motion, last)[keep]
             estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
         with self.clock("mapping"):  # keyframes and landmarks
@@ -171,6 +176,7 @@ class V3DSLAM:
             T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)
             if T_new_old is not None:
                 self._move_world(T_new_old)
+            self._look_back()
             keyframe = self.mapper(frame, static, estimate, reference)
             if estimate.status is not Status.LOST:
                 self.watch.remember(replace(view, T_cw=self.poses.T_cw))
@@ -195,6 +201,13 @@ class V3DSLAM:
     def _expect(self, stamp: float, motion: Motion | None) -> Tensor:
         """Pose of the camera by its motion since the last frame; predicted, where that is not known."""
         return self.poses.predict(stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
+
+    def _look_back(self) -> None:
+        """Put the features of the last frame right, if it is a keyframe: how the camera passed it is known only now."""
+        sparse_map, velocity = self.mapper.map, self.poses.passed
+        for newest in sparse_map.keyframes[-1:]:
+            if velocity is not None and self._last is not None and self._last.frame.index == newest.frame:
+                sparse_map.see(newest, self.unroll(newest.features, velocity, sparse_map.readout))
 
     def _move_world(self, T_new_old: Tensor) -> None:
         """Carry what is remembered along when the world is corrected under it."""

@@ -26,6 +26,7 @@ from v3d_torch.objects.motion_filter import MotionFilter
 from v3d_torch.objects.track import Sighting, Track
 from v3d_torch.odometry.odometry import View
 from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.shutter import Readout
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.state_file import read_state, write_state
 from v3d_torch.timing import StageClock
@@ -36,7 +37,7 @@ State = dict[str, Any]
 
 OF_SLAM = (
     *("clock", "poses", "next_outlook", "_memory", "_last"),
-    *("mapper.map.keyframes", "mapper.map.landmarks", "mapper.map.observations", "mapper.map.loops"),
+    *(f"mapper.map.{name}" for name in ("keyframes", "landmarks", "observations", "loops", "readout")),
     *("mapper._most_tracked", "mapper._untracked_since", "loops.count", "back_end.keyframe"),
     *("watch._views", "judge._last_stamp", "judge.tracker.tracks", "judge.tracker._next_id"),
 )
@@ -44,7 +45,7 @@ OF_SLAM = (
 
 CLASSES: tuple[type, ...] = (
     *(StageClock, PoseRecorder, _Entry, Status, Outlook, View, RGBDFrame, PinholeCamera, Features),
-    *(Keyframe, Loop, Table, DepthView, Track, Sighting, MotionFilter, IdentityConfig, set),
+    *(Readout, Keyframe, Loop, Table, DepthView, Track, Sighting, MotionFilter, IdentityConfig, set),
 )
 """Of the objects in these."""
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,8 +13,10 @@ from v3d_torch.config import Config
 from v3d_torch.lie import rigid
 from v3d_torch.mapping.bundle import Observations, bundle_adjust
 from v3d_torch.mapping.local_map import Keyframe, SparseMap
+from v3d_torch.mapping.self_calibration import learn_readout
 from v3d_torch.mapping.table import distinct
 from v3d_torch.odometry.refine import pixel_sigma
+from v3d_torch.odometry.shutter import Readout
 
 
 @dataclass(frozen=True)
@@ -25,12 +28,14 @@ class Adjustment:
         landmarks: ids of those adjusted, int64, shape :math:`(P,)`.
         points: where they are, world frame, metres, float64, shape :math:`(P, 3)`.
         outliers: rows of the observations that do not fit, int64, shape :math:`(O,)`.
+        readout: of the camera, as it is known by now.
     """
 
     T_cw: Tensor
     landmarks: Tensor
     points: Tensor
     outliers: Tensor
+    readout: Readout
 
     def take_in(self, sparse_map: SparseMap) -> None:
         """Change the map that was adjusted, in place; it has got no new keyframe since."""
@@ -38,6 +43,7 @@ class Adjustment:
         sparse_map.move_keyframes(self.T_cw)
         sparse_map.landmarks["point"][self.landmarks] = self.points
         sparse_map.forget(self.outliers)
+        sparse_map.read(self.readout)
 
 
 def adjust_locally(
@@ -75,17 +81,25 @@ def adjust_locally(
         pose=pose,
         point=point,
     )
-    found = bundle_adjust(
-        T_cw[poses],
-        sparse_map.landmarks["point"][landmarks],
-        observations,
-        camera,
-        fixed,
-        config.mapping.bundle_iterations,
-        config.mapping.bundle_tolerance,
+    adjust = partial(
+        bundle_adjust,
+        camera=camera,
+        fixed=fixed,
+        iterations=config.mapping.bundle_iterations,
+        tolerance=config.mapping.bundle_tolerance,
     )
+    found = adjust(T_cw[poses], sparse_map.landmarks["point"][landmarks], observations)
+
+    def cost(seconds: float) -> float:
+        later = seconds - sparse_map.readout.seconds
+        seen = replace(observations, uv=observations.uv + later * table["drift"].index_select(0, rows))
+        return adjust(found.T_cw, found.points, seen).cost_after
+
+    readout = sparse_map.readout
+    if config.shutter.enabled and (keyframe.index <= config.shutter.keyframes or keyframe.index % 10 == 0):
+        readout = learn_readout(readout, cost)
     T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
-    return Adjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit])
+    return Adjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit], readout)
 
 
 def _observations_around(sparse_map: SparseMap, window: Tensor) -> Tensor:

@@ -132,6 +132,7 @@ def _empty() -> tuple[Table, Table]:
     )
     features = Table(
         uv=((2,), real),
+        drift=((2,), real),
         pixel=((2,), number),
         depth=((), real),
         octave=((), number),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -16,6 +16,7 @@ from v3d_torch.lie import invert, rigid
 from v3d_torch.mapping.table import Table
 from v3d_torch.odometry.guided import LocalMap
 from v3d_torch.odometry.orb import Features, spread
+from v3d_torch.odometry.shutter import GLOBAL_SHUTTER, Readout
 from v3d_torch.odometry.tracker import Tracking
 
 
@@ -100,6 +101,7 @@ class SparseMap:
         self.camera = camera
         self.keyframes: list[Keyframe] = []
         self.loops: list[Loop] = []
+        self.readout = GLOBAL_SHUTTER
         self.landmarks = Table(
             point=((3,), torch.float64),
             direction=((3,), torch.float64),
@@ -115,6 +117,7 @@ class SparseMap:
             landmark=((), torch.int64),
             feature=((), torch.int64),  # of the keyframe
             uv=((2,), torch.float64),
+            drift=((2,), torch.float64),  # of uv, with the readout
             inverse_depth=((), torch.float64),
             octave=((), torch.int64),
             valid=((), torch.bool),  # until a bundle adjustment finds that it does not fit
@@ -248,6 +251,22 @@ class SparseMap:
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
+    def see(self, keyframe: Keyframe, features: Features) -> None:
+        """Take the features of a keyframe, the same ones, for seen elsewhere."""
+        keyframe.features = features
+        rows = torch.nonzero(self.observations["keyframe"] == keyframe.index)[:, 0]
+        for name in ("uv", "drift"):
+            self.observations[name][rows] = getattr(features, name)[self.observations["feature"][rows]]
+
+    def read(self, readout: Readout) -> None:
+        """Take the camera for one that needs another time to read an image."""
+        later = readout.seconds - self.readout.seconds
+        self.readout = readout
+        self.observations["uv"].add_(self.observations["drift"], alpha=later)
+        for keyframe in self.keyframes:
+            seen = keyframe.features
+            keyframe.features = replace(seen, uv=seen.uv + later * seen.drift)
+
     def fuse(self, keyframe: Keyframe, landmarks: Tensor) -> None:
         """Let features of a keyframe show landmarks that turned out to be behind them.
 
@@ -273,6 +292,7 @@ class SparseMap:
             landmark=landmarks[features],
             feature=features,
             uv=seen.uv,
+            drift=seen.drift,
             inverse_depth=seen.inverse_depth,
             octave=seen.octave,
             valid=torch.ones_like(features, dtype=torch.bool),

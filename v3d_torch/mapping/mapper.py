@@ -8,6 +8,7 @@ from v3d_torch.mapping.local_map import Keyframe, SparseMap
 from v3d_torch.mapping.neighbours import NeighbourSearch
 from v3d_torch.mapping.recorder import Estimate, Status
 from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.shutter import Readout
 from v3d_torch.types import RGBDFrame
 
 
@@ -26,6 +27,8 @@ class Mapper:
         self._untracked_since: float | None = None
         self._search_neighbours = NeighbourSearch(config, camera)
         self.map = SparseMap(config.mapping, config.features, camera) if known is None else known
+        if known is None and config.shutter.enabled:
+            self.map.readout = Readout(config.shutter.readout, config.shutter.sigma**-2)
 
     def __call__(
         self, frame: RGBDFrame, static: Features, estimate: Estimate, reference: Keyframe | None

@@ -84,6 +84,7 @@ class PoseRecorder:
     def __init__(self) -> None:
         self._entries: list[_Entry] = []
         self._velocity = torch.zeros(6, dtype=torch.float64)  # twist per second, in the camera frame
+        self.passed: Tensor | None = None  # mean velocity around the frame before the last, where it is known
         self.landmarks = torch.zeros(0, dtype=torch.int64)  # seen by the last frame that was found
 
     @property
@@ -148,12 +149,15 @@ class PoseRecorder:
             self._put_right(correction, keyframe, linked=T_cp is not None, first=first)
             T_new_old = correction if first else None
         T_kw = _pose(keyframe)
+        self.passed = None
         if self._entries:
             elapsed = stamp - self._entries[-1].stamp
             if estimate.status is Status.LOST:
                 self._velocity = self._velocity * (stamp - self._last_found() < Outlook.LONGEST)
             elif self.status is not Status.LOST and elapsed > 0:
-                self._velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
+                velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
+                self.passed = velocity if len(self._entries) == 1 else (self._velocity + velocity) / 2
+                self._velocity = velocity
         T_ck = rigid(estimate.T_cw @ invert(T_kw))
         self._entries.append(_Entry(stamp, status, keyframe, T_ck, linked=T_cp is not None))
         if estimate.count:

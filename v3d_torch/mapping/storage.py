@@ -25,8 +25,9 @@ from v3d_torch.files import StrPath, written_whole
 from v3d_torch.mapping.columns import from_columns, to_columns, what_is_wrong
 from v3d_torch.mapping.local_map import SparseMap
 from v3d_torch.mapping.views import StaticViews
+from v3d_torch.odometry.shutter import Readout
 
-_FORMAT, _VERSION = "v3d_torch map", 2
+_FORMAT, _VERSION = "v3d_torch map", 3
 
 _ROOM, _RATIO = 1 << 28, 20
 """Bytes that any file may unpack to, and by how much a larger one may grow: maps grow threefold."""
@@ -74,6 +75,7 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
         "format": _FORMAT,
         "version": _VERSION,
         "camera": asdict(sparse_map.camera),
+        "readout": asdict(sparse_map.readout),
         "settings": {
             "features.scale": sparse_map.features.scale,
             "features.levels": sparse_map.features.levels,
@@ -105,6 +107,7 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
             if about["format"] != _FORMAT:
                 raise ValueError("it holds something else")
             _refuse_other(str(path), about, camera, config)
+            stored.map.readout = Readout.of(about["readout"])
             columns = {name: torch.from_numpy(_read(archive, name)) for name in to_columns(stored.map, stored.views)}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a file that --save-map wrote") from error

@@ -28,6 +28,10 @@ class Motion:
     T_ba: Tensor
     pairs: Tensor
 
+    def velocity(self, elapsed: float) -> Tensor:
+        """Mean twist per second over the time between the views, in seconds, float64, shape :math:`(6,)`."""
+        return se3_log(self.T_ba) / elapsed
+
     def carry(self, landmarks: Tensor, count: int) -> Tensor:
         """Ids of the landmarks behind the features of b that the matches carry over from a.
 
@@ -90,6 +94,8 @@ class MotionEstimator:
             seed=self._seed,
         )
         pairs = pairs[epipolar]
+        if pairs.shape[0] < config.min_inliers:
+            return None
         pose = pnp_ransac(
             self._camera.lift(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]]),
             b.uv[pairs[:, 1]],

@@ -22,6 +22,8 @@ class Features:
         depth: metres, float64, shape :math:`(N,)`; 0 = no measurement.
         octave: level of the scale pyramid, int64, shape :math:`(N,)`.
         descriptors: 256 bits each, uint8, shape :math:`(N, 32)`.
+        drift: how ``uv`` changes with the time that the camera takes to read an image, pixels per second, float64,
+            shape :math:`(N, 2)`; 0 for a camera that stands still, and where it is not given.
     """
 
     uv: Tensor
@@ -29,6 +31,11 @@ class Features:
     depth: Tensor
     octave: Tensor
     descriptors: Tensor
+    drift: Tensor = None  # type: ignore[assignment]  # never None afterwards
+
+    def __post_init__(self) -> None:
+        if self.drift is None:
+            object.__setattr__(self, "drift", torch.zeros_like(self.uv))
 
     def __len__(self) -> int:
         return self.uv.shape[0]

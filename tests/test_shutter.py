@@ -1,0 +1,158 @@
+"""The rolling shutter: where features would have been seen had all rows been read at once; how long reading takes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.config import Config
+from v3d_torch.lie import se3_exp
+from v3d_torch.mapping.local_map import SparseMap
+from v3d_torch.mapping.self_calibration import learn_readout
+from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.shutter import GLOBAL_SHUTTER, Readout, RollingShutter
+
+CAMERA = PinholeCamera(525.0, 520.0, 320.0, 240.0)
+KINECT = Readout(0.026, 1e8)
+SHAKE = torch.tensor([0.4, -0.3, 0.2, 0.9, -1.1, 1.3], dtype=torch.float64)  # m/s and rad/s
+STILL = torch.zeros(6, dtype=torch.float64)
+
+
+def cloud(count: int = 200) -> Tensor:
+    """Points that the camera sees, metres, (N, 3)."""
+    generator = torch.Generator().manual_seed(3)
+    u, v, z = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    return CAMERA.lift(torch.stack([40 + 560 * u, 40 + 400 * v], dim=1), 1 + 3 * z)
+
+
+def features_of(uv: Tensor, depth: Tensor) -> Features:
+    number = torch.zeros(len(uv), dtype=torch.int64)
+    return Features(uv, uv.round().long(), depth, number, torch.zeros(len(uv), 32, dtype=torch.uint8))
+
+
+def rolled(points: Tensor, velocity: Tensor, readout: float) -> Features:
+    """Points as a camera in motion reads them: each where it is when its row is read."""
+    seen = points
+    for _ in range(20):  # which row that is depends on where it is seen
+        late = (CAMERA.project(seen)[:, 1].round() / (CAMERA.height - 1) - 0.5) * readout
+        moved = se3_exp(late[:, None] * velocity)
+        seen = (moved[:, :3, :3] @ points[..., None])[..., 0] + moved[:, :3, 3]
+    return features_of(CAMERA.project(seen), points[:, 2])
+
+
+def error(velocity: Tensor, readout: Readout) -> float:
+    """Greatest distance from where the points are seen at the time of the middle row, pixels."""
+    read = rolled(cloud(), velocity, KINECT.seconds)
+    put = RollingShutter(CAMERA)(read, velocity, readout)
+    return float((put.uv - CAMERA.project(cloud())).norm(dim=1).max())
+
+
+def test_features_are_put_where_the_middle_row_would_have_seen_them() -> None:
+    assert error(SHAKE, Readout(0.0, 1.0)) > 10
+    assert error(SHAKE, KINECT) < 0.1
+
+
+def test_the_drift_is_the_derivative_by_the_readout() -> None:
+    read = rolled(cloud(), SHAKE, KINECT.seconds)
+    less, more = (RollingShutter(CAMERA)(read, SHAKE, Readout(seconds, 1.0)) for seconds in (0.010, 0.020))
+    torch.testing.assert_close((more.uv - less.uv) / 0.010, less.drift, rtol=1e-9, atol=1e-6)
+
+
+def test_an_infinitely_far_point_drifts_by_the_rotation_alone() -> None:
+    uv = CAMERA.project(cloud())
+    far, nothing = features_of(uv, torch.full((len(uv),), 1e9).double()), features_of(uv, torch.zeros(len(uv)).double())
+    unroll = RollingShutter(CAMERA)
+    torch.testing.assert_close(unroll(nothing, SHAKE, KINECT).uv, unroll(far, SHAKE, KINECT).uv, rtol=0, atol=1e-6)
+
+
+def test_another_velocity_takes_the_place_of_the_first() -> None:
+    read, unroll = rolled(cloud(), SHAKE, KINECT.seconds), RollingShutter(CAMERA)
+    twice = unroll(unroll(read, -2 * SHAKE, KINECT), SHAKE, KINECT)
+    torch.testing.assert_close(twice.uv, unroll(read, SHAKE, KINECT).uv, rtol=0, atol=1e-9)
+    torch.testing.assert_close(unroll(twice, STILL, KINECT).uv, read.uv, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("velocity", "readout"), [(STILL, KINECT), (SHAKE, GLOBAL_SHUTTER)])
+def test_without_motion_or_with_a_global_shutter_nothing_moves(velocity: Tensor, readout: Readout) -> None:
+    read = rolled(cloud(), SHAKE, KINECT.seconds)
+    assert torch.equal(RollingShutter(CAMERA)(read, velocity, readout).uv, read.uv)
+
+
+def test_of_no_features_there_are_none() -> None:
+    read = rolled(cloud(), SHAKE, KINECT.seconds)[torch.zeros(0, dtype=torch.int64)]
+    assert len(RollingShutter(CAMERA)(read, SHAKE, KINECT)) == 0
+
+
+# --- how long reading takes
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.floats(0, 0.03), st.floats(0, 0.03), st.floats(1e3, 1e8), st.floats(1e3, 1e8))
+def test_of_gaussian_costs_the_mean_by_information_is_learnt(a: float, b: float, known: float, told: float) -> None:
+    learnt = learn_readout(Readout(a, known), lambda seconds: 7.0 + told * (seconds - b) ** 2)
+    assert learnt.information == pytest.approx(0.8 * known + told, rel=1e-3)
+    assert learnt.seconds == pytest.approx((0.8 * known * a + told * b) / (0.8 * known + told), abs=1e-5)
+
+
+@pytest.mark.parametrize("bend", [0.0, -1e6])
+def test_costs_without_a_bottom_teach_nothing(bend: float) -> None:
+    assert learn_readout(KINECT, lambda seconds: 5.0 + bend * seconds**2) == KINECT
+
+
+def test_no_camera_takes_longer_than_it_can() -> None:
+    learnt = learn_readout(Readout(0.01, 1.0), lambda seconds: 1e6 * (seconds - 3.0) ** 2)
+    assert learnt.seconds == pytest.approx(Readout.LONGEST, abs=1e-6)
+
+
+@pytest.mark.parametrize("about", [{"seconds": 0.1, "information": 1.0}, {"seconds": math.nan, "information": 1.0}])
+def test_what_no_camera_can_be_is_refused(about: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="readout"):
+        Readout.of(about)
+
+
+# --- in the map
+
+
+def mapped(readout: Readout) -> SparseMap:
+    """Two keyframes that saw the same points while the camera moved."""
+    config = Config()
+    sparse_map = SparseMap(config.mapping, config.features, CAMERA)
+    sparse_map.readout = readout
+    seen = RollingShutter(CAMERA)(rolled(cloud(), SHAKE, KINECT.seconds), SHAKE, readout)
+    first = sparse_map.insert(0, 0.0, torch.eye(4, dtype=torch.float64), seen, torch.full((len(seen),), -1))
+    sparse_map.insert(1, 0.1, torch.eye(4, dtype=torch.float64), seen, first.landmarks)
+    return sparse_map
+
+
+def test_another_readout_moves_all_that_was_seen() -> None:
+    learnt, known = mapped(Readout(0.010, 1.0)), mapped(KINECT)
+    learnt.read(KINECT)
+    assert learnt.readout == KINECT
+    torch.testing.assert_close(learnt.observations["uv"], known.observations["uv"], rtol=0, atol=1e-9)
+    for ours, theirs in zip(learnt.keyframes, known.keyframes, strict=True):
+        torch.testing.assert_close(ours.features.uv, theirs.features.uv, rtol=0, atol=1e-9)
+
+
+def test_a_keyframe_whose_motion_is_known_better_is_seen_again() -> None:
+    sparse_map = mapped(KINECT)
+    newest, others = sparse_map.keyframes[1], sparse_map.observations["keyframe"] == 0
+    before = sparse_map.observations["uv"].clone()
+    sparse_map.see(newest, RollingShutter(CAMERA)(newest.features, SHAKE / 2, KINECT))
+    assert torch.equal(sparse_map.observations["uv"][others], before[others])
+    feature = sparse_map.observations["feature"][~others]
+    assert torch.equal(sparse_map.observations["uv"][~others], newest.features.uv[feature])
+    assert torch.equal(sparse_map.observations["drift"][~others], newest.features.drift[feature])
+    assert not torch.equal(sparse_map.observations["uv"][~others], before[~others])
+
+
+def test_features_keep_their_drift_when_some_are_chosen() -> None:
+    seen = RollingShutter(CAMERA)(rolled(cloud(), SHAKE, KINECT.seconds), SHAKE, KINECT)
+    assert torch.equal(seen[torch.tensor([3, 1])].drift, seen.drift[[3, 1]])
+    assert torch.equal(replace(seen, drift=None).drift, torch.zeros_like(seen.uv))

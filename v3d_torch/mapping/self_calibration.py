@@ -1,0 +1,39 @@
+"""How long the camera takes to read an image, by what explains the map best.
+
+Rows that are read late bend the image of a camera that turns; a map bent alike explains it as well, until the camera
+turns another way. So the same neighbourhood is adjusted for three readouts: where the parabola through their costs has
+its bottom, and how steep it is, tell the readout and how sure it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from v3d_torch.odometry.shutter import Readout
+
+_STEP = 0.005
+"""Seconds between the readouts that are tried: 1 pixel at the image's edge in a turn of 1 rad/s."""
+
+_MEMORY = 0.8
+"""Weight of what was known before: neighbourhoods of keyframes that follow each other share most observations, and the
+first ones knew the camera's motion least."""
+
+
+def learn_readout(known: Readout, cost: Callable[[float], float]) -> Readout:
+    """The readout as it was known and the one that costs least, in one.
+
+    Args:
+        known: so far.
+        cost: twice the negative log-likelihood of a readout of so many seconds.
+
+    Returns:
+        ``known`` where no readout costs less than others: the camera stood still, or always moved alike.
+    """
+    less, same, more = (cost(known.seconds + change) for change in (-_STEP, 0.0, _STEP))
+    curvature = (more - 2 * same + less) / _STEP**2
+    if curvature <= 0:
+        return known
+    bottom = known.seconds - (more - less) / (2 * _STEP) / curvature
+    before, told = _MEMORY * known.information, curvature / 2
+    seconds = (before * known.seconds + told * min(max(bottom, -Readout.LONGEST), Readout.LONGEST)) / (before + told)
+    return Readout(seconds, before + told)

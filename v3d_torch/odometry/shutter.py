@@ -1,0 +1,84 @@
+"""The rolling shutter: the rows of an image are read one after the other, while the camera moves on.
+
+A Kinect takes some 26 ms of the 33 between two frames to read its colour image (Ringaby and Forssen, ICCV 2011, give
+figures for both of its sensors), and a hand turns it by 10 pixels meanwhile. Features are put where they would have
+been seen at the time of the middle row. How far a feature has to go is its drift, the motion field (Longuet-Higgins
+and Prazdny, 1980) times the share of the readout by which its row is late; how long the readout takes, the map tells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from v3d_torch.camera import PinholeCamera
+from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.refine import perspective_jacobian
+
+
+@dataclass(frozen=True)
+class Readout:
+    """How long a camera takes to read the rows of its colour image, as far as is known.
+
+    Attributes:
+        seconds: from the first row to the last; 0 is a global shutter, less than 0 one that is read from below.
+        information: inverse variance of that, 1/s^2.
+    """
+
+    seconds: float
+    information: float
+
+    LONGEST: ClassVar[float] = 0.05  # seconds: no camera takes longer
+
+    @classmethod
+    def of(cls, about: Mapping[str, float]) -> Readout:
+        """From the attributes by their names.
+
+        Raises:
+            ValueError: there is no such camera.
+        """
+        seconds, information = float(about["seconds"]), float(about["information"])
+        if not (abs(seconds) <= cls.LONGEST and information >= 0):
+            raise ValueError(f"a readout of {seconds} s")
+        return cls(seconds, information)
+
+
+GLOBAL_SHUTTER = Readout(0.0, math.inf)
+"""All rows at once, for sure."""
+
+
+class RollingShutter:
+    """Puts features where they would have been seen at the time of the middle row.
+
+    Args:
+        camera: that read them.
+    """
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        self._camera = camera
+
+    def __call__(self, features: Features, velocity: Tensor, readout: Readout) -> Features:
+        """Features of a camera in motion.
+
+        Args:
+            features: as they were read, or as they were put with the same readout for another velocity.
+            velocity: of the points in the camera, twist per second, float64, shape :math:`(6,)`.
+            readout: of the camera.
+
+        Returns:
+            The same features with ``uv`` and ``drift`` for that velocity.
+        """
+        camera = self._camera
+        read = features.uv - readout.seconds * features.drift
+        focal, centre = read.new_tensor([camera.fx, camera.fy]), read.new_tensor([camera.cx, camera.cy])
+        # What has no depth is taken for far away: it drifts by the rotation alone.
+        seen = torch.cat([((read - centre) / focal).T, features.inverse_depth[None]])
+        field = torch.tensordot(velocity, perspective_jacobian(seen), dims=1)[:2].T * focal
+        late = features.pixel[:, 1:].to(torch.float64) / (camera.height - 1) - 0.5
+        drift = -late * field
+        return replace(features, uv=read + readout.seconds * drift, drift=drift)
