@@ -23,6 +23,7 @@ from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.storage import StoredMap, load_map, save_map
 from v3d_torch.mapping.views import StaticViews
 from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.shutter import Readout
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation.none import NoSegmentation
 from v3d_torch.slam import V3DSLAM
@@ -59,6 +60,7 @@ def made_up(keyframes: int = 4, seed: int = 0) -> StoredMap:
         sparse_map.forget(torch.tensor([1, 5]))
         sparse_map.landmarks["alive"][3] = False
         sparse_map.loops.append(Loop(0, 2, se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))))
+    sparse_map.readout = Readout(0.021, 3e6)
     return StoredMap(sparse_map, views)
 
 
@@ -90,6 +92,7 @@ def test_what_is_read_is_what_was_written(keyframes: int, tmp_path: Path) -> Non
         for name, column in vars(before.features).items():
             assert torch.equal(getattr(after.features, name), column)
     assert again.views.camera == stored.views.camera
+    assert again.map.readout == stored.map.readout
     assert [view.keyframe for view in again.views] == again.map.keyframes
     assert torch.equal(again.map.covisibility(1), stored.map.covisibility(1))
 
@@ -198,10 +201,20 @@ def about(path: Path, **changes: object) -> np.ndarray:
     return np.frombuffer(json.dumps(said | changes).encode(), dtype=np.uint8)
 
 
+@pytest.mark.parametrize(
+    "readout", [None, {"seconds": 3.0, "information": 1.0}, {"seconds": "long", "information": 1.0}]
+)
+def test_a_map_of_no_camera(readout: object, tmp_path: Path) -> None:
+    path = saved(tmp_path, made_up(1))
+    rewritten(path, about=about(path, readout=readout))
+    with pytest.raises(InputError, match=r"room\.map: is no map, or a damaged one"):
+        load_map(path, CAMERA, CONFIG)
+
+
 def test_a_map_of_another_version(tmp_path: Path) -> None:
     path = saved(tmp_path, made_up(1))
-    rewritten(path, about=about(path, version=3, camera=None))
-    with pytest.raises(InputError, match=r"room\.map: is a map in version 3 of its format.* knows version 2"):
+    rewritten(path, about=about(path, version=4, camera=None))
+    with pytest.raises(InputError, match=r"room\.map: is a map in version 4 of its format.* knows version 3"):
         load_map(path, CAMERA, CONFIG)
 
 

@@ -351,11 +351,10 @@ class ShutterConfig(Section):
 
     enabled: bool = True
     """Off: all rows are taken for read at once."""
-    readout: float = Field(0.015, ge=-0.05, le=0.05)
-    """Time from the first row to the last, seconds, that the first keyframes are taken with; then the map tells. Half
-    of the time between two frames, which is most that there can be: a Kinect has 0.026, a rendered image 0."""
-    sigma: float = Field(0.015, gt=0)
-    """How sure that is, standard deviation, seconds."""
+    readout: float = Field(0.0, ge=-0.05, le=0.05)
+    """Time from the first row to the last, seconds, as long as the map tells nothing else."""
+    sigma: float = Field(0.02, gt=0)
+    """How sure that is, standard deviation, seconds: a rolling shutter takes most of the time between two frames."""
     keyframes: int = Field(20, ge=0)
     """So many keyframes ask the map, and then every tenth: each time takes three bundle adjustments."""
 

@@ -11,6 +11,8 @@ from torch import Tensor
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import FeaturesConfig
 
+_NOT_GIVEN = torch.zeros(0, 2, dtype=torch.float64)
+
 
 @dataclass(frozen=True)
 class Features:
@@ -31,10 +33,10 @@ class Features:
     depth: Tensor
     octave: Tensor
     descriptors: Tensor
-    drift: Tensor = None  # type: ignore[assignment]  # never None afterwards
+    drift: Tensor = _NOT_GIVEN
 
     def __post_init__(self) -> None:
-        if self.drift is None:
+        if self.drift is _NOT_GIVEN:
             object.__setattr__(self, "drift", torch.zeros_like(self.uv))
 
     def __len__(self) -> int:
