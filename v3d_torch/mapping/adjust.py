@@ -43,7 +43,8 @@ class Adjustment:
         sparse_map.move_keyframes(self.T_cw)
         sparse_map.landmarks["point"][self.landmarks] = self.points
         sparse_map.forget(self.outliers)
-        sparse_map.read(self.readout)
+        if self.readout != sparse_map.readout:
+            sparse_map.read(self.readout)
 
 
 def adjust_locally(
