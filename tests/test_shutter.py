@@ -105,6 +105,10 @@ def test_costs_without_a_bottom_teach_nothing(bend: float) -> None:
     assert learn_readout(KINECT, lambda seconds: 5.0 + bend * seconds**2) == KINECT
 
 
+def test_a_camera_that_is_known_for_sure_is_not_asked() -> None:
+    assert learn_readout(GLOBAL_SHUTTER, lambda seconds: pytest.fail(f"asked for {seconds}")) == GLOBAL_SHUTTER
+
+
 def test_no_camera_takes_longer_than_it_can() -> None:
     learnt = learn_readout(Readout(0.01, 1.0), lambda seconds: 1e6 * (seconds - 3.0) ** 2)
     assert learnt.seconds == pytest.approx(Readout.LONGEST, abs=1e-6)

@@ -7,6 +7,7 @@ its bottom, and how steep it is, tell the readout and how sure it is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from v3d_torch.odometry.shutter import Readout
@@ -31,8 +32,11 @@ def learn_readout(known: Readout, cost: Callable[[float], float]) -> Readout:
         cost: twice the negative log-likelihood of a readout of so many seconds.
 
     Returns:
-        ``known`` where no readout costs less than others: the camera stood still, or always moved alike.
+        ``known`` where that is sure, and where no readout costs less than others: the camera stood still, or always
+        moved alike.
     """
+    if math.isinf(known.information):
+        return known
     less, same, more = (cost(known.seconds + change) for change in (-_STEP, 0.0, _STEP))
     curvature = (more - 2 * same + less) / _STEP**2
     if curvature <= 0:
