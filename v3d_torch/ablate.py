@@ -21,7 +21,7 @@ def main(
     ] = None,
     variants: Annotated[
         str, typer.Option(help="What to run, with commas between.")
-    ] = "baseline,no_voting,no_chamfer,no_bridging,no_unnamed,as_held,paper,full",
+    ] = "baseline,no_voting,no_chamfer,no_bridging,no_unnamed,as_held,global_shutter,paper,full",
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each variant, with seeds from 0.")] = 3,
     set_: Annotated[
         list[str] | None,

@@ -18,7 +18,17 @@ from v3d_torch.evaluation.outcome import Outcome, values_of
 from v3d_torch.evaluation.summary import error_tables
 from v3d_torch.evaluation.tables import HEADINGS
 
-VARIANTS = ("baseline", "no_voting", "no_chamfer", "no_bridging", "no_unnamed", "as_held", "paper", FULL)
+VARIANTS = (
+    "baseline",
+    "no_voting",
+    "no_chamfer",
+    "no_bridging",
+    "no_unnamed",
+    "as_held",
+    "global_shutter",
+    "paper",
+    FULL,
+)
 """Names of the configurations that are compared (`v3d_torch.config_file.CONFIGS`), the whole system last."""
 
 LEGEND = (
