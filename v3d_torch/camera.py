@@ -101,24 +101,31 @@ class PinholeCamera:
         Returns:
             Shape :math:`(N, 2)`, float64.
         """
-        focal, centre = self._focal_and_centre
-        return self._image((uv.to(torch.float64) - centre) / focal) if self.is_distorted else uv.to(torch.float64)
+        return self._image(self.slopes(uv)) if self.is_distorted else uv.to(torch.float64)
+
+    def slopes(self, uv: Tensor) -> Tensor:
+        """Directions (x / z, y / z) through pixels of an ideal pinhole camera, :math:`(N, 2)`, float64 both ways."""
+        return (uv.to(torch.float64) - self._centre) / self.focal
 
     @cached_property
-    def _focal_and_centre(self) -> Tensor:
-        """Focal lengths and principal point, float64, shape (2, 2)."""
-        return torch.tensor([[self.fx, self.fy], [self.cx, self.cy]], dtype=torch.float64)
+    def focal(self) -> Tensor:
+        """Focal lengths along u and v, pixels, float64, shape :math:`(2,)`."""
+        return torch.tensor([self.fx, self.fy], dtype=torch.float64)
+
+    @cached_property
+    def _centre(self) -> Tensor:
+        """Principal point, pixels, float64, shape (2,)."""
+        return torch.tensor([self.cx, self.cy], dtype=torch.float64)
 
     def _image(self, slope: Tensor) -> Tensor:
         """Directions (x / z, y / z) to pixels as delivered, by the Brown model, both (N, 2) and float64."""
-        focal, centre = self._focal_and_centre
         if self.is_distorted:
             k1, k2, p1, p2, k3 = self.distortion
             tangential = slope.new_tensor([p2, p1])
             square = slope.square().sum(dim=1, keepdim=True)
             radial = 1 + square * (k1 + square * (k2 + square * k3))
             slope = slope * (radial + 2 * (slope @ tangential)[:, None]) + square * tangential
-        return slope * focal + centre
+        return slope * self.focal + self._centre
 
     def project(self, points: Tensor) -> Tensor:
         """Points in the camera frame to undistorted pixels.

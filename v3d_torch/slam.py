@@ -204,10 +204,12 @@ class V3DSLAM:
 
     def _look_back(self) -> None:
         """Put the features of the last frame right, if it is a keyframe: how the camera passed it is known only now."""
-        sparse_map, velocity = self.mapper.map, self.poses.passed
-        for newest in sparse_map.keyframes[-1:]:
-            if velocity is not None and self._last is not None and self._last.frame.index == newest.frame:
-                sparse_map.see(newest, self.unroll(newest.features, velocity, sparse_map.readout))
+        sparse_map, last, velocity = self.mapper.map, self._last, self.poses.passed
+        if velocity is None or last is None or not sparse_map.keyframes:
+            return
+        newest = sparse_map.keyframes[-1]
+        if newest.frame == last.frame.index:
+            sparse_map.see(newest, self.unroll(newest.features, velocity, sparse_map.readout))
 
     def _move_world(self, T_new_old: Tensor) -> None:
         """Carry what is remembered along when the world is corrected under it."""

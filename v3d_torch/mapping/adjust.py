@@ -18,6 +18,9 @@ from v3d_torch.mapping.table import distinct
 from v3d_torch.odometry.refine import pixel_sigma
 from v3d_torch.odometry.shutter import Readout
 
+_SELDOM = 10
+"""After the first keyframes every so many ask for the readout: later turns of the camera tell more of it."""
+
 
 @dataclass(frozen=True)
 class Adjustment:
@@ -97,7 +100,7 @@ def adjust_locally(
         return adjust(found.T_cw, found.points, seen).cost_after
 
     readout = sparse_map.readout
-    if config.shutter.enabled and (keyframe.index <= config.shutter.keyframes or keyframe.index % 10 == 0):
+    if config.shutter.enabled and (keyframe.index <= config.shutter.keyframes or keyframe.index % _SELDOM == 0):
         readout = learn_readout(readout, cost)
     T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
     return Adjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit], readout)

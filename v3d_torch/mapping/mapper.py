@@ -26,9 +26,11 @@ class Mapper:
         self._most_tracked = 0  # landmarks found by a frame since the last keyframe
         self._untracked_since: float | None = None
         self._search_neighbours = NeighbourSearch(config, camera)
-        self.map = SparseMap(config.mapping, config.features, camera) if known is None else known
-        if known is None and config.shutter.enabled:
-            self.map.readout = Readout(config.shutter.readout, config.shutter.sigma**-2)
+        if known is None:
+            known = SparseMap(config.mapping, config.features, camera)
+            if config.shutter.enabled:
+                known.readout = Readout(config.shutter.readout, config.shutter.sigma**-2)
+        self.map = known
 
     def __call__(
         self, frame: RGBDFrame, static: Features, estimate: Estimate, reference: Keyframe | None

@@ -76,10 +76,9 @@ class RollingShutter:
         """
         camera = self._camera
         read = features.uv - readout.seconds * features.drift
-        focal, centre = read.new_tensor([camera.fx, camera.fy]), read.new_tensor([camera.cx, camera.cy])
         # What has no depth is taken for far away: it drifts by the rotation alone.
-        seen = torch.cat([((read - centre) / focal).T, features.inverse_depth[None]])
-        field = torch.tensordot(velocity, perspective_jacobian(seen), dims=1)[:2].T * focal
+        seen = torch.cat([camera.slopes(read).T, features.inverse_depth[None]])
+        field = torch.tensordot(velocity, perspective_jacobian(seen), dims=1)[:2].T * camera.focal
         late = features.pixel[:, 1:].to(torch.float64) / (camera.height - 1) - 0.5
         drift = -late * field
         return replace(features, uv=read + readout.seconds * drift, drift=drift)
