@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from v3d_torch.association import associate
-from v3d_torch.datasets.lists import read_associations, read_image_list
+from v3d_torch.datasets.lists import pair_lists, read_associations, read_image_list
 from v3d_torch.errors import InputError
 
 STAMPS = st.floats(min_value=-1e10, max_value=1e10, allow_nan=False)
@@ -41,6 +41,18 @@ def test_associations_with_spaces_in_names(tmp_path: Path, entries: list[tuple[f
     first = {entry[0]: (entry[0], entry[1], entry[3]) for entry in reversed(entries)}
     found = [(pair.stamp, pair.colour, pair.depth) for pair in read_associations(path)]
     assert found == [first[stamp] for stamp in sorted(first)]
+
+
+def test_depth_has_its_own_time(tmp_path: Path) -> None:
+    (tmp_path / "rgb.txt").write_text("10.0 rgb/a.png\n10.5 rgb/b.png\n")
+    (tmp_path / "depth.txt").write_text("9.984375 depth/a.png\n10.515625 depth/b.png\n")
+    path = tmp_path / "associations.txt"
+    lines = ["10.0 rgb/a.png 9.984375 depth/a.png", "10.5 rgb/b.png 10.515625 depth/b.png"]
+    path.write_text("\n".join(lines))
+    listed, paired = read_associations(path), pair_lists(tmp_path / "rgb.txt", tmp_path / "depth.txt")
+    assert listed == paired and [pair.delay for pair in listed] == [-1 / 64, 1 / 64]
+    path.write_text("10.0 rgb/a.png 5009.99 depth/a.png")  # two clocks tell no delay
+    assert [pair.delay for pair in read_associations(path)] == [0.0]
 
 
 @given(content=st.binary(max_size=200))

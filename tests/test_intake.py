@@ -37,6 +37,7 @@ def slam(segment: Callable[[RGBDFrame], Any] | None = None) -> V3DSLAM:
         (replace(FRAME, depth=FRAME.depth.double()), "depth image is torch.float64"),
         (replace(FRAME, depth=None), "depth image is a NoneType"),
         (replace(FRAME, stamp=float("nan")), "the stamp is nan"),
+        (replace(FRAME, delay=float("inf")), "the delay of depth is inf"),
         (replace(FRAME, camera=replace(CAMERA, width=80)), r"colour image .* of shape \(3, 48, 80\)"),
     ],
 )

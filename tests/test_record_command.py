@@ -52,6 +52,7 @@ def assert_equal(saved: RGBDSequence, source: RGBDSequence) -> None:
     for frame, original in zip(saved, source, strict=True):
         assert torch.equal(frame.image, original.image)
         torch.testing.assert_close(frame.depth, original.depth, rtol=1e-6, atol=0)
+        assert frame.delay == pytest.approx(original.delay, abs=2e-6)
 
 
 def test_a_bag_becomes_a_folder(tmp_path: Path) -> None:
@@ -61,11 +62,12 @@ def test_a_bag_becomes_a_folder(tmp_path: Path) -> None:
     for i in range(3):
         stamp = 1700000000 + i / 30
         messages.append((RGB, stamp, make.image(stamp, "rgb8", colour_of(i))))
-        messages.append((DEPTH, stamp, make.image(stamp, "16UC1", depth_of(i))))
+        messages.append((DEPTH, stamp - 0.0125, make.image(stamp - 0.0125, "16UC1", depth_of(i))))
     bag = make.write(tmp_path / "take", messages)
     done = call("--seq", bag, "--out", tmp_path / "out [b]", "--rgb-topic", RGB)
     assert (done.returncode, done.stderr, done.stdout.strip()) == (0, "", f"3 frames: {tmp_path / 'out [b]'}")
     assert_equal(load_sequence(str(tmp_path / "out [b]")), load_sequence(str(bag)))
+    assert load_sequence(str(bag))[1].delay == pytest.approx(-0.0125, abs=1e-6)
 
 
 def test_ground_truth_is_saved_and_not_transformed_twice(tmp_path: Path) -> None:

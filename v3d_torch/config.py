@@ -347,10 +347,10 @@ class MappingConfig(Section):
 
 
 class ShutterConfig(Section):
-    """The rolling shutter of the colour camera: its rows are read one after the other."""
+    """What is read when, while the camera moves: the rows of colour one after the other, depth at a time of its own."""
 
     enabled: bool = True
-    """Off: all rows are taken for read at once."""
+    """Off: all rows of both images are taken for read at once."""
     readout: float = Field(0.0, ge=-0.05, le=0.05)
     """Time from the first row to the last, seconds, as long as the map tells nothing else."""
     sigma: float = Field(0.02, gt=0)

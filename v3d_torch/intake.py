@@ -50,8 +50,9 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera | None) -> PinholeCamera
                 f"frame {frame.index}: the {name} image is {_said(image)}, and not a tensor, {dtype} of shape {shape}"
                 " as the camera has it; RGBDFrame.of makes frames of arrays"
             )
-    if not math.isfinite(frame.stamp):
-        raise InputError(f"frame {frame.index}: the stamp is {frame.stamp}; give seconds, as a finite number")
+    for name, seconds in (("stamp", frame.stamp), ("delay of depth", frame.delay)):
+        if not math.isfinite(seconds):
+            raise InputError(f"frame {frame.index}: the {name} is {seconds}; give seconds, as a finite number")
     if frame.camera is not None and frame.camera != camera:
         raise InputError(
             f"frame {frame.index}: carries another camera than the V3DSLAM has; make one for each camera, or frames"

@@ -23,9 +23,10 @@ from v3d_torch.objects.dynamics import ObjectDynamics
 from v3d_torch.objects.lift import CloudLifter
 from v3d_torch.objects.unnamed import unnamed_instances
 from v3d_torch.objects.witnesses import Witnesses
+from v3d_torch.odometry.late_depth import LateDepth
 from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, View
-from v3d_torch.odometry.orb import ORB
+from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.shutter import RollingShutter
 from v3d_torch.odometry.tracker import MapTracker
 from v3d_torch.percept import Percept, Tracked
@@ -86,6 +87,7 @@ class V3DSLAM:
         self.propose = partial(unnamed_instances, camera=camera, min_area=config.objects.background.min_area)
         self.judge = ObjectDynamics(config.objects, camera)
         self.unroll = RollingShutter(camera)
+        self.date_back = LateDepth(config, camera)
         self.track = MapTracker(config.tracking, config.features, camera)
         self.mapper = Mapper(config, camera, self._known)
         self.loops = LoopCloser(config.loop, self.match, self.track, config.tracking.local_keyframes)
@@ -150,7 +152,7 @@ class V3DSLAM:
         self.clock.add(percept.seconds)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             last, outlook = self._last, self.poses.outlook()
-            seen = View(frame, depth, self.unroll(percept.features, outlook.velocity, self.mapper.map.readout))
+            seen = View(frame, depth, self._at_once(percept.features, depth, frame, outlook.velocity))
             guess = outlook.at(frame.stamp) @ invert(outlook.T_cw)
             motion = None if last is None else self.move(last, seen, guess)
             T_cw = self._expect(frame.stamp, motion)
@@ -168,8 +170,8 @@ class V3DSLAM:
         with self.clock("tracking"):  # III-E: the pose in the local map
             T_cw = self._expect(frame.stamp, motion)  # in the map as it is now
             velocity = outlook.velocity if motion is None else motion.velocity(frame.stamp - outlook.stamp)
-            features = self.unroll(percept.features, velocity, self.mapper.map.readout)
-            static, carried = features[keep], seen.carried(motion, last)[keep]
+            static = self._at_once(percept.features[keep], depth, frame, velocity)
+            carried = seen.carried(motion, last)[keep]
             estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
         with self.clock("mapping"):  # keyframes and landmarks
             reference = self.localise.reference(estimate)
@@ -202,6 +204,11 @@ class V3DSLAM:
         """Pose of the camera by its motion since the last frame; predicted, where that is not known."""
         return self.poses.predict(stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
 
+    def _at_once(self, features: Features, depth: Tensor, frame: RGBDFrame, velocity: Tensor) -> Features:
+        """Features as a camera would have seen them that takes all rows, of colour and of depth, at once."""
+        features = self.date_back(features, depth, velocity, frame.delay)
+        return self.unroll(features, velocity, self.mapper.map.readout)
+
     def _look_back(self) -> None:
         """Put the features of the last frame right, if it is a keyframe: how the camera passed it is known only now."""
         sparse_map, last, velocity = self.mapper.map, self._last, self.poses.passed
@@ -209,7 +216,7 @@ class V3DSLAM:
             return
         newest = sparse_map.keyframes[-1]
         if newest.frame == last.frame.index:
-            sparse_map.see(newest, self.unroll(newest.features, velocity, sparse_map.readout))
+            sparse_map.see(newest, self._at_once(newest.features, last.depth, last.frame, velocity))
 
     def _move_world(self, T_new_old: Tensor) -> None:
         """Carry what is remembered along when the world is corrected under it."""

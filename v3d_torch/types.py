@@ -33,6 +33,7 @@ class RGBDFrame:
         depth: metres, float32, shape :math:`(1, H, W)`, pixel by pixel on the colour image; 0 = no measurement.
         T_cw: world to camera where the camera is expected to be, float64, shape :math:`(4, 4)`; None before it is.
         camera: that took both; None where who takes the frame in knows it.
+        delay: of the depth image, seconds after the colour image; less than 0 where it was taken before.
     """
 
     index: int
@@ -41,6 +42,7 @@ class RGBDFrame:
     depth: Tensor
     T_cw: Tensor | None = None
     camera: PinholeCamera | None = None
+    delay: float = 0.0
 
     @staticmethod
     def of(
@@ -49,6 +51,7 @@ class RGBDFrame:
         image: NDArray[np.uint8] | Tensor,
         depth: NDArray[np.generic] | Tensor,
         camera: PinholeCamera | None = None,
+        delay: float = 0.0,
     ) -> RGBDFrame:
         """A frame from images as cameras, simulators and image libraries give them.
 
@@ -59,6 +62,7 @@ class RGBDFrame:
             depth: pixel by pixel on it, shape :math:`(H, W)`: metres where it is a floating-point image, else the
                 camera's units; 0 or not a number = no measurement.
             camera: that took both; gives the units of depth, millimetres where there is none.
+            delay: of the depth image, seconds after the colour image.
 
         Raises:
             InputError: an image has another shape or type, or another size than the camera's; the stamp is no number.
@@ -93,7 +97,7 @@ class RGBDFrame:
             metres = metres / (camera.depth_scale if camera is not None else 1000)
         metres = metres.where(metres.isfinite() & (metres > 0), 0.0)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
-        return RGBDFrame(index, seconds, channels, metres[None], camera=camera)
+        return RGBDFrame(index, seconds, channels, metres[None], camera=camera, delay=number(delay))
 
 
 def _array(image: object) -> NDArray[Any]:

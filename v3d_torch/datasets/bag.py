@@ -78,7 +78,8 @@ class BagSequence(StoredFrames):
                 f"{path}: no image on {topics.rgb} lies within {MAX_DIFFERENCE} s of one on {topics.depth};"
                 " choose others with --rgb-topic and --depth-topic"
             )
-        super().__init__(path.resolve().stem, [colour[i] for i, _ in pairs], own)
+        delays = [depth[j] - colour[i] for i, j in pairs]
+        super().__init__(path.resolve().stem, [colour[i] for i, _ in pairs], own, delays=delays)
         self._pairs = [(stamps[topics.rgb][colour[i]], stamps[topics.depth][depth[j]]) for i, j in pairs]
         self._colours, self._depths = (Cursor(partial(_messages, path, topic)) for topic in (topics.rgb, topics.depth))
         self._read(0)  # what is wrong with every frame is said at once

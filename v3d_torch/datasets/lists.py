@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -35,6 +35,7 @@ class Pair:
     stamp: float
     colour: str
     depth: str
+    delay: float = field(default=0.0, kw_only=True)  # of the depth image, seconds after the colour image
 
 
 def read_image_list(path: Path) -> list[tuple[float, str]]:
@@ -83,8 +84,8 @@ def read_associations(path: Path) -> list[Pair]:
         rows.append((_stamp(first, path, number), names[0], _stamp(second, path, number), names[1]))
     if rows and is_depth(path.parent / rows[0][1]) and not is_depth(path.parent / rows[0][3]):
         rows = [(stamp, colour, other, depth) for other, depth, stamp, colour in rows]
-    ordered = _in_order(((stamp, (colour, depth)) for stamp, colour, _, depth in rows), path)
-    return [Pair(stamp, *files) for stamp, files in ordered]
+    ordered = _in_order(((stamp, (colour, depth, other)) for stamp, colour, other, depth in rows), path)
+    return [Pair(stamp, colour, depth, delay=_delay(stamp, other)) for stamp, (colour, depth, other) in ordered]
 
 
 def pair_lists(colour: Path, depth: Path) -> list[Pair]:
@@ -108,7 +109,7 @@ def pair_lists(colour: Path, depth: Path) -> list[Pair]:
             f"{colour.parent}: no stamp in {colour.name} lies within {MAX_DIFFERENCE} s of one in {depth.name};"
             " do both lists belong to this sequence?"
         )
-    return [Pair(*images[i], depths[j][1]) for i, j in indices]
+    return [Pair(*images[i], depths[j][1], delay=_delay(images[i][0], depths[j][0])) for i, j in indices]
 
 
 def refuse_other_units(pairs: Sequence[Pair], folder: Path) -> None:
@@ -136,6 +137,11 @@ def _stamp(word: str, path: Path, number: int) -> float:
             f"{path}: line {number} has {word[:80]!r} where a stamp in seconds is expected; repair or remove the line"
         )
     return stamp
+
+
+def _delay(colour: float, depth: float) -> float:
+    """Seconds from one stamp to the other; 0 where they are of different clocks, as no pair lies so far apart."""
+    return depth - colour if abs(depth - colour) <= MAX_DIFFERENCE else 0.0
 
 
 def _in_order(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[float, _T]]:

@@ -42,7 +42,8 @@ class PairedImages(StoredFrames):
                 f"{folder / missing[0]}: is listed but not there ({len(missing)} such files);"
                 " copy the whole sequence again"
             )
-        super().__init__(name or folder.resolve().name, [pair.stamp for pair in pairs], camera, groundtruth)
+        stamps, delays = [pair.stamp for pair in pairs], [pair.delay for pair in pairs]
+        super().__init__(name or folder.resolve().name, stamps, camera, groundtruth, delays)
         self.folder = folder
         self._pairs = pairs
 

@@ -28,6 +28,7 @@ class StoredFrames(ABC):
         stamps: of the colour images, seconds, strictly increasing.
         camera: that took all frames.
         groundtruth: reads the measured poses of that camera.
+        delays: of the depth images, seconds after the colour images; None where both were taken at once.
 
     Attributes:
         groundtruth: these poses; None where there are none, or they cannot be read, as the frames still can.
@@ -35,11 +36,17 @@ class StoredFrames(ABC):
     """
 
     def __init__(
-        self, name: str, stamps: Sequence[float], camera: PinholeCamera, groundtruth: ReadTruth | None = None
+        self,
+        name: str,
+        stamps: Sequence[float],
+        camera: PinholeCamera,
+        groundtruth: ReadTruth | None = None,
+        delays: Sequence[float] | None = None,
     ) -> None:
         self.name = name.encode(errors="replace").decode()  # a folder's name need not be text
         self.stamps: Tensor = torch.tensor(stamps, dtype=torch.float64)
         self.camera = camera
+        self._delays = delays or [0.0] * len(stamps)
         self.groundtruth: Trajectory | None = None
         self.groundtruth_error: InputError | None = None
         try:
@@ -74,7 +81,8 @@ class StoredFrames(ABC):
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, there is none with index {index}")
         image, depth = self._read(index)
-        return RGBDFrame(index=index, stamp=float(self.stamps[index]), image=image, depth=depth, camera=self.camera)
+        stamp = float(self.stamps[index])
+        return RGBDFrame(index, stamp, image, depth, camera=self.camera, delay=self._delays[index])
 
     def check_first_frame(self, source: object) -> None:
         """Decode the first frame, so that what is wrong with every frame is said before anything else is done.

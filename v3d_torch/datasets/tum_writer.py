@@ -36,7 +36,7 @@ class TUMWriter:
             raise OutputError(f"{folder}: holds something already; choose another folder with --out")
         self.folder = folder
         self.camera = camera
-        self._written: list[str] = []
+        self._written: list[tuple[str, str]] = []
         fields = asdict(camera) | {"distortion": list(camera.distortion)}
         write_text(folder / "camera.yaml", yaml.safe_dump(fields, sort_keys=False))
         if groundtruth is not None:
@@ -49,9 +49,9 @@ class TUMWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         lines = {
-            "rgb.txt": [f"{stamp} rgb/{stamp}.png" for stamp in self._written],
-            "depth.txt": [f"{stamp} depth/{stamp}.png" for stamp in self._written],
-            "associations.txt": [f"{stamp} rgb/{stamp}.png {stamp} depth/{stamp}.png" for stamp in self._written],
+            "rgb.txt": [f"{stamp} rgb/{stamp}.png" for stamp, _ in self._written],
+            "depth.txt": [f"{stamp} depth/{stamp}.png" for _, stamp in self._written],
+            "associations.txt": [f"{rgb} rgb/{rgb}.png {depth} depth/{depth}.png" for rgb, depth in self._written],
         }
         for name, entries in lines.items():
             write_text(self.folder / name, "".join(f"{entry}\n" for entry in entries))
@@ -62,13 +62,13 @@ class TUMWriter:
 
     def add(self, frame: RGBDFrame) -> None:
         """Write a frame's images; depth that 16 bits of the camera's units cannot tell is no measurement."""
-        stamp = f"{frame.stamp:.6f}"
+        stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self.camera.depth_scale)
         units[units >= SATURATED] = 0
         colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
-        _save(self.folder / "rgb" / f"{stamp}.png", colour)
-        _save(self.folder / "depth" / f"{stamp}.png", units.astype(np.uint16))
-        self._written.append(stamp)
+        _save(self.folder / "rgb" / f"{stamps[0]}.png", colour)
+        _save(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))
+        self._written.append(stamps)
 
 
 def _save(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:

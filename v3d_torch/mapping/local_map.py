@@ -255,7 +255,7 @@ class SparseMap:
         """Take the features of a keyframe, the same ones, for seen elsewhere."""
         keyframe.features = features
         rows = torch.nonzero(self.observations["keyframe"] == keyframe.index)[:, 0]
-        for name in ("uv", "drift"):
+        for name in ("uv", "inverse_depth", "drift"):
             self.observations[name][rows] = getattr(features, name)[self.observations["feature"][rows]]
 
     def read(self, readout: Readout) -> None:

@@ -85,14 +85,31 @@ class ORB:
         place = torch.from_numpy(found.keypoints_xy.copy()).to(torch.float64).reshape(-1, 2)
         pixel = place.round().to(torch.int64)
         pixel = torch.stack([pixel[:, 0].clamp(0, width - 1), pixel[:, 1].clamp(0, height - 1)], dim=1)
-        z = depth[0, pixel[:, 1], pixel[:, 0]].to(torch.float64)
         return Features(
             uv=self._camera.undistort(place),
             pixel=pixel,
-            depth=torch.where(z <= self._config.max_depth, z, 0.0),
+            depth=depth_under(pixel, depth, self._config.max_depth),
             octave=torch.from_numpy(found.octaves.astype("int64")),
             descriptors=torch.from_numpy(found.descriptors.copy()).reshape(-1, 32),
         )
+
+
+def depth_under(pixel: Tensor, depth: Tensor, max_depth: float) -> Tensor:
+    """Depth at pixels.
+
+    Args:
+        pixel: (column, row), int64, shape :math:`(N, 2)`; outside the image there is no depth.
+        depth: metres, shape :math:`(1, H, W)`, 0 = none.
+        max_depth: depth beyond is taken for none, metres.
+
+    Returns:
+        Metres, float64, shape :math:`(N,)`, 0 = none.
+    """
+    column, row = pixel.unbind(dim=1)
+    height, width = depth.shape[-2:]
+    z = depth[0, row.clamp(0, height - 1), column.clamp(0, width - 1)].to(torch.float64)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return torch.where(inside & (z <= max_depth), z, 0.0)
 
 
 def spread(pixel: Tensor, count: int, cell: int) -> Tensor:

@@ -3,8 +3,8 @@
 A Kinect takes most of the 33 ms between two frames to read its colour image, and a turn of 1 rad/s moves the image by
 some 13 pixels meanwhile, more than any other error (Hedborg et al., Rolling Shutter Bundle Adjustment, CVPR 2012).
 Features are put where they would have been seen at the time of the middle row. How far a feature has to go is its
-drift, the motion field (Longuet-Higgins and Prazdny, 1980) times the share of the readout by which its row is late; how
-long the readout takes, the map tells.
+drift, the motion field times the share of the readout by which its row is late; how long the readout takes, the map
+tells.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
+from v3d_torch.odometry.motion_field import motion_field
 from v3d_torch.odometry.orb import Features
-from v3d_torch.odometry.refine import perspective_jacobian
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,8 @@ class RollingShutter:
         Returns:
             The same features with ``uv`` and ``drift`` for that velocity.
         """
-        camera = self._camera
         read = features.uv - readout.seconds * features.drift
-        # What has no depth is taken for far away: it drifts by the rotation alone.
-        seen = torch.cat([camera.slopes(read).T, features.inverse_depth[None]])
-        field = torch.tensordot(velocity, perspective_jacobian(seen), dims=1)[:2].T * camera.focal
-        late = features.pixel[:, 1:].to(torch.float64) / (camera.height - 1) - 0.5
+        field, _ = motion_field(read, features.inverse_depth, velocity, self._camera)
+        late = features.pixel[:, 1:].to(torch.float64) / (self._camera.height - 1) - 0.5
         drift = -late * field
         return replace(features, uv=read + readout.seconds * drift, drift=drift)
