@@ -107,11 +107,11 @@ def test_same_bytes_with_one_thread_and_two() -> None:
 
 def test_a_mirrored_image_gives_mirrored_masks() -> None:
     """Nothing may be shifted by a pixel or two on the way to the canvas and back."""
-    segmenter = YOLOSegmenter(SegmentationConfig(threads=1))
+    segmenter = YOLOSegmenter(SegmentationConfig(**LARGE))
     image = photograph("astronaut")
     mask = segmenter.segment(image).masks[0]
     mirrored = segmenter.segment(image.flip(2)).masks[0].flip(1)
-    assert (mask & mirrored).sum() / (mask | mirrored).sum() > 0.96
+    assert (mask & mirrored).sum() / (mask | mirrored).sum() > 0.975
 
 
 @pytest.mark.parametrize("turns", range(4))

@@ -53,8 +53,8 @@ def letterbox(image: Tensor, height: int, width: int) -> tuple[Tensor, Window]:
     left = (width - inner_width) // 2 // CELL * CELL
     window = Window(top, left, inner_height, inner_width, image_height, image_width)
 
-    picture = image[None].to(torch.float32)
+    picture = image[None]  # scaled as bytes, as when the networks were trained
     if (inner_height, inner_width) != (image_height, image_width):
         picture = functional.interpolate(picture, (inner_height, inner_width), mode="bilinear", antialias=True)
     margins = (left, width - inner_width - left, top, height - inner_height - top)
-    return functional.pad(picture / 255, margins, value=_GREY).contiguous(), window
+    return functional.pad(picture.to(torch.float32) / 255, margins, value=_GREY).contiguous(), window
