@@ -26,7 +26,7 @@ from v3d_torch.segmentation.letterbox import letterbox
 if TYPE_CHECKING:
     import onnx
 
-_VERSION = 2
+_VERSION = 3
 """Of what this file makes of a network: raised with every change, so that older files in the cache are not used."""
 
 _EVERY = 15
