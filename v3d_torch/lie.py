@@ -67,7 +67,7 @@ def _motion(R: Tensor, t: Tensor) -> Tensor:
 
 
 def se3_exp(xi: Tensor) -> Tensor:
-    """Exponential map: the matrix exponential of ``[[rotation x, translation], [0, 0]]``, by its closed form.
+    """Exponential map: the matrix exponential of its `twist`, by its closed form.
 
     Args:
         xi: ``[translation, rotation]``, shape :math:`(..., 6)`; rotations by any angle.
@@ -75,7 +75,7 @@ def se3_exp(xi: Tensor) -> Tensor:
     Returns:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
-    X = _twist(xi)
+    X = twist(xi)
     # Below, the coefficients are multiplied by next to nothing: those of a small angle are exact enough at any smaller.
     angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL)
     b = 2 * ((angle / 2).sin() / angle).square()
@@ -99,14 +99,14 @@ def se3_log(T: Tensor) -> Tensor:
     safe = torch.where(square < _TINY, 1.0, square)
     half = safe.sqrt() / 2
     c = torch.where(square < _TINY, 1 / 12, (1 - half / half.tan()) / safe)
-    K = _twist(torch.cat([phi, phi], dim=-1))[..., :3, :3]
+    K = twist(torch.cat([phi, phi], dim=-1))[..., :3, :3]
     t = T[..., :3, 3:]
     rho = t - 0.5 * (K @ t) + c * (K @ (K @ t))
     return torch.cat([rho[..., 0], phi], dim=-1)
 
 
-def _twist(xi: Tensor) -> Tensor:
-    """Tangent vectors as matrices, :math:`(..., 6)` to :math:`(..., 4, 4)`."""
+def twist(xi: Tensor) -> Tensor:
+    """Tangent vectors as matrices, ``[[rotation x, translation], [0, 0]]``, :math:`(..., 6)` to :math:`(..., 4, 4)`."""
     return (xi @ _GENERATORS.to(xi.dtype)).unflatten(-1, (4, 4))
 
 

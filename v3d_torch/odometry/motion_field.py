@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
-from v3d_torch.odometry.refine import perspective_jacobian
+from v3d_torch.lie import twist
 
 
 def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
@@ -24,6 +24,7 @@ def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, camera: Pi
     Returns:
         Pixels per second, shape :math:`(N, 2)`, and the change of inverse depth, 1/m per second, shape :math:`(N,)`.
     """
-    seen = torch.cat([camera.slopes(uv).T, inverse_depth[None]])
-    moves = torch.tensordot(velocity, perspective_jacobian(seen), dims=1)
-    return moves[:2].T * camera.focal, moves[2]
+    slopes = camera.slopes(uv).T
+    # How points move for each metre of their depth: they are (x / z, y / z, 1, 1 / z) in such units.
+    moves = twist(velocity)[:3] @ torch.cat([slopes, torch.ones_like(inverse_depth)[None], inverse_depth[None]])
+    return (moves[:2] - moves[2] * slopes).T * camera.focal, -moves[2] * inverse_depth
