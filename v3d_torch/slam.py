@@ -162,7 +162,8 @@ class V3DSLAM:
             clouds = percept.clouds
             if self.config.segmentation.source != "none":  # the baseline has no masks at all
                 proposed = self.propose(arrivals, instances, depth)
-                instances, clouds = instances.joined(proposed), clouds.joined(self.lift(depth, proposed))
+                if len(proposed) > 0:
+                    instances, clouds = instances.joined(proposed), clouds.joined(self.lift(depth, proposed))
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
             scene = self.judge(instances, clouds, view, arrivals, Witnesses(seen.features.pixel, seen.matched(motion)))
             keep = seen.features.on(scene.static)

@@ -39,8 +39,6 @@ class ObjectClouds:
 
     def joined(self, others: ObjectClouds) -> ObjectClouds:
         """These clouds, then the others."""
-        if len(others) == 0:
-            return self
         longest = max(self.points.shape[1], others.points.shape[1])
         both = (self, others)
         return ObjectClouds(
