@@ -23,7 +23,20 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
 STAGES = frozenset(
-    {"segment", "smooth", "detect", "lift", "match", "move", "watch", "propose", "judge", "track", "unroll"}
+    {
+        "segment",
+        "smooth",
+        "detect",
+        "lift",
+        "match",
+        "move",
+        "watch",
+        "propose",
+        "judge",
+        "track",
+        "unroll",
+        "date_back",
+    }
     | {"mapper", "loops", "back_end", "localise"}
 )
 """Attributes of `V3DSLAM` that are its stages."""
