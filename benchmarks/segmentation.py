@@ -30,7 +30,7 @@ from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
-SERIAL = ("lookahead=false", "segmentation.threads=1")  # as in v3d_torch/run.py
+SERIAL = ("lookahead=false",)  # as in v3d_torch/run.py
 
 REFERENCE = "yolov8n 640x480, 32 bits"
 FULL = ("segmentation.width=640", "segmentation.height=480")

@@ -28,7 +28,6 @@ from v3d_torch.study import SegmentOnce
 from v3d_torch.types import Instances, RGBDFrame
 
 FRAMES = 6
-NETWORK = ("--set", "segmentation.threads=1")
 
 
 def call(*arguments: str | Path) -> Result:
@@ -66,7 +65,7 @@ def sequence(moment: Path) -> Path:
 def done(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The whole study with one seed: its folder and what the screen showed."""
     out = tmp_path_factory.mktemp("study") / "out [a]"
-    process = shell("ablate", "--seq", sequence, "--seeds", "1", "--out", out, *NETWORK)
+    process = shell("ablate", "--seq", sequence, "--seeds", "1", "--out", out)
     assert process.returncode == 0, process.stderr
     return out, process.stdout
 
@@ -94,7 +93,7 @@ def test_every_run_has_its_results_and_the_configuration_of_its_variant(done: tu
         folder = done[0] / "moment" / variant / "seed0"
         for name in ("trajectory.txt", "metrics.json", "dynamics.parquet", "run.log", "figures/trajectory.png"):
             assert (folder / name).is_file()
-        assert load_config(folder / "config.yaml") == load_config(CONFIGS[variant], [NETWORK[1]])
+        assert load_config(folder / "config.yaml") == load_config(CONFIGS[variant])
 
 
 def test_the_file_of_figures_has_those_of_the_runs(done: tuple[Path, str]) -> None:
@@ -116,7 +115,7 @@ def test_the_results_are_those_of_the_run_command(
     variant: str, done: tuple[Path, str], sequence: Path, tmp_path: Path
 ) -> None:
     """The instances of ``no_bridging`` are those that were kept from the run of ``no_voting``."""
-    arguments = ("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path, *NETWORK)
+    arguments = ("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path)
     process = shell("run", *arguments)
     assert process.returncode == 0, process.stderr
     ours = done[0] / "moment" / variant / "seed0"

@@ -419,11 +419,12 @@ def test_configurations_that_cannot_be_told_apart(moment: Path, tmp_path: Path) 
 
 
 def test_full_and_default_are_one_and_the_seed_is_the_batchs(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("seed: 7\n")
-    configs = read_configs(["default", "full", str(tmp_path / "mine.yaml")], one_thread=False)
+    mine = str(tmp_path / "mine.yaml")
+    Path(mine).write_text("seed: 7\nthreads: 2\nsegmentation: {threads: 2}\n")
+    configs = read_configs(["default", "full", mine], one_thread=False)
     assert list(configs) == ["full", "mine"] and configs["full"] == load_config()
-    (one, two) = read_configs(["full"], one_thread=True)["full"], configs["full"]
-    assert (one.threads, one.segmentation.threads, two.segmentation.threads) == (1, 1, 2)
+    one, two = read_configs([mine], one_thread=True)["mine"], configs["mine"]
+    assert [(config.threads, config.segmentation.threads) for config in (one, two)] == [(1, 1), (2, 2)]
 
 
 @pytest.mark.parametrize("below", [False, True])

@@ -19,7 +19,7 @@ FRAMES = 14
 RUNS = {
     "by default": (),
     "one by one": ("lookahead=false",),
-    "one thread for the network": ("segmentation.threads=1",),
+    "two threads for the network": ("segmentation.threads=2",),
     "one by one, two threads": ("lookahead=false", "threads=2"),
     "two threads": ("threads=2",),
 }

@@ -42,8 +42,8 @@ class SegmentationConfig(Section):
     """Whether the network is shown the images of a rolled camera upright (off in the paper)."""
     max_instances: int = Field(32, gt=0)
     """Most instances kept in an image, by score: bounds memory, far above what a room shows."""
-    threads: int = Field(2, gt=0, le=256)
-    """Threads of the inference engine."""
+    threads: int = Field(1, gt=0, le=256)
+    """Threads of the inference engine. It runs beside tracking, from which on two cores a second one takes the time."""
 
 
 class DepthConfig(Section):

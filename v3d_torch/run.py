@@ -85,7 +85,7 @@ def main(
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
     overrides += ["mapping.enabled=false"] if localise else []
-    overrides += ["lookahead=false", "segmentation.threads=1"] if serial else []
+    overrides += ["lookahead=false"] if serial else []
     request = Request(
         seq=seq or "",
         data_root=_text(data_root),

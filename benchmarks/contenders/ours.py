@@ -15,7 +15,7 @@ from v3d_torch.types import Trajectory
 
 OVERRIDES = {
     "v3d_torch": [],
-    "v3d_torch --serial": ["lookahead=false", "segmentation.threads=1"],  # as in v3d_torch/run.py
+    "v3d_torch --serial": ["lookahead=false"],  # as in v3d_torch/run.py
     "v3d_torch --segmenter none": ["segmentation.source=none"],
 }
 
