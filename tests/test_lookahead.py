@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 import torch
@@ -12,8 +13,8 @@ from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
 from v3d_torch.config_file import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import InputError
-from v3d_torch.lookahead import percepts
-from v3d_torch.percept import Percept
+from v3d_torch.lookahead import Lookahead
+from v3d_torch.percept import AHEAD, Percept
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.types import Instances
@@ -43,8 +44,9 @@ class Expecting:
 def run(demo: RGBDSequence, *, ahead: bool) -> tuple[V3DSLAM, Expecting]:
     seen = Expecting()
     slam = V3DSLAM(demo.camera, seen, NO_NETWORK)
-    for percept in percepts((demo[index] for index in range(FRAMES)), slam, ahead=ahead):
-        slam.take_in(percept)
+    with closing(Lookahead((demo[index] for index in range(FRAMES)), slam, ahead=ahead)) as percepts:
+        for percept in percepts:
+            slam.take_in(percept)
     return slam, seen
 
 
@@ -69,7 +71,7 @@ def test_only_ahead_is_another_thread_at_work(demo: RGBDSequence) -> None:
 
 
 @pytest.mark.parametrize("ahead", [False, True])
-def test_one_frame_is_read_ahead_and_no_more(demo: RGBDSequence, ahead: bool) -> None:
+def test_so_many_frames_are_read_ahead_and_no_more(demo: RGBDSequence, ahead: bool) -> None:
     read: list[int] = []
 
     def frames() -> Iterator[RGBDFrame]:
@@ -78,11 +80,12 @@ def test_one_frame_is_read_ahead_and_no_more(demo: RGBDSequence, ahead: bool) ->
             yield demo[index]
 
     slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
-    for taken, percept in enumerate(percepts(frames(), slam, ahead=ahead)):
-        slam.take_in(percept)
-        assert percept.frame.index == taken
-        assert len(read) <= taken + 1 + ahead
-        assert set(percept.seconds) == {"read", "segmentation", "depth", "features", "clouds"}
+    with closing(Lookahead(frames(), slam, ahead=ahead)) as percepts:
+        for taken, percept in enumerate(percepts):
+            slam.take_in(percept)
+            assert percept.frame.index == taken
+            assert len(read) <= taken + 1 + ahead * AHEAD
+            assert set(percept.seconds) == {"read", "segmentation", "depth", "features", "clouds"}
     assert read == list(range(FRAMES))
 
 
@@ -94,8 +97,8 @@ def test_a_broken_frame_is_told_of_after_those_before_it(demo: RGBDSequence, ahe
 
     slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
     given: list[Percept] = []
-    with pytest.raises(InputError, match="truncated"):
-        for percept in percepts(frames(), slam, ahead=ahead):
+    with pytest.raises(InputError, match="truncated"), closing(Lookahead(frames(), slam, ahead=ahead)) as percepts:
+        for percept in percepts:
             slam.take_in(percept)
             given.append(percept)
     assert [percept.frame.index for percept in given] == [0, 1]
@@ -104,10 +107,10 @@ def test_a_broken_frame_is_told_of_after_those_before_it(demo: RGBDSequence, ahe
 def test_who_stops_early_leaves_no_thread_behind(demo: RGBDSequence) -> None:
     slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
     before = set(threading.enumerate())
-    coming = percepts((demo[index] for index in range(FRAMES)), slam, ahead=True)
-    next(coming)
+    percepts = Lookahead((demo[index] for index in range(FRAMES)), slam, ahead=True)
+    next(iter(percepts))
     (thread,) = set(threading.enumerate()) - before
-    coming.close()
+    percepts.close()
     assert not thread.is_alive()
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import fields, replace
 from itertools import islice
 from pathlib import Path
@@ -21,7 +20,7 @@ from v3d_torch.config_file import load_config
 from v3d_torch.datasets.stored import Following, StoredFrames
 from v3d_torch.doors import CheckedSLAM
 from v3d_torch.errors import InputError
-from v3d_torch.lookahead import percepts
+from v3d_torch.lookahead import Lookahead
 from v3d_torch.percept import Percept
 from v3d_torch.second_process import SecondProcess
 from v3d_torch.segmentation import NoSegmentation
@@ -36,17 +35,6 @@ def demo() -> StoredFrames:
     sequence = load_sequence("demo")
     assert isinstance(sequence, StoredFrames)
     return sequence
-
-
-def started(slam: V3DSLAM, sequence: StoredFrames) -> SecondProcess:
-    """A process that is up, or never will be."""
-    second = SecondProcess(slam, sequence)
-    until = time.monotonic() + 60
-    with suppress(EOFError):
-        while not second._is_ready():
-            assert time.monotonic() < until
-            time.sleep(0.02)
-    return second
 
 
 def same(one: object, other: object) -> bool:
@@ -70,11 +58,13 @@ def without_times(percept: Percept) -> Percept:
 def test_it_sees_what_is_seen_here_to_the_bit(demo: StoredFrames) -> None:
     """With the network, upright, and what that remembers of the frames before."""
     here, slam = V3DSLAM(demo.camera, config=SMALL), V3DSLAM(demo.camera, config=SMALL)
-    with closing(started(slam, demo)) as second:
+    outlook = here.outlook()
+    with closing(SecondProcess(slam, demo)) as second:
+        second.ask(0, outlook)
         for index in range(3):
-            outlook = here.next_outlook
+            second.ask(index + 1, outlook)
             expected = here.perceive(demo[index], outlook)
-            seen = second.look(index, outlook)
+            seen = second.answer()
             assert seen is not None and same(without_times(seen), without_times(expected))
             assert same(slam.segment.memory, expected.memory)  # type: ignore[attr-defined]
             assert set(seen.seconds) == {"read", "segmentation", "depth", "features", "clouds"}
@@ -83,24 +73,25 @@ def test_it_sees_what_is_seen_here_to_the_bit(demo: StoredFrames) -> None:
 
 def test_numbers_are_checked_there_too(demo: StoredFrames) -> None:
     slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
-    with closing(started(slam, demo)) as second:
-        seen = second.look(0, slam.next_outlook)
-    assert seen is not None and same(without_times(seen), without_times(slam.perceive(demo[0], slam.next_outlook)))
+    with closing(SecondProcess(slam, demo)) as second:
+        second.ask(0, slam.outlook())
+        seen = second.answer()
+    assert seen is not None and same(without_times(seen), without_times(slam.perceive(demo[0], slam.outlook())))
 
 
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second process is begun with the first frame that it may be begun with, and waited for."""
+    """A second process is begun for any number of frames."""
     monkeypatch.setattr(v3d_torch.lookahead, "_WORTH", 1)
-    monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", started)
     monkeypatch.setattr(v3d_torch.lookahead, "_cores", lambda: 2)
 
 
 def tracked(config: Config, frames: Iterator[RGBDFrame], sequence: StoredFrames) -> tuple[V3DSLAM, list[Percept]]:
     slam, given = V3DSLAM(sequence.camera, config=config), []
-    for percept in percepts(frames, slam, ahead=True):
-        slam.take_in(percept)
-        given.append(percept)
+    with closing(Lookahead(frames, slam, ahead=True)) as percepts:
+        for percept in percepts:
+            slam.take_in(percept)
+            given.append(percept)
     return slam, given
 
 
@@ -119,25 +110,20 @@ def test_the_trajectory_is_that_without(demo: StoredFrames) -> None:
 
 
 @pytest.mark.usefixtures("at_once")
-def test_when_it_dies_the_run_goes_on_without(demo: StoredFrames, monkeypatch: pytest.MonkeyPatch) -> None:
-    begun: list[SecondProcess] = []
-
-    def noted(slam: V3DSLAM, sequence: StoredFrames) -> SecondProcess:
-        begun.append(started(slam, sequence))
-        return begun[0]
-
-    monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", noted)
+def test_when_it_dies_the_run_goes_on_without(demo: StoredFrames) -> None:
     slam, given = V3DSLAM(demo.camera, config=NO_NETWORK), []
-    for percept in percepts(iter(demo), slam, ahead=True):
-        slam.take_in(percept)
-        given.append(percept.frame.index)
-        if len(given) == 3:
-            process = begun[0]._process
-            assert process is not None and process.poll() is None and not begun[0]._gone
-            process.kill()
-        if len(given) == 7:
-            assert begun[0]._gone and len(begun) == 1
-            break
+    with closing(Lookahead(iter(demo), slam, ahead=True)) as percepts:
+        second = percepts._second
+        assert second is not None and second._process is not None
+        for percept in percepts:
+            slam.take_in(percept)
+            given.append(percept.frame.index)
+            if len(given) == 3:
+                assert second._process.poll() is None and second.can
+                second._process.kill()
+            if len(given) == 7:
+                assert not second.can
+                break
     assert given == list(range(7))
 
 
@@ -147,11 +133,11 @@ def test_what_cannot_be_sent_is_looked_at_here(demo: StoredFrames) -> None:
 
     slam = V3DSLAM(demo.camera, segment, NO_NETWORK)
     with closing(SecondProcess(slam, demo)) as second:
-        until = time.monotonic() + 60
-        while not second._gone:
-            assert second.look(0, None) is None and time.monotonic() < until
-            time.sleep(0.05)
-        assert second.look(0, None) is None
+        assert not second.can
+        second.ask(0, None)
+        assert second.answer() is None
+    with closing(Lookahead(iter(demo), slam, ahead=True)) as percepts:
+        assert percepts._second is None and percepts._thread is not None
 
 
 @pytest.mark.usefixtures("at_once")
@@ -163,8 +149,11 @@ def test_a_broken_image_is_told_of_by_its_own_error_after_those_before_it(tmp_pa
     broken.write_bytes(broken.read_bytes()[: broken.stat().st_size // 2])
     given = []
     slam = V3DSLAM(sequence.camera, config=NO_NETWORK)
-    with pytest.raises(InputError, match=rf"{broken.name}: is truncated"):
-        for percept in percepts(iter(sequence), slam, ahead=True):
+    with (
+        pytest.raises(InputError, match=rf"{broken.name}: is truncated"),
+        closing(Lookahead(iter(sequence), slam, ahead=True)) as percepts,
+    ):
+        for percept in percepts:
             slam.take_in(percept)
             given.append(percept.frame.index)
     assert given == [0, 1, 2]
@@ -172,11 +161,13 @@ def test_a_broken_image_is_told_of_by_its_own_error_after_those_before_it(tmp_pa
 
 def test_its_end_is_waited_for(demo: StoredFrames) -> None:
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    second = started(slam, demo)
+    second = SecondProcess(slam, demo)
     process = second._process
+    assert process is not None and process.poll() is None
     second.close()
-    assert process is not None and process.returncode is not None
-    assert second.look(0, None) is None
+    assert process.returncode is not None
+    second.ask(0, None)
+    assert second.answer() is None
 
 
 @pytest.mark.parametrize(("cores", "ahead", "frames"), [(1, True, 100), (2, False, 100), (2, True, 3)])
@@ -195,15 +186,19 @@ def test_none_is_begun_that_would_not_pay(
     monkeypatch.setattr(v3d_torch.lookahead, "_cores", lambda: cores)
     monkeypatch.setattr(v3d_torch.lookahead, "SecondProcess", none)
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    for percept in islice(percepts(Short(demo, 0), slam, ahead=ahead), 4):
-        slam.take_in(percept)
+    with closing(Lookahead(Short(demo, 0), slam, ahead=ahead)) as percepts:
+        for percept in islice(percepts, 4):
+            slam.take_in(percept)
 
 
 def test_without_memory_to_share_and_without_processes(demo: StoredFrames, monkeypatch: pytest.MonkeyPatch) -> None:
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    monkeypatch.setattr("v3d_torch.second_process.new_arena", lambda: None)
-    with closing(started(slam, demo)) as second:
-        assert second.look(1, slam.next_outlook) is not None
+    monkeypatch.setattr("v3d_torch.second_process.new_arena", lambda values: None)
+    with closing(SecondProcess(slam, demo)) as second:
+        second.ask(1, slam.outlook())
+        assert second.answer() is not None
     monkeypatch.setattr("v3d_torch.second_process.sys.executable", "/nowhere/python")
     with closing(SecondProcess(slam, demo)) as second:
-        assert second.look(1, slam.next_outlook) is None
+        assert second._process is None
+        second.ask(1, slam.outlook())
+        assert second.answer() is None

@@ -29,9 +29,9 @@ Ends = tuple[Channel, Channel]
 def joined(*, shared: bool) -> Iterator[Ends]:
     """Both ends of a channel, with memory of their own to share or without."""
     here, there = socket.socketpair()
-    arena = new_arena() if shared else None
+    arena = new_arena(2) if shared else None
     with here, there:
-        yield Channel(here, arena), Channel(there, arena)
+        yield Channel(here, arena, 2), Channel(there, arena, 2)
     if arena is not None:
         os.close(arena)
 
@@ -93,12 +93,17 @@ def test_masks_are_a_bit_a_pixel() -> None:
     assert all(torch.equal(getattr(came, name), getattr(instances, name)) for name in vars(instances))
 
 
-def test_a_value_stays_when_the_next_one_comes(ends: Ends) -> None:
-    here, there = ends
-    here.send(torch.zeros(5))
-    first = there.receive()
-    here.send(torch.ones(5))
-    assert torch.equal(there.receive(), torch.ones(5)) and torch.equal(first, torch.zeros(5))
+def test_a_value_stays_when_the_next_ones_come() -> None:
+    """Two are on their way at a time: each has its place in the shared memory until it is asked for."""
+    images = [torch.full((300, 400), value) for value in range(5)]
+    with joined(shared=True) as (here, there):
+        here.send(images[0])
+        came = []
+        for image in images[1:]:
+            here.send(image)
+            came.append(there.receive())
+        came.append(there.receive())
+    assert all(map(torch.equal, came, images))
 
 
 def test_what_does_not_fit_into_the_shared_memory_goes_without(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,10 @@
-"""The next frame is looked at while this one is tracked."""
+"""The next frames are looked at while this one is tracked."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -22,64 +23,78 @@ from v3d_torch.types import RGBDFrame
 _WORTH = 150
 """Frames for which a second process is begun: fewer are done soon after it is up, which takes some seconds."""
 
+Upcoming = Callable[[], Percept | None]
+"""Waits for what a frame shows; None behind the last."""
 
-def percepts(frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> Generator[Percept]:
+
+class Lookahead:
     """What the frames show, for `V3DSLAM.take_in`, one after the other.
 
-    Each frame is looked at with what was known of the camera when the one before it came, not when it was done with:
-    so it makes no difference to the results whether that happens ahead, in another thread or another process.
+    Each frame is looked at with what was known of the camera some frames before: so it makes no difference to the
+    results whether that happens when it is its turn, or ahead, in another thread or another process.
 
     Args:
         frames: to be read.
         slam: that looks at them, and takes each in before it asks for the next.
-        ahead: whether the next frame is read and looked at while one is taken in. Of a stored sequence that is long
-            enough, a second process does that as soon as it is up, until then a thread.
-
-    Raises:
-        V3DError: a frame cannot be read; those before have been given.
+        ahead: whether the next frames are read and looked at while one is taken in: those of a stored sequence that is
+            long enough by a second process, which is up when this is made, else, or if there is none to be had, by a
+            thread.
     """
-    look = partial(_look, frames, slam, torch.is_inference_mode_enabled())
-    with ExitStack() as stack:
+
+    def __init__(self, frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> None:
+        self._frames = frames
+        self._slam = slam
+        self._open = ExitStack()
+        self._second: SecondProcess | None = None
         if ahead and isinstance(frames, Following) and frames.left >= _WORTH and _cores() > 1:
-            second = stack.enter_context(closing(SecondProcess(slam, frames.sequence)))
-            look = partial(_look_there, second, frames, look)
-        thread = stack.enter_context(ThreadPoolExecutor(1, "perception"))
+            second = self._open.enter_context(closing(SecondProcess(slam, frames.sequence)))
+            self._second = second if second.can else None
+        self._thread = ThreadPoolExecutor(1, "perception") if ahead and self._second is None else None
+        if self._thread is not None:
+            self._open.callback(self._thread.shutdown, cancel_futures=True)
 
-        def begin() -> Callable[[], Percept | None]:
-            outlook = slam.next_outlook
-            return thread.submit(look, outlook).result if ahead else partial(look, outlook)
+    def __iter__(self) -> Iterator[Percept]:
+        """Go on with the next frame.
 
-        upcoming = begin()
-        while (percept := upcoming()) is not None:
-            slam.next_outlook = slam.outlook()
-            upcoming = begin()
+        Raises:
+            V3DError: a frame cannot be read; those before have been given.
+        """
+        slam = self._slam
+        upcoming = deque(map(self._begin, slam.outlooks, range(len(slam.outlooks))))
+        while (percept := upcoming.popleft()()) is not None:
+            upcoming.append(self._begin(slam.look_further(), len(upcoming)))
             yield percept
 
+    def close(self) -> None:
+        """End the thread or the process."""
+        self._open.close()
 
-def _look(frames: Iterator[RGBDFrame], slam: V3DSLAM, inference: bool, outlook: Outlook | None) -> Percept | None:
-    """Read the next frame and look at it, here; None behind the last. ``inference`` tells whether without gradients."""
-    clock = StageClock()
-    with clock("read"):
-        frame = next(frames, None)
-    if frame is None:
-        return None
-    with torch.inference_mode(inference):
-        percept = slam.perceive(frame, outlook)
-    return replace(percept, seconds={**clock.seconds, **percept.seconds})
+    def _begin(self, outlook: Outlook | None, waiting: int) -> Upcoming:
+        """Let a frame be looked at, behind those that are waited for already."""
+        look = partial(self._look, torch.is_inference_mode_enabled(), outlook)
+        if self._second is not None and isinstance(self._frames, Following) and waiting < self._frames.left:
+            self._second.ask(self._frames.index + waiting, outlook)
+            return partial(self._look_there, self._second, self._frames, look)
+        return look if self._thread is None else self._thread.submit(look).result
 
+    def _look(self, inference: bool, outlook: Outlook | None) -> Percept | None:
+        """Read the next frame and look at it, here; ``inference`` tells whether without gradients."""
+        clock = StageClock()
+        with clock("read"):
+            frame = next(self._frames, None)
+        if frame is None:
+            return None
+        with torch.inference_mode(inference):
+            percept = self._slam.perceive(frame, outlook)
+        return replace(percept, seconds={**clock.seconds, **percept.seconds})
 
-def _look_there(
-    second: SecondProcess,
-    frames: Following,
-    look_here: Callable[[Outlook | None], Percept | None],
-    outlook: Outlook | None,
-) -> Percept | None:
-    """Let the second process do that, as soon as it is up and as long as it can."""
-    percept = second.look(frames.index, outlook) if frames.left else None
-    if percept is None:
-        return look_here(outlook)
-    frames.index += 1
-    return percept
+    def _look_there(self, second: SecondProcess, frames: Following, look_here: Upcoming) -> Percept | None:
+        """What the second process saw, as long as it can."""
+        percept = second.answer()
+        if percept is None:
+            return look_here()
+        frames.index += 1
+        return percept
 
 
 def _cores() -> int:

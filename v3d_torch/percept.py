@@ -12,6 +12,10 @@ from v3d_torch.objects.lift import ObjectClouds
 from v3d_torch.odometry.orb import Features
 from v3d_torch.types import Instances, RGBDFrame
 
+AHEAD = 2
+"""Frames that may be looked at before their turn: a frame that becomes a keyframe takes twice as long to take in as
+others, and what looks at the frames goes on meanwhile."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked(Scene):

@@ -18,7 +18,7 @@ from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.files import write_png
-from v3d_torch.lookahead import percepts
+from v3d_torch.lookahead import Lookahead
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.views import StaticViews
 from v3d_torch.objects.dynamics import Judged, Scene, Verdict
@@ -102,6 +102,7 @@ class Pipeline:
         self._masks = masks
         self._viewer = viewer
         self._step = 1
+        self._percepts: Lookahead | None = None
 
     @property
     def frames(self) -> int:
@@ -116,20 +117,20 @@ class Pipeline:
         Args:
             on_frame: called after each frame.
         """
-        start = time.perf_counter() - self.run.seconds
         self.run.failure, self.run.interrupted = None, False
-        ahead = self.slam.config.lookahead
+        before, start = self.run.seconds, time.perf_counter()
         try:
             # Nobody learns through a run: to keep no gradients in mind saves a tenth of the time.
-            with torch.inference_mode(), closing(percepts(self._coming(), self.slam, ahead=ahead)) as coming:
-                for percept in coming:
+            with torch.inference_mode(), closing(self.get_ready()) as percepts:
+                start = time.perf_counter()
+                for percept in percepts:
                     self.whole = False
                     frame, scene = percept.frame, self.slam.take_in(percept)
                     seconds = self.slam.clock.lap()
                     self.run.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
                     self._note(frame, scene)
                     self._viewer.show(frame, scene, self.slam, seconds)
-                    self.run.seconds, self.whole = time.perf_counter() - start, True
+                    self.run.seconds, self.whole = before + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, scene, self.slam.poses.statuses[-1])
         except V3DError as error:
@@ -143,12 +144,18 @@ class Pipeline:
             if isinstance(self.sequence, Sized):
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
                 self.run.failure = f"interrupted after {done} of {total} frames"
-        self.run.seconds = time.perf_counter() - start
+        self.run.seconds, self._percepts = before + time.perf_counter() - start, None
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:
             self.run.failure = self.run.failure or str(error)
         return self.run
+
+    def get_ready(self) -> Lookahead:
+        """What looks at the frames, begun and up, which may take seconds: a call does it first of all."""
+        if self._percepts is None:
+            self._percepts = Lookahead(self._coming(), self.slam, ahead=self.slam.config.lookahead)
+        return self._percepts
 
     @torch.inference_mode()
     def settle(self) -> None:

@@ -2,24 +2,25 @@
 
 Two threads of Python wait for each other: a frame is a thousand small operations, and only one thread at a time may
 begin one. Two processes do not, but a new one takes seconds until it is up, and has libraries and network of its own in
-memory.
+memory. It is asked for some frames ahead, so that neither waits for the other while a frame takes longer than most.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import select
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 
 from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.mapping.recorder import Outlook
-from v3d_torch.percept import Percept
+from v3d_torch.percept import AHEAD, Percept
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.timing import StageClock
 from v3d_torch.types import memory_of, remind
@@ -30,27 +31,35 @@ _LOG = logging.getLogger(__name__)
 _STAGES = "segment", "smooth", "detect", "lift"
 """Those that look at a frame by itself, as attributes of `V3DSLAM`."""
 
+_LONGEST = 120.0
+"""Seconds after which a process that is not up is taken to hang."""
+
 _COMMAND = "from v3d_torch.second_process import serve; serve(*{})"
+
+_Given = TypeVar("_Given")
 
 
 class SecondProcess:
-    """Looks at frames as `V3DSLAM.perceive` does, to the bit, in a process of its own.
+    """Looks at frames as `V3DSLAM.perceive` does, to the bit, in a process of its own, which is up when this is made.
 
     What it cannot do, whatever the reason, it leaves to the one who asks, who then sees the error where it arises.
 
     Args:
-        slam: whose stages are taken along.
+        slam: whose stages are taken along, and what its segmentation remembers.
         sequence: of the frames.
+
+    Attributes:
+        can: whether it can still look at frames.
     """
 
     def __init__(self, slam: V3DSLAM, sequence: StoredFrames) -> None:
         self._slam = slam
         self._sequence = sequence
-        self._told = self._ready = self._gone = False
+        self.can = True
         self._process: subprocess.Popen[bytes] | None = None
         ours, theirs = socket.socketpair()
-        arena = new_arena()
-        self._channel = Channel(ours, arena)
+        arena = new_arena(AHEAD)
+        self._channel = Channel(ours, arena, AHEAD)
         taken_along = [theirs.fileno()] if arena is None else [theirs.fileno(), arena]
         with theirs:
             try:
@@ -65,31 +74,30 @@ class SecondProcess:
                     start_new_session=True,
                 )
             except (OSError, ValueError):  # no more processes, or Windows
-                self._gone = True
+                self.can = False
         if arena is not None:
             os.close(arena)
+        try:
+            self._try(self._greet)
+        except BaseException:
+            self.close()
+            raise
 
-    def look(self, index: int, outlook: Outlook | None) -> Percept | None:
-        """Read and look at a frame.
+    def ask(self, index: int, outlook: Outlook | None) -> None:
+        """Let it read and look at a frame, behind those that it was asked for and has not answered, fewer than `AHEAD`.
 
         Args:
-            index: of the frame.
+            index: of the frame; the segmentation goes by those before, so they come in order.
             outlook: see `V3DSLAM.perceive`.
-
-        Returns:
-            None while the process is not up, and when it cannot.
         """
-        segment = self._slam.segment
-        try:
-            if self._gone or not self._is_ready():
-                return None
-            self._channel.send((index, outlook, memory_of(segment)))
-            percept: Percept = self._channel.receive()
-        except Exception:  # it has ended, or is to look with what cannot be sent
-            _LOG.debug("the second process looks at no more frames", exc_info=True)
-            self._gone = True
+        self._try(lambda: self._channel.send((index, outlook)))
+
+    def answer(self) -> Percept | None:
+        """What the next of these frames shows; None when it cannot tell."""
+        percept: Percept | None = self._try(self._channel.receive)
+        if percept is None:
             return None
-        remind(segment, percept.memory)
+        remind(self._slam.segment, percept.memory)
         return replace(percept, frame=replace(percept.frame, camera=self._sequence.camera))
 
     def close(self) -> None:
@@ -99,17 +107,26 @@ class SecondProcess:
             self._process.kill()
             self._process.wait()
 
-    def _is_ready(self) -> bool:
-        """Whether it is up: first it is told what to look with, then it is ready."""
-        while not self._ready and select.select([self._channel.connection], [], [], 0)[0]:
-            self._channel.receive()
-            if self._told:
-                self._ready = True
-            else:
-                slam, self._told = self._slam, True
-                stages = {name: getattr(slam, name) for name in _STAGES}
-                self._channel.send((type(slam), slam.camera, slam.config, stages, self._sequence))
-        return self._ready
+    def _greet(self) -> None:
+        """Wait until it has begun, tell it what to look with, and wait until it can."""
+        slam, channel = self._slam, self._channel
+        channel.connection.settimeout(_LONGEST)
+        channel.receive()
+        stages = {name: getattr(slam, name) for name in _STAGES}
+        channel.send((type(slam), slam.camera, slam.config, stages, memory_of(slam.segment), self._sequence))
+        channel.receive()
+        channel.connection.settimeout(None)
+
+    def _try(self, step: Callable[[], _Given]) -> _Given | None:
+        """What a step gives; None once one of them failed."""
+        if not self.can:
+            return None
+        try:
+            return step()
+        except Exception:  # it has ended, or is to look with what cannot be sent
+            _LOG.debug("the second process looks at no more frames", exc_info=True)
+            self.can = False
+            return None
 
 
 @torch.inference_mode()
@@ -120,16 +137,16 @@ def serve(connection: int, arena: int | None = None) -> None:
         connection: descriptor of the socket to the one who started it.
         arena: of the memory that they share.
     """
-    channel = Channel(socket.socket(fileno=connection), arena)
+    channel = Channel(socket.socket(fileno=connection), arena, AHEAD)
     channel.send(None)
-    kind, camera, config, stages, sequence = channel.receive()
+    kind, camera, config, stages, memory, sequence = channel.receive()
     torch.set_num_threads(config.threads)
     slam: V3DSLAM = kind(camera, stages["segment"], config)
     vars(slam).update(stages)
+    remind(slam.segment, memory)
     channel.send(None)
     while True:
-        index, outlook, memory = channel.receive()
-        remind(slam.segment, memory)
+        index, outlook = channel.receive()
         clock = StageClock()
         with clock("read"):
             frame = sequence[index]

@@ -29,7 +29,7 @@ from v3d_torch.odometry.odometry import Odometry, View
 from v3d_torch.odometry.orb import ORB, Features
 from v3d_torch.odometry.shutter import RollingShutter
 from v3d_torch.odometry.tracker import MapTracker
-from v3d_torch.percept import Percept, Tracked
+from v3d_torch.percept import AHEAD, Percept, Tracked
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.timing import StageClock
 from v3d_torch.types import RGBDFrame, Segmenter, memory_of
@@ -49,7 +49,7 @@ class V3DSLAM:
 
     Attributes:
         camera: of all frames; None before the first, where it was not given.
-        next_outlook: with which the next frame is to be looked at, see `perceive`.
+        outlooks: with which each of the next `AHEAD` frames is to be looked at, see `perceive`.
 
     Raises:
         WeightsError: the network's weights are not to be had.
@@ -71,7 +71,7 @@ class V3DSLAM:
         self._last: View | None = None
         self._memory: object = None
         self._known = known
-        self.next_outlook = self.outlook()
+        self.outlooks = [self.outlook()] * AHEAD
         self.camera: PinholeCamera | None = None
         if camera is not None:
             self._set_up(camera)
@@ -105,21 +105,26 @@ class V3DSLAM:
             ConfigError: nobody said which camera took the first frame; a stage of the user's gave what it should not.
             InputError: it is no frame, or not of this camera, or not after the last one.
         """
-        percept = self.perceive(frame, self.next_outlook)
-        self.next_outlook = self.outlook()
+        percept = self.perceive(frame, self.outlooks[0])
+        self.look_further()
         return self.take_in(percept)
 
     def outlook(self) -> Outlook | None:
         """How the camera is expected to go on; None in a known map as long as nobody knows where."""
         return self.poses.outlook() if self.poses.located or self._known is None else None
 
+    def look_further(self) -> Outlook | None:
+        """Note, before a frame is taken in, with which outlook the one `AHEAD` frames later is to be looked at."""
+        self.outlooks = [*self.outlooks[1:], self.outlook()]
+        return self.outlooks[-1]
+
     def perceive(self, frame: RGBDFrame, outlook: Outlook | None) -> Percept:
         """Look at a frame by itself: nothing of what follows the camera is touched.
 
         Args:
             frame: the next one.
-            outlook: how the camera was expected to go on before the frame before was taken in, which tells up from
-                down; see `percepts`, which runs this ahead.
+            outlook: how the camera was expected to go on `AHEAD` frames before, which tells up from down; see
+                `Lookahead`, which runs this ahead.
 
         Raises:
             ConfigError: nobody said which camera took the first frame; the segmenter gave no instances.

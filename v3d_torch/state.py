@@ -36,7 +36,7 @@ State = dict[str, Any]
 """Values of attributes by their names, one graph: what two of them share is shared."""
 
 OF_SLAM = (
-    *("clock", "poses", "next_outlook", "_memory", "_last"),
+    *("clock", "poses", "outlooks", "_memory", "_last"),
     *(f"mapper.map.{name}" for name in ("keyframes", "landmarks", "observations", "loops", "readout")),
     *("mapper._most_tracked", "mapper._untracked_since", "loops.count", "back_end.keyframe"),
     *("watch._views", "judge._last_stamp", "judge.tracker.tracks", "judge.tracker._next_id"),

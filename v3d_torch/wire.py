@@ -8,7 +8,7 @@ import socket
 import struct
 from collections.abc import Callable, Sequence
 from io import BytesIO
-from itertools import accumulate, pairwise
+from itertools import accumulate, cycle, pairwise
 from mmap import mmap
 from typing import Any
 
@@ -20,7 +20,11 @@ from torch import Tensor
 _NUMBER = struct.Struct("!Q")
 
 ARENA = 1 << 26
-"""Bytes of the memory that two processes share: no more of it is taken than the frames need, at 640x480 about 5 MB."""
+"""Bytes of the memory that two processes share, for each value on its way: no more of it is taken than the values need,
+for a frame of 640x480 about 5 MB."""
+
+_SMALL = 1 << 14
+"""Bytes up to which a value goes by the connection, which holds them until they are asked for."""
 
 
 _KNOWN = {
@@ -33,28 +37,34 @@ _KNOWN = {
 """What comes beside this package's own classes and functions."""
 
 
-def new_arena() -> int | None:
-    """Descriptor of memory for both ends of a channel; None where the system has none of this kind."""
+def new_arena(values: int) -> int | None:
+    """Descriptor of memory for both ends of a channel; None where the system has none of this kind.
+
+    Args:
+        values: see `Channel`.
+    """
     if not hasattr(os, "memfd_create"):
         return None
     descriptor = os.memfd_create("v3d_torch")
-    os.truncate(descriptor, ARENA)
+    os.truncate(descriptor, values * ARENA)
     return descriptor
 
 
 class Channel:
-    """One end of a connection between a process and another that it started, which speak in turns.
+    """One end of a connection between a process and another that it started.
 
-    What tensors hold goes through memory that both share, as it lies there, masks as a bit a pixel.
+    What the tensors of large values hold goes through memory that both share, as it lies there, masks as a bit a pixel.
 
     Args:
         connection: to the other end; is closed with this one.
         arena: descriptor of the shared memory; None sends all by the connection. It is the caller's to close.
+        values: most large ones that are on their way at a time, all of them from one end.
     """
 
-    def __init__(self, connection: socket.socket, arena: int | None) -> None:
+    def __init__(self, connection: socket.socket, arena: int | None, values: int) -> None:
         self.connection = connection
-        self._arena = None if arena is None else mmap(arena, ARENA)
+        self._arena = None if arena is None else mmap(arena, values * ARENA)
+        self._places = cycle(range(0, values * ARENA, ARENA))
 
     def send(self, value: object) -> None:
         """Send a value.
@@ -69,10 +79,11 @@ class Channel:
         parts = [stream.getbuffer(), *(buffer.raw() for buffer in buffers)]
         sizes = [part.nbytes for part in parts]
         self.connection.sendall(b"".join(map(_NUMBER.pack, (len(parts), *sizes))))
-        if self._arena is not None and sum(sizes) <= ARENA:
-            for part, (begin, end) in zip(parts, pairwise(accumulate(sizes, initial=0)), strict=True):
+        if self._arena is not None and _SMALL < sum(sizes) <= ARENA:
+            place = next(self._places)
+            for part, (begin, end) in zip(parts, pairwise(accumulate(sizes, initial=place)), strict=True):
                 self._arena[begin:end] = part
-            self.connection.sendall(b"!")
+            self.connection.sendall(_NUMBER.pack(place))
         else:
             for part in parts:
                 self.connection.sendall(part)
@@ -87,9 +98,9 @@ class Channel:
         """
         (count,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
         sizes = [size for (size,) in _NUMBER.iter_unpack(self._exactly(count * _NUMBER.size))]
-        if self._arena is not None and sum(sizes) <= ARENA:
-            self._exactly(1)
-            ends = pairwise(accumulate(sizes, initial=0))
+        if self._arena is not None and _SMALL < sum(sizes) <= ARENA:
+            (place,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
+            ends = pairwise(accumulate(sizes, initial=place))
             parts = [_writable(memoryview(self._arena)[begin:end]) for begin, end in ends]
         else:
             parts = [self._exactly(size) for size in sizes]
@@ -113,7 +124,7 @@ class Channel:
 
 
 def _writable(shared: memoryview) -> memoryview:
-    """A copy, for the next value takes the place of this one."""
+    """A copy, for another value takes the place of this one."""
     return np.frombuffer(shared, np.uint8).copy().data
 
 

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 from replay import Replay
 
 from contenders import OURS, PEERS
@@ -34,9 +35,11 @@ def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | Non
 
 
 def cpu_time() -> float:
-    """Seconds of all threads, and of processes that were begun and have ended."""
+    """Seconds of all threads of this process, and of those that it began, ended or not."""
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    mine = times.user + times.system + times.children_user + times.children_system
+    running = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
+    return mine + sum(child.user + child.system for child in running)
 
 
 def main() -> None:

@@ -41,6 +41,7 @@ class Ours:
         self.pipeline = Pipeline(sequence, self.slam)
         # True masks, where a sequence has any, are compared in time of their own.
         self.pipeline.run.unscored = "this run is for the trajectory and the time"
+        self.pipeline.get_ready()
 
     @property
     def stages(self) -> Mapping[str, float]:

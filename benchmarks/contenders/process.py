@@ -30,7 +30,7 @@ class Measured:
         trajectory: None where it found no pose.
         frames: of the sequence that were given to it.
         seconds: from before the first frame is read until the last has a pose.
-        cpu_seconds: of all threads of its process in that time, user and system.
+        cpu_seconds: of all threads of its processes in that time, user and system.
         stages: seconds by stage, where it tells them.
     """
 
