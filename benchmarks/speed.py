@@ -27,7 +27,7 @@ REFERENCE = "pyorbslam3"
 CONTENDERS = (*OURS, *PEERS)
 ABOUT = (
     "Each run is a process of its own. Times are from before the first frame is read until the last has a pose: reading"
-    " and decoding of the images are in them; imports, loading of network or vocabulary, the begin of the second process,"
+    " and decoding of the images are in them; imports, loading of network or vocabulary, begin of the second process,"
     " what ORB-SLAM3's threads still map after the last frame, and writing of results are not."
     " CPU time is that of all threads, and of a second process, user and system. Ratios are to pyorbslam3's run of the"
     " same turn: above 1, more frames a second, or more CPU time. Values are the median [lowest-highest] of the turns."
