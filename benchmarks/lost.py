@@ -30,6 +30,7 @@ from v3d_torch.lie import invert, se3_log
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.segmentation import NoSegmentation, StoredMasks
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.threads import share_out
 from v3d_torch.types import Instances, RGBDFrame, Trajectory
 
 COVERED = NOWHERE = -1
@@ -145,7 +146,7 @@ class Result:
 
 def follow(sequence: RGBDSequence, case: Case, config: Config, masks: Path | None) -> Result:
     """Run a case; without masks nobody is left out."""
-    torch.set_num_threads(config.threads)
+    share_out(config.threads)
     torch.manual_seed(config.seed)
     segment = NoSegmentation() if masks is None else MaskedWay(sequence, case, masks)
     slam = V3DSLAM(sequence.camera, segment, config)

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 
-import torch
 from command import command_line, publish
 from heading import heading
 from sequences import located
@@ -28,6 +27,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.threads import share_out
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 SERIAL = ("lookahead=false",)  # as in v3d_torch/run.py
@@ -85,7 +85,7 @@ def compare(sequence: RGBDSequence) -> Iterator[str]:
     reference: dict[int, Tensor] = {}
     for name, variant in VARIANTS.items():
         config = load_config(overrides=[*SERIAL, *variant.overrides])
-        torch.set_num_threads(config.threads)
+        share_out(config.threads)
         watched = Watched(make_segmenter(config.segmentation), variant.every)
         pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, watched, config))
         run = pipeline()

@@ -414,9 +414,9 @@ class Config(Section):
     seed: int = Field(0, ge=0, lt=1 << 63)
     """Seed of every random choice."""
     threads: int = Field(1, gt=0, le=256)
-    """Threads of torch: the tensors of a frame are so small that more threads wait for each other."""
+    """Threads of torch and OpenCV: the tensors of a frame are so small that more threads wait for each other."""
     lookahead: bool = True
-    """Whether the next frame is read, segmented and lifted while one is tracked, in another thread and, where a stored
+    """Whether the next frames are read, segmented and lifted while one is tracked, in another thread or, where a stored
     sequence is long enough, another process, and the map adjusted behind in a thread; the results are the same."""
     check_numerics: bool = False
     """Debug mode: whatever leaves a stage is looked through for NaN and infinity, and the first stage that gives some

@@ -29,6 +29,7 @@ from v3d_torch.request import Request
 from v3d_torch.results import write_results
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.threads import share_out
 from v3d_torch.types import RGBDFrame, Segmenter
 from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
 
@@ -69,7 +70,7 @@ def run_logged(
         OutputError: when the results cannot be written.
     """
     write_text(folder / "config.yaml", dump_config(config))  # where this has no room, an hour's results have none
-    torch.set_num_threads(config.threads)
+    share_out(config.threads)
     torch.manual_seed(config.seed)
     masks = folder / "masks" if save_masks else None
     system = CheckedSLAM if config.check_numerics else V3DSLAM

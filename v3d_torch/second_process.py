@@ -22,6 +22,7 @@ from v3d_torch.datasets.stored import StoredFrames
 from v3d_torch.mapping.recorder import Outlook
 from v3d_torch.percept import AHEAD, Percept
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.threads import share_out
 from v3d_torch.timing import StageClock
 from v3d_torch.types import memory_of, remind
 from v3d_torch.wire import Channel, new_arena
@@ -140,7 +141,7 @@ def serve(connection: int, arena: int | None = None) -> None:
     channel = Channel(socket.socket(fileno=connection), arena, AHEAD)
     channel.send(None)
     kind, camera, config, stages, memory, sequence = channel.receive()
-    torch.set_num_threads(config.threads)
+    share_out(config.threads)
     slam: V3DSLAM = kind(camera, stages["segment"], config)
     vars(slam).update(stages)
     remind(slam.segment, memory)

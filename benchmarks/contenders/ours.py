@@ -11,6 +11,7 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.pipeline import FrameCallback, Pipeline
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.threads import share_out
 from v3d_torch.types import Trajectory
 
 OVERRIDES = {
@@ -35,7 +36,7 @@ class Ours:
 
     def __init__(self, sequence: RGBDSequence, name: str, seed: int) -> None:
         config = load_config(overrides=[f"seed={seed}", *OVERRIDES[name]])
-        torch.set_num_threads(config.threads)
+        share_out(config.threads)
         torch.manual_seed(seed)
         self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
         self.pipeline = Pipeline(sequence, self.slam)

@@ -10,8 +10,6 @@ from itertools import islice
 from threading import Event
 from typing import Any
 
-import cv2
-
 from v3d_torch.console import interrupts_between_frames
 from v3d_torch.errors import InputError
 from v3d_torch.jobs.executor import Advanced, Ended
@@ -129,7 +127,6 @@ class _Board:
 def _run(job: Job, index: int, board: Any) -> str | None:
     """The whole life of a process."""
     with interrupts_between_frames() as cancelled:  # Ray cancels a task as Ctrl-C does
-        cv2.setNumThreads(1)  # the others follow OMP_NUM_THREADS, which Ray sets to the number of cores of a task
 
         def report(frames: int) -> None:
             board.report.remote(index, frames)  # nobody waits: a task that does gives its core to another one

@@ -9,7 +9,10 @@ from typing import Protocol
 
 from v3d_torch.jobs.job import Job
 
-THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+THREADS = dict.fromkeys(
+    (*("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "OPENCV_FOR_THREADS_NUM", "RAYON_NUM_THREADS"),
+    "1",
+)
 """Environment of a run that shares its machine with others: no library starts threads of its own."""
 
 
