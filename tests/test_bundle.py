@@ -95,6 +95,27 @@ def test_step_equals_dense_solution() -> None:
     torch.testing.assert_close(torch.cat([xi.flatten(), shift.flatten()]), expected, rtol=1e-7, atol=1e-9)
 
 
+def test_profile_is_that_of_the_cost_adjusted_anew() -> None:
+    """Its derivatives are those of the least costs when all is seen a little to one side and to the other."""
+    scene = Scene(poses=4, points=40, seen_by=3)
+    drift = 5.0 * torch.randn(len(scene.observations.uv), 2, generator=torch.Generator().manual_seed(5)).double()
+    here = bundle_adjust(
+        scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
+    )
+
+    def cost(step: float) -> float:
+        seen = replace(scene.observations, uv=scene.observations.uv + step * drift)
+        return bundle_adjust(
+            here.T_cw, here.points, seen, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
+        ).cost_after
+
+    step = 1e-3
+    less, same, more = cost(-step), cost(0.0), cost(step)
+    first, second = here.errors.profile(drift)
+    assert first == pytest.approx((more - less) / (2 * step), rel=1e-3)
+    assert second == pytest.approx((more - 2 * same + less) / step**2, rel=0.05)
+
+
 def test_same_optimum_as_scipy() -> None:
     scene = Scene(poses=3, points=12, seen_by=3)
     limit = scene.observations.limit

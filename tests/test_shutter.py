@@ -95,22 +95,22 @@ def test_of_no_features_there_are_none() -> None:
 @settings(deadline=None, max_examples=50)
 @given(st.floats(0, 0.03), st.floats(0, 0.03), st.floats(1e3, 1e8), st.floats(1e3, 1e8))
 def test_of_gaussian_costs_the_mean_by_information_is_learnt(a: float, b: float, known: float, told: float) -> None:
-    learnt = learn_readout(Readout(a, known), lambda seconds: 7.0 + told * (seconds - b) ** 2)
-    assert learnt.information == pytest.approx(0.8 * known + 0.1 * told, rel=1e-3)
-    assert learnt.seconds == pytest.approx((0.8 * known * a + 0.1 * told * b) / learnt.information, abs=1e-5)
+    learnt = learn_readout(Readout(a, known), slope=2 * told * (a - b), curvature=2 * told)
+    assert learnt.information == pytest.approx(0.8 * known + 0.1 * told, rel=1e-12)
+    assert learnt.seconds == pytest.approx((0.8 * known * a + 0.1 * told * b) / learnt.information, abs=1e-9)
 
 
-@pytest.mark.parametrize("bend", [0.0, -1e6])
-def test_costs_without_a_bottom_teach_nothing(bend: float) -> None:
-    assert learn_readout(KINECT, lambda seconds: 5.0 + bend * seconds**2) == KINECT
+@pytest.mark.parametrize("curvature", [0.0, -1e6])
+def test_costs_without_a_bottom_teach_nothing(curvature: float) -> None:
+    assert learn_readout(KINECT, slope=5.0, curvature=curvature) == KINECT
 
 
-def test_a_camera_that_is_known_for_sure_is_not_asked() -> None:
-    assert learn_readout(GLOBAL_SHUTTER, lambda seconds: pytest.fail(f"asked for {seconds}")) == GLOBAL_SHUTTER
+def test_a_camera_that_is_known_for_sure_learns_nothing() -> None:
+    assert learn_readout(GLOBAL_SHUTTER, slope=5.0, curvature=1e6) == GLOBAL_SHUTTER
 
 
 def test_no_camera_takes_longer_than_it_can() -> None:
-    learnt = learn_readout(Readout(0.01, 1.0), lambda seconds: 1e6 * (seconds - 3.0) ** 2)
+    learnt = learn_readout(Readout(0.01, 1.0), slope=-2e6 * 2.99, curvature=2e6)
     assert learnt.seconds == pytest.approx(Readout.LONGEST, abs=1e-6)
 
 

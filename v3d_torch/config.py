@@ -356,7 +356,7 @@ class ShutterConfig(Section):
     sigma: float = Field(0.02, gt=0)
     """How sure that is, standard deviation, seconds: a rolling shutter takes most of the time between two frames."""
     keyframes: int = Field(20, ge=0)
-    """So many keyframes ask the map, and then every tenth: each time takes three bundle adjustments."""
+    """So many keyframes ask the map, and then every tenth: what was learnt moves all that the map has seen."""
 
 
 class MeshConfig(Section):

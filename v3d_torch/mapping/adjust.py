@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -85,23 +84,18 @@ def adjust_locally(
         pose=pose,
         point=point,
     )
-    adjust = partial(
-        bundle_adjust,
-        camera=camera,
-        fixed=fixed,
+    found = bundle_adjust(
+        T_cw[poses],
+        sparse_map.landmarks["point"][landmarks],
+        observations,
+        camera,
+        fixed,
         iterations=config.mapping.bundle_iterations,
         tolerance=config.mapping.bundle_tolerance,
     )
-    found = adjust(T_cw[poses], sparse_map.landmarks["point"][landmarks], observations)
-
-    def cost(seconds: float) -> float:
-        later = seconds - sparse_map.readout.seconds
-        seen = replace(observations, uv=observations.uv + later * table["drift"].index_select(0, rows))
-        return adjust(found.T_cw, found.points, seen).cost_after
-
     readout = sparse_map.readout
     if config.shutter.enabled and (keyframe.index <= config.shutter.keyframes or keyframe.index % _SELDOM == 0):
-        readout = learn_readout(readout, cost)
+        readout = learn_readout(readout, *found.errors.profile(table["drift"].index_select(0, rows)))
     T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
     return Adjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit], readout)
 

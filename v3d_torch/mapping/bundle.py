@@ -8,7 +8,7 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -53,6 +53,7 @@ class BundleResult:
         cost_before: sum of robust squared errors at the start.
         cost_after: the same at the end.
         iterations: steps tried.
+        errors: at the end.
     """
 
     T_cw: Tensor
@@ -61,6 +62,7 @@ class BundleResult:
     cost_before: float
     cost_after: float
     iterations: int
+    errors: Errors
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,30 @@ class Errors:
         """The robust cost linearised, once for however many steps are tried from there."""
         return self.bundle.linearise(self)
 
+    def profile(self, drift: Tensor) -> tuple[float, float]:
+        r"""How the cost would go on if all was seen elsewhere, and adjusted anew: as far as it is a parabola.
+
+        With the errors' change :math:`j` by that and their Jacobian :math:`J` by poses and points, these follow by
+        :math:`-(J^T W J)^{-1} J^T W j`, and what is left of :math:`j` changes the cost.
+
+        Args:
+            drift: of the places where it was seen, pixels for one of whatever unit, float64, shape :math:`(M, 2)`.
+
+        Returns:
+            First and second derivative of the cost by that unit.
+        """
+        j = self.bundle.moved(drift)
+        here, change = self.normal_equations, replace(self, residuals=j).normal_equations
+        xi, moved = solve_normal_equations(change, _NEXT_TO_NONE)
+        first, second = (
+            float((self.weights * j * of).sum() + (xi * by.U[..., 6]).sum() + (moved.T * by.V[:, 3]).sum())
+            for of, by in ((self.residuals, here), (j, change))
+        )
+        return 2 * first, 2 * second
+
+
+_NEXT_TO_NONE = 1e-9
+"""Damping of a step that is to be taken whole."""
 
 State = tuple[Tensor, Tensor]  # T_cw (K, 4, 4), points (P, 3)
 
@@ -120,7 +146,7 @@ def bundle_adjust(
     found = levenberg_marquardt((T_cw, points), bundle.errors_at, bundle.step, iterations, tolerance)
     T_cw, points = found.state
     chi2 = bundle.as_given(chi_square(found.system.in_camera.T, found.system.residuals.T))
-    return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations)
+    return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, found.system)
 
 
 class Bundle:
@@ -141,6 +167,7 @@ class Bundle:
         self._row, self._order = row[observations.pose].sort(stable=True)
         self._counts = torch.bincount(self._row, minlength=len(self._free))[: len(self._free)].tolist()
         self._pose, self._point = observations.pose[self._order], observations.point[self._order]
+        self._focal = torch.tensor([[camera.fx], [camera.fy]], dtype=torch.float64)
         target = whitened(observations, camera)
         self._target = Whitened(target.scale[:, self._order], target.offset[:, self._order])
         self._limit = observations.limit[self._order]
@@ -148,6 +175,12 @@ class Bundle:
     def as_given(self, of_each: Tensor) -> Tensor:
         """Numbers of the sorted observations, (M,), in the order in which these were given."""
         return torch.empty_like(of_each).index_copy_(0, self._order, of_each)
+
+    def moved(self, drift: Tensor) -> Tensor:
+        """How the errors change when what is seen moves by drift, pixels as given, (M, 2); shape :math:`(3, M)`."""
+        change = torch.zeros_like(self._target.scale)
+        change[:2] = self._target.scale[:2] * -drift[self._order].T / self._focal
+        return change
 
     def errors_at(self, state: State) -> tuple[float, Errors]:
         """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""

@@ -1,19 +1,16 @@
 """How long the camera takes to read an image, by what explains the map best.
 
 Rows that are read late bend the image of a camera that turns; a map bent alike explains it as well, until the camera
-turns another way. So the same neighbourhood is adjusted for three readouts: where the parabola through their costs has
-its bottom, and how steep it is, tell the readout and how sure it is.
+turns another way. So a neighbourhood that was adjusted is asked what it would cost at another readout, all poses and
+points adjusted anew: where the parabola of that cost has its bottom, and how steep it is, tell the readout and how sure
+it is.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from v3d_torch.odometry.shutter import Readout
-
-_STEP = 0.005
-"""Seconds between the readouts that are tried: 1 pixel at the image's edge in a turn of 1 rad/s."""
 
 _MEMORY = 0.8
 """Weight of what was known before: neighbourhoods of keyframes that follow each other share most observations, and the
@@ -24,24 +21,21 @@ _TRUST = 0.1
 readouts that TUM's and 7-Scenes' sequences tell are off by three times what independent errors would do."""
 
 
-def learn_readout(known: Readout, cost: Callable[[float], float]) -> Readout:
+def learn_readout(known: Readout, slope: float, curvature: float) -> Readout:
     """The readout as it was known and the one that costs least, in one.
 
     Args:
         known: so far.
-        cost: twice the negative log-likelihood of a readout of so many seconds.
+        slope: first derivative of the cost, twice the negative log-likelihood, by the seconds of the readout, there.
+        curvature: second derivative.
 
     Returns:
         ``known`` where that is sure, and where no readout costs less than others: the camera stood still, or always
         moved alike.
     """
-    if math.isinf(known.information):
+    if math.isinf(known.information) or curvature <= 0:
         return known
-    less, same, more = (cost(known.seconds + change) for change in (-_STEP, 0.0, _STEP))
-    curvature = (more - 2 * same + less) / _STEP**2
-    if curvature <= 0:
-        return known
-    bottom = known.seconds - (more - less) / (2 * _STEP) / curvature
+    bottom = known.seconds - slope / curvature
     before, told = _MEMORY * known.information, _TRUST * curvature / 2
     seconds = (before * known.seconds + told * min(max(bottom, -Readout.LONGEST), Readout.LONGEST)) / (before + told)
     return Readout(seconds, before + told)
