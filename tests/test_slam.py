@@ -106,6 +106,7 @@ def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
         ({"depth": np.ones((480, 640), complex)}, "the depth image is complex128; give metres"),
         ({"stamp": math.nan}, "the stamp is nan; give seconds"),
         ({"stamp": None}, "the stamp is None; give seconds"),
+        ({"delay": math.inf}, "the delay is inf; give seconds"),
         ({"camera": np.eye(3)}, "the camera is a ndarray; give a PinholeCamera"),
         (
             {"camera": PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240)},

@@ -79,6 +79,7 @@ class Pipeline:
         masks: folder for an image per frame of what was left out of tracking; None for none.
         viewer: looks on.
         views: of the keyframes of a known map; None for none.
+        score: whether masks are compared with the true ones, where there are any.
 
     Attributes:
         whole: whether no frame is half taken in.
@@ -93,6 +94,8 @@ class Pipeline:
         masks: Path | None = None,
         viewer: Viewer = NULL_VIEWER,
         views: StaticViews | None = None,
+        *,
+        score: bool = True,
     ) -> None:
         self.sequence = sequence
         self.slam = slam
@@ -101,6 +104,7 @@ class Pipeline:
         self.whole = True
         self._masks = masks
         self._viewer = viewer
+        self._score = score
         self._step = 1
         self._percepts: Lookahead | None = None
 
@@ -198,7 +202,7 @@ class Pipeline:
 
     def _evaluate_masks(self, frame: RGBDFrame, scene: Scene) -> None:
         truth = None
-        if isinstance(self.sequence, KnowsWhoMoves) and self.run.unscored is None:
+        if self._score and isinstance(self.sequence, KnowsWhoMoves) and self.run.unscored is None:
             try:
                 truth = self.sequence.who_moves(frame.index)
             except InputError as error:  # the truth is for the scores only

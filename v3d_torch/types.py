@@ -65,9 +65,10 @@ class RGBDFrame:
             delay: of the depth image, seconds after the colour image.
 
         Raises:
-            InputError: an image has another shape or type, or another size than the camera's; the stamp is no number.
+            InputError: an image has another shape or type, or another size than the camera's; stamp or delay is no
+                number.
         """
-        colour, measured, seconds = _array(image), _array(depth), number(stamp)
+        colour, measured = _array(image), _array(depth)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
             raise InputError(
                 f"frame {index}: the colour image is {colour.dtype} of shape {colour.shape}; give uint8 RGB of shape"
@@ -83,8 +84,9 @@ class RGBDFrame:
                 f"frame {index}: the depth image is {measured.dtype}; give metres in floating point, or whole numbers"
                 " in the camera's units"
             )
-        if not math.isfinite(seconds):
-            raise InputError(f"frame {index}: the stamp is {stamp!r}; give seconds, as a finite number")
+        for name, seconds in (("stamp", stamp), ("delay", delay)):
+            if not math.isfinite(number(seconds)):
+                raise InputError(f"frame {index}: the {name} is {seconds!r}; give seconds, as a finite number")
         if not isinstance(camera, PinholeCamera | None):
             raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
         if camera is not None and colour.shape[:2] != (camera.height, camera.width):
@@ -97,7 +99,7 @@ class RGBDFrame:
             metres = metres / (camera.depth_scale if camera is not None else 1000)
         metres = metres.where(metres.isfinite() & (metres > 0), 0.0)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
-        return RGBDFrame(index, seconds, channels, metres[None], camera=camera, delay=number(delay))
+        return RGBDFrame(index, number(stamp), channels, metres[None], camera=camera, delay=number(delay))
 
 
 def _array(image: object) -> NDArray[Any]:
