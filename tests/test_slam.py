@@ -139,3 +139,25 @@ def test_a_stage_can_be_replaced_at_any_time(demo: RGBDSequence, known: bool) ->
 def test_arrays_instead_of_a_frame_are_refused(demo: RGBDSequence) -> None:
     with pytest.raises(InputError, match=r"this is a ndarray; .* RGBDFrame\.of"):
         V3DSLAM(demo.camera, config=NO_NETWORK)(np.zeros((480, 640, 3), np.uint8))
+
+
+def test_a_map_that_drops_what_nobody_needs_tracks_the_same_to_the_bit(
+    demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Landmarks that are dead and that nobody refers to go; the others get other ids, and nothing else changes."""
+    runs = {}
+    for name, worth in (("never", math.inf), ("with every keyframe", 0)):
+        monkeypatch.setattr("v3d_torch.mapping.local_map._LANDMARKS", worth)
+        slam = V3DSLAM(demo.camera, config=load_config(None, ("segmentation.source=none",)))
+        for index in range(60):
+            slam(demo[index])
+        slam.settle()
+        runs[name] = slam
+    packed, whole = runs["with every keyframe"].mapper.map, runs["never"].mapper.map
+    assert len(packed.keyframes) == len(whole.keyframes) > 3
+    assert len(packed.landmarks) < 0.9 * len(whole.landmarks)
+    assert torch.equal(*(slam.poses.trajectory().T_wc for slam in runs.values()))
+    for name, column in packed.landmarks.columns.items():
+        assert torch.equal(column[packed.landmarks["alive"]], whole.landmarks[name][whole.landmarks["alive"]])
+    places = [known.landmarks["point"][known.observations["landmark"]] for known in (packed, whole)]
+    assert torch.equal(*places)

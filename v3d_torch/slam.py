@@ -205,6 +205,12 @@ class V3DSLAM:
             T_new_old = self.back_end.take_in(solved)
             if T_new_old is not None:
                 self._move_world(T_new_old)
+            self.mapper.map.pack(self._landmarks_held())
+
+    def _landmarks_held(self) -> list[Tensor]:
+        """Ids of landmarks that are kept from frame to frame, outside the map."""
+        seen = None if self._last is None else self._last.landmarks
+        return [self.poses.landmarks] if seen is None else [self.poses.landmarks, seen]
 
     def _expect(self, stamp: float, motion: Motion | None) -> Tensor:
         """Pose of the camera by its motion since the last frame; predicted, where that is not known."""

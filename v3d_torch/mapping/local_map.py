@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,9 @@ from v3d_torch.odometry.guided import LocalMap
 from v3d_torch.odometry.orb import Features, spread
 from v3d_torch.odometry.shutter import GLOBAL_SHUTTER, Readout
 from v3d_torch.odometry.tracker import Tracking
+
+_LANDMARKS = 2
+"""For each observation, from which it is worth to look for those that can go."""
 
 
 @dataclass
@@ -354,6 +357,27 @@ class SparseMap:
         elusive = self.landmarks["found"] < 0.25 * self.landmarks["visible"]  # ORB-SLAM2's rule
         lonely = (age == 3) & (seen_by < 2)
         self.landmarks["alive"][(elusive & (age > 0)) | lonely] = False
+
+    def pack(self, held: Iterable[Tensor]) -> None:
+        """Drop landmarks that are dead and that nobody refers to, once they are most.
+
+        So what a map takes, in memory and in time, goes by what it holds, not by what it ever held. The others get new
+        ids in the order of the old ones: nothing else changes.
+
+        Args:
+            held: ids outside the map, -1 for none, int64; they are changed in place.
+        """
+        if len(self.landmarks) < _LANDMARKS * len(self.observations):
+            return
+        tensors = [self.observations["landmark"], *(keyframe.landmarks for keyframe in self.keyframes), *held]
+        referring = {tensor.data_ptr(): tensor for tensor in tensors if len(tensor)}.values()  # some share theirs
+        needed = self.landmarks["alive"].clone()
+        for ids in referring:
+            needed[ids[ids >= 0]] = True
+        self.landmarks.keep(needed)
+        becomes = needed.cumsum(0) - 1
+        for ids in referring:
+            ids.copy_(torch.where(ids >= 0, becomes[ids], -1))
 
     def _fresh(self, features: Features, landmarks: Tensor) -> Tensor:
         """Features that become landmarks: unmatched, with depth, as many as the map wants, spread.
