@@ -191,6 +191,13 @@ def test_fused_landmarks_are_one(seeing: tuple[SparseMap, list[set[int]]]) -> No
     assert target.shared(torch.tensor([4, 7, 30])).tolist() == [len({4, 7, 30} & seen) for seen in sets] + [3]
 
 
+def test_a_map_without_landmarks_has_none_to_drop() -> None:
+    target = sparse_map()
+    blind = target.insert(0, 0.0, EYE, features(5, depth=0.0), torch.full((5,), -1))
+    target.pack([blind.landmarks.clone()])
+    assert len(target.landmarks) == 0 and blind.landmarks.tolist() == [-1] * 5
+
+
 def test_culling_keeps_what_is_found_again() -> None:
     target = sparse_map()
     target.insert(0, 0.0, EYE, features(4), torch.full((4,), -1))

@@ -25,6 +25,14 @@ from v3d_torch.wire import Channel, new_arena
 Ends = tuple[Channel, Channel]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def share_all() -> Iterator[None]:
+    """Small values, too, go through the memory that is shared, where there is any."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("v3d_torch.wire._SMALL", -1)
+        yield
+
+
 @contextmanager
 def joined(*, shared: bool) -> Iterator[Ends]:
     """Both ends of a channel, with memory of their own to share or without."""
@@ -93,7 +101,15 @@ def test_masks_are_a_bit_a_pixel() -> None:
     assert all(torch.equal(getattr(came, name), getattr(instances, name)) for name in vars(instances))
 
 
-def test_a_value_stays_when_the_next_ones_come() -> None:
+def test_a_value_stays_when_the_next_one_comes(ends: Ends) -> None:
+    here, there = ends
+    here.send(torch.zeros(5))
+    first = there.receive()
+    here.send(torch.ones(5))
+    assert torch.equal(there.receive(), torch.ones(5)) and torch.equal(first, torch.zeros(5))
+
+
+def test_values_stay_when_the_next_ones_come() -> None:
     """Two are on their way at a time: each has its place in the shared memory until it is asked for."""
     images = [torch.full((300, 400), value) for value in range(5)]
     with joined(shared=True) as (here, there):

@@ -1,6 +1,6 @@
 """A second process that reads and looks at the frames of a stored sequence.
 
-Two threads of Python wait for each other: a frame is a thousand small operations, and only one thread at a time may
+Two threads of Python wait for each other: a frame is thousands of small operations, and only one thread at a time may
 begin one. Two processes do not, but a new one takes seconds until it is up, and has libraries and network of its own in
 memory. It is asked for some frames ahead, so that neither waits for the other while a frame takes longer than most.
 """

@@ -102,7 +102,7 @@ class Errors:
         Returns:
             First and second derivative of the cost by that unit.
         """
-        j = self.bundle.moved(drift)
+        j = self.bundle.drifted(drift)
         here, change = self.normal_equations, replace(self, residuals=j).normal_equations
         xi, moved = solve_normal_equations(change, _NEXT_TO_NONE)
         first, second = (
@@ -167,19 +167,18 @@ class Bundle:
         self._row, self._order = row[observations.pose].sort(stable=True)
         self._counts = torch.bincount(self._row, minlength=len(self._free))[: len(self._free)].tolist()
         self._pose, self._point = observations.pose[self._order], observations.point[self._order]
-        self._focal = torch.tensor([[camera.fx], [camera.fy]], dtype=torch.float64)
         target = whitened(observations, camera)
         self._target = Whitened(target.scale[:, self._order], target.offset[:, self._order])
-        self._limit = observations.limit[self._order]
+        self._limit, self._sigma = observations.limit[self._order], observations.pixel_sigma[self._order]
 
     def as_given(self, of_each: Tensor) -> Tensor:
         """Numbers of the sorted observations, (M,), in the order in which these were given."""
         return torch.empty_like(of_each).index_copy_(0, self._order, of_each)
 
-    def moved(self, drift: Tensor) -> Tensor:
+    def drifted(self, drift: Tensor) -> Tensor:
         """How the errors change when what is seen moves by drift, pixels as given, (M, 2); shape :math:`(3, M)`."""
         change = torch.zeros_like(self._target.scale)
-        change[:2] = self._target.scale[:2] * -drift[self._order].T / self._focal
+        change[:2] = -drift[self._order].T / self._sigma
         return change
 
     def errors_at(self, state: State) -> tuple[float, Errors]:

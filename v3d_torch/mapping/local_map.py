@@ -20,7 +20,7 @@ from v3d_torch.odometry.shutter import GLOBAL_SHUTTER, Readout
 from v3d_torch.odometry.tracker import Tracking
 
 _LANDMARKS = 2
-"""For each observation, from which it is worth to look for those that can go."""
+"""For each observation: only of more it is worth to look for those that can go."""
 
 
 @dataclass
@@ -367,7 +367,7 @@ class SparseMap:
         Args:
             held: ids outside the map, -1 for none, int64; they are changed in place.
         """
-        if len(self.landmarks) < _LANDMARKS * len(self.observations):
+        if len(self.landmarks) <= _LANDMARKS * len(self.observations):
             return
         tensors = [self.observations["landmark"], *(keyframe.landmarks for keyframe in self.keyframes), *held]
         referring = {tensor.data_ptr(): tensor for tensor in tensors if len(tensor)}.values()  # some share theirs
