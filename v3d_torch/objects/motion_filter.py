@@ -22,7 +22,7 @@ class MotionFilter:
         self._max_speed = config.max_speed
         self._stamp = 0.0
         self._state = torch.stack([torch.full((3,), torch.nan), torch.zeros(3)]).to(torch.float64)
-        self._covariance = torch.eye(2, dtype=torch.float64)  # of (position, velocity), the same for all three axes
+        self._covariance = (1.0, 0.0, 1.0)  # of place, of both, of velocity: the same for all three axes
 
     @property
     def velocity(self) -> Tensor:
@@ -45,20 +45,23 @@ class MotionFilter:
             return
         if bool(self._state[0].isnan().any()):
             self._state = torch.stack([place, torch.zeros_like(place)])
-            self._covariance = torch.tensor([sigma**2, self._SPEED_SIGMA**2], dtype=torch.float64).diag()
+            self._covariance = (sigma**2, 0.0, self._SPEED_SIGMA**2)
         else:
             self._correct(stamp - self._stamp, place, sigma)
         self._stamp = stamp
 
     def _correct(self, dt: float, place: Tensor, sigma: float) -> None:
-        transition = torch.tensor([[1.0, dt], [0.0, 1.0]], dtype=torch.float64)
-        noise = torch.tensor([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], dtype=torch.float64)
-        state = transition @ self._state
-        covariance = transition @ self._covariance @ transition.T + self._acceleration**2 * noise
-        gain = covariance[:, 0] / (covariance[0, 0] + sigma**2)
-        self._state = state + torch.outer(gain, place - state[0])
-        self._covariance = covariance - torch.outer(gain, covariance[0])
-        self._state[1] *= min(1.0, self._max_speed / max(float(self._state[1].norm()), 1e-9))
+        pp, pv, vv = self._covariance
+        noise = self._acceleration**2
+        pp, pv, vv = pp + 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
+        gain = pp / (pp + sigma**2), pv / (pp + sigma**2)
+        self._covariance = (1 - gain[0]) * pp, (1 - gain[0]) * pv, vv - gain[1] * pv
+        here, velocity = self._state
+        expected = here + velocity * dt
+        surprise = place - expected
+        velocity = velocity + gain[1] * surprise
+        velocity = velocity * min(1.0, self._max_speed / max(float(velocity.norm()), 1e-9))
+        self._state = torch.stack([expected + gain[0] * surprise, velocity])
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the state along when the map is corrected under it, see `InstanceTracker.move_world`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -42,8 +44,8 @@ def decode(
     mask_channels = prototypes.shape[0]
     class_scores = predictions[_BOX:-mask_channels]
     scores = class_scores.amax(dim=0)
-    order = scores.argsort(descending=True, stable=True)[:_MAX_CANDIDATES]
-    order = order[scores[order] >= score_threshold]
+    candidates = torch.nonzero(scores >= score_threshold)[:, 0]
+    order = candidates[scores[candidates].argsort(descending=True, stable=True)[:_MAX_CANDIDATES]]
     boxes, labels = _corners(predictions[:_BOX, order].T), class_scores[:, order].argmax(dim=0)
     if iou_threshold is not None:
         kept = non_maximum_suppression(boxes, labels, iou_threshold)
@@ -107,6 +109,8 @@ def assemble_masks(coefficients: Tensor, prototypes: Tensor, boxes: Tensor, wind
     return masks
 
 
+@cache
+@torch.inference_mode(False)  # what is kept may be wanted where gradients are
 def _enlargement(cells: int, pixels: int) -> Tensor:
     """Linear interpolation from cells to pixels that cover the same extent, as a matrix (pixels, cells)."""
     return functional.interpolate(torch.eye(cells)[None], pixels, mode="linear")[0].T

@@ -11,7 +11,7 @@ from torch.nn import functional
 CELL = 4
 """Pixels of the canvas per prototype cell: the picture covers whole cells, so that masks are cut out exactly."""
 
-_GREY = 114 / 255
+_GREY = 114
 """The padding that the networks were trained with."""
 
 
@@ -56,5 +56,6 @@ def letterbox(image: Tensor, height: int, width: int) -> tuple[Tensor, Window]:
     picture = image[None]  # scaled as bytes, as when the networks were trained
     if (inner_height, inner_width) != (image_height, image_width):
         picture = functional.interpolate(picture, (inner_height, inner_width), mode="bilinear", antialias=True)
-    margins = (left, width - inner_width - left, top, height - inner_height - top)
-    return functional.pad(picture.to(torch.float32) / 255, margins, value=_GREY).contiguous(), window
+    canvas = torch.full((1, 3, height, width), _GREY, dtype=torch.uint8)
+    canvas[..., top : top + inner_height, left : left + inner_width] = picture
+    return canvas.to(torch.float32).div_(255), window
