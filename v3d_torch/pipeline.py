@@ -21,6 +21,7 @@ from v3d_torch.files import write_png
 from v3d_torch.lookahead import Lookahead
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.mapping.views import StaticViews
+from v3d_torch.memory import give_back
 from v3d_torch.objects.dynamics import Judged, Scene, Verdict
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
@@ -86,6 +87,7 @@ class Pipeline:
     """
 
     _SNAPSHOTS = 6
+    _TIDY = 200  # frames: giving memory back takes some ms
 
     def __init__(
         self,
@@ -137,6 +139,8 @@ class Pipeline:
                     self.run.seconds, self.whole = before + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, scene, self.slam.poses.statuses[-1])
+                    if len(self.run.frames) % self._TIDY == 0:
+                        give_back()
         except V3DError as error:
             self.run.failure = str(error)
         except Exception as error:  # what was computed is worth keeping when the program is at fault, too
