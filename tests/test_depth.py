@@ -18,9 +18,7 @@ from v3d_torch.errors import ConfigError
 DTYPES = [torch.float32, torch.float64]
 
 
-def bumpy(
-    height: int, width: int, dtype: torch.dtype = torch.float64, *, batch: int = 2, holes: float = 0.2
-) -> Tensor:
+def bumpy(height: int, width: int, dtype: torch.dtype = torch.float64, *, batch: int = 2, holes: float = 0.2) -> Tensor:
     """Two surfaces with a step between them, noise and holes."""
     generator = torch.Generator().manual_seed(0)
     depth = 2 + 0.05 * torch.rand(batch, 1, height, width, generator=generator, dtype=torch.float64)

@@ -52,16 +52,15 @@ class MotionFilter:
 
     def _correct(self, dt: float, place: Tensor, sigma: float) -> None:
         pp, pv, vv = self._covariance
-        noise = self._acceleration**2
-        pp, pv, vv = pp + 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
-        gain = pp / (pp + sigma**2), pv / (pp + sigma**2)
-        self._covariance = (1 - gain[0]) * pp, (1 - gain[0]) * pv, vv - gain[1] * pv
-        here, velocity = self._state
-        expected = here + velocity * dt
-        surprise = place - expected
-        velocity = velocity + gain[1] * surprise
+        pp += 2 * dt * pv + dt**2 * vv + self._acceleration**2 * dt**3 / 3
+        pv += dt * vv + self._acceleration**2 * dt**2 / 2
+        vv += self._acceleration**2 * dt
+        of_place, of_velocity = pp / (pp + sigma**2), pv / (pp + sigma**2)  # the gains
+        self._covariance = pp - of_place * pp, pv - of_place * pv, vv - of_velocity * pv
+        expected = self._state[0] + self._state[1] * dt
+        velocity = self._state[1] + of_velocity * (place - expected)
         velocity = velocity * min(1.0, self._max_speed / max(float(velocity.norm()), 1e-9))
-        self._state = torch.stack([expected + gain[0] * surprise, velocity])
+        self._state = torch.stack([expected + of_place * (place - expected), velocity])
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the state along when the map is corrected under it, see `InstanceTracker.move_world`."""
