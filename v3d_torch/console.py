@@ -156,14 +156,17 @@ class _Verdicts:
     def __init__(self, progress: Progress, frames: int | None, interrupted: Event, done: int) -> None:
         self._progress = progress
         self._interrupted = interrupted
-        self._task = progress.add_task("tracking", total=frames, completed=done, note="")
-        self._start = time.perf_counter()
-        self._frames = 0
+        self._task = progress.add_task("tracking", total=frames, completed=done, note="getting ready")
+        self._first: float | None = None
+        self._since = 0
 
     def __call__(self, frame: RGBDFrame, scene: Scene, status: Status) -> None:
-        self._frames += 1
-        rate = self._frames / (time.perf_counter() - self._start)
-        note = f"{rate:.1f} frames/s  {status.value}  {what_moves(scene)}"
+        now, note = time.perf_counter(), f"{status.value}  {what_moves(scene)}"
+        if self._first is None:
+            self._first = now
+        else:
+            self._since += 1
+            note = f"{self._since / (now - self._first):.1f} frames/s  {note}"
         self._progress.update(self._task, advance=1, note=note)
         if self._interrupted.is_set():
             raise KeyboardInterrupt

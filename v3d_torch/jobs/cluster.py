@@ -12,7 +12,7 @@ from typing import Any
 
 from v3d_torch.console import interrupts_between_frames
 from v3d_torch.errors import InputError
-from v3d_torch.jobs.executor import Advanced, Ended
+from v3d_torch.jobs.executor import THREADS, Advanced, Ended
 from v3d_torch.jobs.job import Job
 from v3d_torch.jobs.worker import run_job
 
@@ -60,7 +60,8 @@ class Cluster:
             ray.get_runtime_context().get_node_id(), soft=False
         )
         board = ray.remote(num_cpus=0, scheduling_strategy=here)(_Board).remote()  # no other machine's end is its end
-        run = ray.remote(num_cpus=1, max_retries=0, max_calls=1)(_run)  # max_calls: the next job gets a new process
+        alone = {"num_cpus": 1, "max_retries": 0, "max_calls": 1}  # max_calls: the next job gets a new process
+        run = ray.remote(**alone, runtime_env={"env_vars": THREADS})(_run)
         waiting = iter(range(len(jobs)))
         pending: dict[Any, int] = {}
         told = False
