@@ -217,8 +217,8 @@ class FeaturesConfig(Section):
     """ORB features (paper, Sec. III-A and III-E)."""
 
     count: int = Field(1500, gt=0)
-    """Features asked of the detector. More than ORB-SLAM2's 1000, as people take their share: with 1000 walkers_desk has
-    an ATE of 7.6 mm, with 1500 6.7, with 2500 6.4 and 6 ms more of CPU time a frame (medians of 3 seeds)."""
+    """Features asked of the detector. More than ORB-SLAM2's 1000, as people take their share: with 1000 walkers_desk
+    has an ATE of 7.6 mm, with 1500 6.7, with 2500 6.4 and 6 ms more of CPU time a frame (medians of 3 seeds)."""
     levels: int = Field(8, gt=0, le=20)
     """Levels of the scale pyramid (ORB-SLAM2)."""
     scale: float = Field(1.2, gt=1)

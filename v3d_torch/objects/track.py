@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -28,7 +29,7 @@ class Sighting:
     centroid: Tensor
     cloud: Tensor
 
-    @property
+    @cached_property
     def located(self) -> bool:
         """Whether the centroid is known."""
         return bool(torch.isfinite(self.centroid).all())
