@@ -81,7 +81,8 @@ def test_the_wheel_is_of_this_package_alone_and_says_what_it_is(built: tuple[Pat
     tops = {name.partition("/")[0] for name in held}
     (info,) = tops - {"v3d_torch"}
     metadata = held[f"{info}/METADATA"].decode()
-    for line in ("Name: v3d-torch", "License-Expression: Apache-2.0", "Requires-Python: >=3.11.4", "Provides-Extra: ray"):
+    stated = "Name: v3d-torch", "License-Expression: Apache-2.0", "Requires-Python: >=3.11.4", "Provides-Extra: ray"
+    for line in stated:
         assert f"\n{line}\n" in metadata
     assert (ROOT / "README.md").read_text() in metadata
     assert b"v3d-torch = v3d_torch.__main__:app" in held[f"{info}/entry_points.txt"]
