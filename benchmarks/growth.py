@@ -7,15 +7,14 @@ and pose graph alone, on keyframes that are made up, since no sequence at hand h
 from __future__ import annotations
 
 import argparse
-import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial, reduce
-from pathlib import Path
 from statistics import fmean, median
 from typing import TypeVar
 
+import psutil
 import torch
 from command import command_line, publish
 from contenders.ours import Ours
@@ -90,8 +89,7 @@ def long_run(sequence: RGBDSequence, frames: int) -> Iterator[str]:
 
 def resident_mb() -> float:
     """Memory of this process."""
-    status = Path("/proc/self/status").read_text(encoding="utf-8")
-    return int(re.search(r"^VmRSS:\s*(\d+) kB$", status, re.MULTILINE)[1]) / 1024
+    return psutil.Process().memory_info().rss / 2**20
 
 
 def many_keyframes(most: int) -> Iterator[str]:

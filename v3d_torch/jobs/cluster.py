@@ -60,8 +60,12 @@ class Cluster:
             ray.get_runtime_context().get_node_id(), soft=False
         )
         board = ray.remote(num_cpus=0, scheduling_strategy=here)(_Board).remote()  # no other machine's end is its end
-        alone = {"num_cpus": 1, "max_retries": 0, "max_calls": 1}  # max_calls: the next job gets a new process
-        run = ray.remote(**alone, runtime_env={"env_vars": THREADS})(_run)
+        run = ray.remote(
+            num_cpus=1,
+            max_retries=0,
+            max_calls=1,  # the next job gets a new process
+            runtime_env={"env_vars": THREADS},
+        )(_run)
         waiting = iter(range(len(jobs)))
         pending: dict[Any, int] = {}
         told = False
