@@ -29,12 +29,13 @@ class Localiser:
         self._local_keyframes = local_keyframes
 
     def __call__(
-        self, static: Features, T_cw: Tensor, carried: Tensor, poses: PoseRecorder, *, moved: bool
+        self, static: Features, depth: Tensor, T_cw: Tensor, carried: Tensor, poses: PoseRecorder, *, moved: bool
     ) -> Estimate:
         """Pose in the local map, else in a place seen before, else by the motion alone, else lost.
 
         Args:
             static: features on what stands still.
+            depth: of the frame, metres, shape :math:`(1, H, W)`, 0 = none.
             T_cw: predicted, by the motion where it is known, float64, shape :math:`(4, 4)`.
             carried: id of the landmark behind each feature as far as the last frame tells, -1 for none.
             poses: of the frames before.
@@ -42,7 +43,7 @@ class Localiser:
         """
         if self._map.keyframes:
             local = self._map.local(poses.landmarks, self._local_keyframes)
-            tracking = self._track(static, T_cw, local, carried)
+            tracking = self._track(static, T_cw, local, carried, depth)
             if tracking is None:
                 place = self._places.recognise(static, self._map)
                 tracking = place.tracking if place is not None else None

@@ -178,7 +178,7 @@ class V3DSLAM:
             velocity = outlook.velocity if motion is None else motion.velocity(frame.stamp - outlook.stamp)
             static = self._at_once(percept.features[keep], depth, frame, velocity)
             carried = seen.carried(motion, last)[keep]
-            estimate = self.localise(static, T_cw, carried, self.poses, moved=motion is not None)
+            estimate = self.localise(static, depth, T_cw, carried, self.poses, moved=motion is not None)
         with self.clock("mapping"):  # keyframes and landmarks
             reference = self.localise.reference(estimate)
             T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)

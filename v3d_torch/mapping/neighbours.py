@@ -48,7 +48,8 @@ class NeighbourSearch:
         """Find those landmarks that a keyframe sees without knowing."""
         features, config = keyframe.features, self._config
         local = sparse_map.look_up(landmarks[~sparse_map.among(landmarks, keyframe.seen)].sort().values)
-        row, feature = self._search(features, keyframe.T_cw, local, config.mapping.fuse_radius).unbind(dim=1)
+        seen = self._search.project(keyframe.T_cw, local)
+        row, feature = self._search(features, seen, local, config.mapping.fuse_radius).unbind(dim=1)
         in_camera = local.points[row] @ keyframe.T_cw[:3, :3].T + keyframe.T_cw[:3, 3]
         measured = measurements(features[feature], config.tracking, config.features)
         fits = chi_square(in_camera, reprojection(in_camera, measured, self._camera)) <= measured.limit

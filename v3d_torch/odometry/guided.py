@@ -39,12 +39,14 @@ class Projection:
 
     Attributes:
         rows: of the local map, those in view, int64, shape :math:`(V,)`.
-        pixels: shape :math:`(V, 2)`.
+        pixels: undistorted, shape :math:`(V, 2)`.
+        depth: along z, metres, shape :math:`(V,)`.
         levels: of the scale pyramid, int64, shape :math:`(V,)`.
     """
 
     rows: Tensor
     pixels: Tensor
+    depth: Tensor
     levels: Tensor
 
 
@@ -72,19 +74,18 @@ class GuidedSearch:
         beyond = [math.inf, camera.width, camera.height, math.inf, features.levels - 1 + slack]
         self._least, self._beyond = torch.tensor([least, beyond], dtype=torch.float64)[..., None]
 
-    def __call__(self, features: Features, T_cw: Tensor, local: LocalMap, radius: float) -> Tensor:
+    def __call__(self, features: Features, seen: Projection, local: LocalMap, radius: float) -> Tensor:
         """Pairs (row in ``local``, feature) that lie near each other in the image and look alike.
 
         Args:
             features: of the view.
-            T_cw: its pose, world to camera, float64, shape :math:`(4, 4)`.
+            seen: the landmarks as `project` puts them into it.
             local: landmarks.
             radius: around their projections, pixels at level 0; grows with the level.
 
         Returns:
             Each landmark and each feature at most once, int64, shape :math:`(K, 2)`.
         """
-        seen = self.project(T_cw, local)
         pairs = match_near(
             seen.pixels,
             radius * self._scale ** seen.levels.to(torch.float64),
@@ -109,6 +110,6 @@ class GuidedSearch:
         level = torch.log(local.reach / distance) / math.log(self._scale)
         found = torch.stack([z, u, v, cosine, level])
         rows = torch.nonzero(((found >= self._least) & (found < self._beyond)).all(dim=0))[:, 0]
-        _, u, v, _, level = found.index_select(1, rows)
+        z, u, v, _, level = found.index_select(1, rows)
         levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
-        return Projection(rows, torch.stack([u, v], dim=1), levels)
+        return Projection(rows, torch.stack([u, v], dim=1), z, levels)

@@ -9,9 +9,12 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import FeaturesConfig, TrackingConfig
-from v3d_torch.odometry.guided import GuidedSearch, LocalMap
-from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.guided import GuidedSearch, LocalMap, Projection
+from v3d_torch.odometry.orb import Features, depth_under
 from v3d_torch.odometry.refine import PoseRefinement, measurements, refine_pose
+
+_ERRS = 2
+"""Standard deviations that 95 % of depths err by at most."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,9 @@ class MapTracker:
         self._camera = camera
         self._search = GuidedSearch(config, features, camera)
 
-    def __call__(self, features: Features, T_cw: Tensor, local: LocalMap, carried: Tensor) -> Tracking | None:
+    def __call__(
+        self, features: Features, T_cw: Tensor, local: LocalMap, carried: Tensor, depth: Tensor | None = None
+    ) -> Tracking | None:
         """Track ``features`` from a predicted pose.
 
         Args:
@@ -58,6 +63,8 @@ class MapTracker:
             local: landmarks near the prediction.
             carried: id of the landmark behind each feature as far as the frame before tells, -1 for none, int64,
                 shape :math:`(N,)`.
+            depth: image of the view, metres, shape :math:`(1, H, W)`, 0 = none: landmarks behind what it shows are
+                hidden, by people most of all, and need not have been seen. None where it is not at hand.
 
         Returns:
             None when fewer than ``min_inliers`` landmarks are found: the camera is lost.
@@ -66,19 +73,27 @@ class MapTracker:
         feature = torch.nonzero((carried >= 0) & (local.ids[row] == carried))[:, 0] if len(local.ids) else row[:0]
         first = self._refine(features, T_cw, local, torch.stack([row[feature], feature], dim=1), rounds=2)
         if first is None:
-            pairs = self._search(features, T_cw, local, self._config.search_radius)
+            seen = self._search.project(T_cw, local)
+            pairs = self._search(features, seen, local, self._config.search_radius)
             first = self._refine(features, T_cw, local, pairs, rounds=2)
         if first is None:
             return None
         # From the refined pose, what the prediction had put out of reach is found as well, within half the radius.
-        pairs = self._search(features, first.T_cw, local, 0.5 * self._config.search_radius)
+        seen = self._search.project(first.T_cw, local)
+        pairs = self._search(features, seen, local, 0.5 * self._config.search_radius)
         found = self._refine(features, first.T_cw, local, pairs, rounds=4)
         if found is None:
             return None
         landmark, feature = pairs[found.inliers].unbind(dim=1)
         ids = torch.full((len(features),), -1, dtype=torch.int64)
         ids[feature] = local.ids[landmark]
-        return Tracking(found.T_cw, ids, local.ids[self._search.project(found.T_cw, local).rows])
+        visible = seen.rows if depth is None else seen.rows[~self._hidden(seen, depth)]
+        return Tracking(found.T_cw, ids, local.ids[visible])
+
+    def _hidden(self, seen: Projection, depth: Tensor) -> Tensor:
+        """Which landmarks lie behind what is seen in their places, by more than depth errs; bool, shape (V,)."""
+        z = depth_under(self._camera.distort(seen.pixels).round().to(torch.int64), depth, torch.inf)
+        return (z > 0) & (1 / z - 1 / seen.depth > _ERRS * self._config.inverse_depth_sigma)
 
     def _refine(
         self, features: Features, T_cw: Tensor, local: LocalMap, pairs: Tensor, *, rounds: int
