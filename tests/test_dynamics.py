@@ -333,6 +333,18 @@ def test_chamfer_of_somebody_who_stands_is_noise_and_things_have_none() -> None:
     assert all(math.isnan(frame[number].chamfer) for frame in frames for number in (1, 2, 3))
 
 
+def test_chamfer_is_asked_of_those_alone_whom_the_votes_leave_as_static() -> None:
+    """Somebody who walks changes shape all the time; who has come to rest is measured again once the vote lapses."""
+    rests, hold = 1.2, 0.4
+    somebody = walker((-0.8, 0.1, 2.4), (0.9, 0.0, 0.0), stop=rests)
+    frames = play(*CHAIRS, somebody, seconds=2.6, overrides=(f"objects.mask.hold_dynamic={hold}",))
+    walks = [frame[4] for frame in frames if 0.5 < frame.stamp < rests]
+    assert {judged.verdict for judged in walks} == {Verdict.DYNAMIC}
+    assert all(math.isnan(judged.chamfer) for judged in walks)
+    assert all(frame[4].verdict is not Verdict.DYNAMIC or math.isnan(frame[4].chamfer) for frame in frames)
+    assert all(frame[4].chamfer < 0.02 for frame in frames if frame.stamp > 2.4)
+
+
 SHORT = ("objects.voting.baselines=[0.0, 0.3]", "objects.background.baselines=[0.3]")  # looks back 0.3 s and no more
 
 

@@ -46,7 +46,7 @@ class Judged:
         mask: its pixels, bool, shape :math:`(H, W)`.
         centroid: world frame, metres, float64, shape :math:`(3,)`; nan when unknown.
         votes: of the newest frame, the most over the baselines.
-        chamfer: root mean nearest-neighbour distance, metres; nan when it was not measured.
+        chamfer: root mean nearest-neighbour distance, metres; nan when it was not measured, as of who is voted dynamic.
         verdict: static, dynamic, deforming or unknown.
         missed: whether the network missed it, so that all but the id is predicted.
         cloud: as the network last saw it, world frame, metres, float32, shape :math:`(P, 3)`.
@@ -209,12 +209,15 @@ class ObjectDynamics:
     def _deform(
         self, compared: dict[float, Pairs], came: dict[Track, list[float]], left: dict[Sighting, float], stamp: float
     ) -> dict[Track, float]:
-        """Root mean Chamfer distance of each living object to its own past; marks those that deform."""
+        """Root mean Chamfer distance of each living object to its own past; marks those that deform.
+
+        Not of those that the votes say move: this refines what they leave as static (paper, Sec. I).
+        """
         config = self._config.chamfer
         share = self._config.background.deformed_share
         measured: dict[Track, float] = {}
         for track, (then, now) in compared[config.baseline].items() if config.enabled else ():
-            if track.label not in LIVING:
+            if track.label not in LIVING or self._moves(track, stamp):
                 continue
             motion = intra_object_motion(then.cloud[None], now.cloud[None], config.distance_threshold)
             measured[track] = float(motion.distance)
@@ -245,7 +248,7 @@ class ObjectDynamics:
         known = [was for was, share in zip(filled, came, strict=True) if not isnan(share)]
         if track.label in THINGS and known and all(known):
             return Verdict.STATIC
-        if stamp - track.last_dynamic <= config.hold_dynamic and track.evidence >= config.confirm_moving:
+        if self._moves(track, stamp):
             return Verdict.DYNAMIC
         if stamp - track.last_deforming <= config.hold_dynamic:
             return Verdict.DEFORMING
@@ -253,6 +256,12 @@ class ObjectDynamics:
         if doubted and not still and not fits:
             return Verdict.UNKNOWN
         return Verdict.STATIC
+
+    def _moves(self, track: Track, stamp: float) -> bool:
+        """Whether an object is voted dynamic, or was not long ago and often enough."""
+        config = self._config.mask
+        held = stamp - track.last_dynamic <= config.hold_dynamic and track.evidence >= config.confirm_moving
+        return held or track.last_dynamic == stamp
 
     def _may_be_tracked(self, verdict: Verdict) -> bool:
         deforming = verdict is Verdict.DEFORMING and self._config.chamfer.include_deforming
