@@ -187,7 +187,7 @@ class V3DSLAM:
             self._look_back()
             keyframe = self.mapper(frame, static, estimate, reference)
             if estimate.status is not Status.LOST:
-                self.watch.remember(replace(view, T_cw=self.poses.T_cw))
+                self.watch.remember(view.at(self.poses.T_cw))
             landmarks = estimate.landmarks if keyframe is None else keyframe.landmarks
             self._last = View(frame, depth, static, scene.static, landmarks)
             if keyframe is not None:

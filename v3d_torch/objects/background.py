@@ -46,6 +46,12 @@ class DepthView:
         """What it is made of, without what is cached."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
+    def at(self, T_cw: Tensor) -> DepthView:
+        """The same image, taken from another pose: what is cached of it holds there as well."""
+        view = replace(self, T_cw=T_cw)
+        vars(view).update(vars(self) | {"T_cw": T_cw})
+        return view
+
     @cached_property
     def missing(self) -> Tensor:
         """Pixels without depth, bool, shape :math:`(H, W)`."""
@@ -223,7 +229,7 @@ class BackgroundWatch:
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry the views along when the map is corrected under them, float64, shape :math:`(4, 4)`."""
-        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
+        self._views = [view.at(view.T_cw @ invert(T_new_old)) for view in self._views]
 
     def _before(self, stamp: float) -> DepthView | None:
         """The newest view at least that old."""

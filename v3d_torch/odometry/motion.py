@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -28,9 +29,19 @@ class Motion:
     T_ba: Tensor
     pairs: Tensor
 
+    @cached_property
+    def twist(self) -> Tensor:
+        """Logarithm of ``T_ba``, float64, shape :math:`(6,)`."""
+        return se3_log(self.T_ba)
+
     def velocity(self, elapsed: float) -> Tensor:
         """Mean twist per second over the time between the views, in seconds, float64, shape :math:`(6,)`."""
-        return se3_log(self.T_ba) / elapsed
+        return self.twist / elapsed
+
+    def is_possible(self, elapsed: float, config: MotionConfig) -> bool:
+        """Whether a camera in a hand or on a robot can move so in the time, given in seconds."""
+        distance, angle = float(self.twist[:3].norm()), float(self.twist[3:].norm())
+        return distance <= config.max_speed * elapsed and angle <= config.max_rotation_rate * elapsed
 
     def carry(self, landmarks: Tensor, count: int) -> Tensor:
         """Ids of the landmarks behind the features of b that the matches carry over from a.
@@ -108,11 +119,5 @@ class MotionEstimator:
         if pose is None or int(pose[1].sum()) < config.min_inliers:
             return None
         T_ba, inliers = pose
-        return Motion(T_ba, pairs[inliers]) if is_possible(T_ba, elapsed, config) else None
-
-
-def is_possible(T_ba: Tensor, elapsed: float, config: MotionConfig) -> bool:
-    """Whether a camera in a hand or on a robot can move so in the time, given in seconds."""
-    twist = se3_log(T_ba)
-    distance, angle = float(twist[:3].norm()), float(twist[3:].norm())
-    return distance <= config.max_speed * elapsed and angle <= config.max_rotation_rate * elapsed
+        motion = Motion(T_ba, pairs[inliers])
+        return motion if motion.is_possible(elapsed, config) else None

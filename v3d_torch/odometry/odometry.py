@@ -12,7 +12,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.odometry.dense import DenseAligner
 from v3d_torch.odometry.dense_view import DenseView
-from v3d_torch.odometry.motion import Motion, MotionEstimator, is_possible
+from v3d_torch.odometry.motion import Motion, MotionEstimator
 from v3d_torch.odometry.orb import Features
 from v3d_torch.types import RGBDFrame
 
@@ -79,9 +79,10 @@ class Odometry:
         if motion is not None:
             return motion
         aligned = self._align(self._dense(then), self._dense(now), T_ba)
-        if aligned is None or not is_possible(aligned.T_ba, elapsed, self._config.motion):
+        if aligned is None:
             return None
-        return Motion(aligned.T_ba, torch.zeros(0, 2, dtype=torch.int64))
+        motion = Motion(aligned.T_ba, torch.zeros(0, 2, dtype=torch.int64))
+        return motion if motion.is_possible(elapsed, self._config.motion) else None
 
     def _dense(self, view: View) -> DenseView:
         grey = rgb_to_grayscale(view.frame.image.to(torch.float32) / 255)
