@@ -234,7 +234,7 @@ class MotionConfig(Section):
 
     count: int = Field(500, gt=0)
     """Features of the earlier frame that are matched to all of the later one, spread over the image. Twice as many take
-    2 ms more of a frame, and the camera is followed no better: the map refines what they tell."""
+    1 ms more of a frame, and the camera is followed no better: the map refines what they tell."""
     max_ratio: float = Field(0.8, gt=0, le=1)
     """Lowe's ratio between the best and the second Hamming distance."""
     max_hamming: int = Field(64, gt=0, le=256)
