@@ -291,8 +291,8 @@ def test_no_code_of_a_file_is_run_and_no_other_class_made(tmp_path: Path) -> Non
 
 def test_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = small(tmp_path / "s")
-    (tmp_path / "s").write_bytes(whole.replace(b"state 7 ", b"state 8 ", 1))
-    with pytest.raises(InputError, match=r"/s: is a state in version 8 .* knows version 7"):
+    (tmp_path / "s").write_bytes(whole.replace(b"state 8 ", b"state 9 ", 1))
+    with pytest.raises(InputError, match=r"/s: is a state in version 9 .* knows version 8"):
         read_state(tmp_path / "s", [])
     with monkeypatch.context() as patch:
         patch.setattr("v3d_torch.state_file.version", lambda _: "9.9")

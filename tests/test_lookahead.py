@@ -85,7 +85,7 @@ def test_so_many_frames_are_read_ahead_and_no_more(demo: RGBDSequence, ahead: bo
             slam.take_in(percept)
             assert percept.frame.index == taken
             assert len(read) <= taken + 1 + ahead * AHEAD
-            assert set(percept.seconds) == {"read", "segmentation", "depth", "features", "clouds"}
+            assert set(percept.seconds) == {"read", "segmentation", "depth", "features"}
     assert read == list(range(FRAMES))
 
 

@@ -67,7 +67,7 @@ def test_it_sees_what_is_seen_here_to_the_bit(demo: StoredFrames) -> None:
             seen = second.answer()
             assert seen is not None and same(without_times(seen), without_times(expected))
             assert same(slam.segment.memory, expected.memory)  # type: ignore[attr-defined]
-            assert set(seen.seconds) == {"read", "segmentation", "depth", "features", "clouds"}
+            assert set(seen.seconds) == {"read", "segmentation", "depth", "features"}
             assert seen.frame.camera is demo.camera
 
 

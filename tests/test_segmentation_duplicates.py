@@ -173,3 +173,11 @@ def test_the_segmenter_leaves_duplicates_out(monkeypatch: pytest.MonkeyPatch) ->
     for share, scores in ((SHARE, [0.9]), (1.0, [0.9, 0.8])):
         segmenter = yolo.YOLOSegmenter(SegmentationConfig(duplicate_share=share), Path("network.onnx"))
         assert segmenter.segment(image).scores.tolist() == pytest.approx(scores)
+
+
+def test_what_all_stays_is_not_copied() -> None:
+    """Masks are large, and mostly there is nothing to leave out, nor to add."""
+    all_ = instances([WHOLE, OTHER], [PERSON, PERSON])
+    assert without_duplicates(all_, SHARE) is all_
+    assert all_.joined(Instances.empty(HEIGHT, WIDTH)) is all_
+    assert len(all_[torch.tensor([False, True])]) == 1

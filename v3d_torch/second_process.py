@@ -29,7 +29,7 @@ from v3d_torch.wire import Channel, new_arena
 
 _LOG = logging.getLogger(__name__)
 
-_STAGES = "segment", "smooth", "detect", "lift"
+_STAGES = "segment", "smooth", "detect"
 """Those that look at a frame by itself, as attributes of `V3DSLAM`."""
 
 _LONGEST = 120.0

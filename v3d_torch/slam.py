@@ -38,8 +38,8 @@ from v3d_torch.types import RGBDFrame, Segmenter, memory_of
 class V3DSLAM:
     """Tracks an RGB-D camera and maps what stands still.
 
-    Every stage is an attribute, and any callable of the same signature can take its place. Those up to the clouds look
-    at a frame by itself (`perceive`), and may run ahead of those that follow the camera (`take_in`).
+    Every stage is an attribute, and any callable of the same signature can take its place. Those up to the features
+    look at a frame by itself (`perceive`), and may run ahead of those that follow the camera (`take_in`).
 
     Args:
         camera: intrinsics; None takes those of the first frame.
@@ -141,9 +141,7 @@ class V3DSLAM:
             depth = self.smooth(frame.depth[None])[0]
         with clock("features"):  # III-A: ORB
             features = self.detect(frame.image, depth)
-        with clock("clouds"):  # III-B.2: instances lifted to clean clouds
-            clouds = self.lift(depth, instances)
-        return Percept(frame, instances, depth, features, clouds, clock.seconds, memory_of(self.segment))
+        return Percept(frame, instances, depth, features, clock.seconds, memory_of(self.segment))
 
     def take_in(self, percept: Percept) -> Tracked:
         """Follow the camera and the objects on to the next frame.
@@ -164,11 +162,10 @@ class V3DSLAM:
         with self.clock("background"):  # what does not fit that motion, also what the network has no name for
             view = self.watch.look(frame.stamp, depth, T_cw)
             arrivals = self.watch(view, trusted=motion is not None)
-            clouds = percept.clouds
             if self.config.segmentation.source != "none":  # the baseline has no masks at all
-                proposed = self.propose(arrivals, instances, depth)
-                if len(proposed) > 0:
-                    instances, clouds = instances.joined(proposed), clouds.joined(self.lift(depth, proposed))
+                instances = instances.joined(self.propose(arrivals, instances, depth))
+        with self.clock("clouds"):  # III-B.2: instances lifted to clean clouds
+            clouds = self.lift(depth, instances)
         with self.clock("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
             scene = self.judge(instances, clouds, view, arrivals, Witnesses(seen.features.pixel, seen.matched(motion)))
             keep = seen.features.on(scene.static)

@@ -21,7 +21,7 @@ import torch
 from v3d_torch.errors import InputError
 from v3d_torch.files import written_whole
 
-_FORMAT, _VERSION = "v3d_torch state", 7
+_FORMAT, _VERSION = "v3d_torch state", 8
 
 _HEADER = f"{_FORMAT} {{version}} sha256 {{digest}}\n"
 _NO_DIGEST = "0" * hashlib.sha256().digest_size * 2

@@ -129,8 +129,16 @@ class Instances:
     def __len__(self) -> int:
         return self.labels.shape[0]
 
+    def __getitem__(self, keep: Tensor) -> Instances:
+        """Instances chosen by a boolean mask; all of them are these themselves, as masks take long to copy."""
+        if bool(keep.all()):
+            return self
+        return Instances(self.masks[keep], self.labels[keep], self.scores[keep], self.boxes[keep])
+
     def joined(self, others: Instances) -> Instances:
-        """These instances, then the others."""
+        """These instances, then the others; without others, these themselves."""
+        if len(others) == 0:
+            return self
         return Instances(
             masks=torch.cat([self.masks, others.masks]),
             labels=torch.cat([self.labels, others.labels]),

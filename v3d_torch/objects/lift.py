@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import CloudConfig
@@ -36,17 +35,6 @@ class ObjectClouds:
 
     def __len__(self) -> int:
         return self.points.shape[0]
-
-    def joined(self, others: ObjectClouds) -> ObjectClouds:
-        """These clouds, then the others."""
-        longest = max(self.points.shape[1], others.points.shape[1])
-        both = (self, others)
-        return ObjectClouds(
-            points=torch.cat([pad(each.points, (0, 0, 0, longest - each.points.shape[1])) for each in both]),
-            valid=torch.cat([pad(each.valid, (0, longest - each.valid.shape[1])) for each in both]),
-            centroid=torch.cat([each.centroid for each in both]),
-            own=torch.cat([each.own for each in both]),
-        )
 
 
 class CloudLifter:

@@ -54,7 +54,7 @@ def decode(
 
     masks = assemble_masks(predictions[-mask_channels:, order].T, prototypes, boxes, window)
     seen = masks.view(torch.uint8).flatten(1).amax(dim=1).bool()
-    return Instances(masks=masks[seen], labels=labels[seen], scores=scores[order][seen], boxes=boxes[seen])
+    return Instances(masks=masks, labels=labels, scores=scores[order], boxes=boxes)[seen]
 
 
 def non_maximum_suppression(boxes: Tensor, labels: Tensor, iou_threshold: float) -> Tensor:
@@ -97,15 +97,16 @@ def assemble_masks(coefficients: Tensor, prototypes: Tensor, boxes: Tensor, wind
     enlarge_rows = _enlargement(window.height // CELL, window.image_height)
     enlarge_columns = _enlargement(window.width // CELL, window.image_width)
     top, left = window.top // CELL, window.left // CELL
-    picture = prototypes[:, top : top + enlarge_rows.shape[1], left : left + enlarge_columns.shape[1]]
+    logits = (coefficients @ prototypes.flatten(1)).unflatten(1, prototypes.shape[1:])
+    logits = logits[:, top : top + enlarge_rows.shape[1], left : left + enlarge_columns.shape[1]]
 
     masks = torch.zeros(len(boxes), window.image_height, window.image_width, dtype=torch.bool)
     first, last = boxes.ceil().long().chunk(2, dim=1)  # pixel u is inside where left <= u < right
-    for mask, weights, (u0, v0), (u1, v1) in zip(masks, coefficients, first.tolist(), last.tolist(), strict=True):
+    for mask, cells, (u0, v0), (u1, v1) in zip(masks, logits, first.tolist(), last.tolist(), strict=True):
         rows, cell_rows = enlarge_rows[v0:v1], _cells(v0, v1, enlarge_rows)
         columns, cell_columns = enlarge_columns[u0:u1], _cells(u0, u1, enlarge_columns)
-        logits = torch.einsum("p,phw->hw", weights, picture[:, cell_rows, cell_columns])
-        mask[v0:v1, u0:u1] = rows[:, cell_rows] @ logits @ columns[:, cell_columns].T > 0  # sigmoid above one half
+        enlarged = rows[:, cell_rows] @ cells[cell_rows, cell_columns] @ columns[:, cell_columns].T
+        mask[v0:v1, u0:u1] = enlarged > 0  # sigmoid above one half
     return masks
 
 

@@ -27,8 +27,7 @@ def without_duplicates(instances: Instances, share: float) -> Instances:
     within = (masks @ masks.T) / area[:, None].clamp(min=1)
     # A person may hold a cup, or hide most of a chair; but what also lies in it is the same thing by another name.
     same = (within > share) & ((instances.labels[:, None] == instances.labels) | (share < within.T))
-    kept: list[int] = []
+    kept = torch.zeros(len(instances), dtype=torch.bool)
     for i in range(len(instances)):  # each depends on those before it; there are a few dozen at most
-        if not same[i, kept].any():
-            kept.append(i)
-    return Instances(instances.masks[kept], instances.labels[kept], instances.scores[kept], instances.boxes[kept])
+        kept[i] = not (same[i] & kept).any()
+    return instances[kept]
