@@ -288,8 +288,8 @@ def test_a_damaged_checkpoint_or_one_of_another_version(out: Path) -> None:
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])
     assert_one_sentence(call("--resume", out), f"{path}: is no state of a run, or a damaged one; begin anew")
-    path.write_bytes(whole.replace(b"state 7", b"state 8", 1))
-    assert_one_sentence(call("--resume", out), f"{path}: is a state in version 8 of its format")
+    path.write_bytes(whole.replace(b"state 8", b"state 9", 1))
+    assert_one_sentence(call("--resume", out), f"{path}: is a state in version 9 of its format")
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 
 
