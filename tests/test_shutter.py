@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,16 +13,21 @@ from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
-from v3d_torch.lie import se3_exp
+from v3d_torch.lie import invert, se3_exp, se3_log
+from v3d_torch.localise import Localiser
 from v3d_torch.mapping.local_map import SparseMap
+from v3d_torch.mapping.recorder import Estimate, PoseRecorder, Status
 from v3d_torch.mapping.self_calibration import learn_readout
 from v3d_torch.odometry.orb import Features
 from v3d_torch.odometry.shutter import GLOBAL_SHUTTER, Readout, RollingShutter
+from v3d_torch.odometry.tracker import MapTracker
 
 CAMERA = PinholeCamera(525.0, 520.0, 320.0, 240.0)
 KINECT = Readout(0.026, 1e8)
 SHAKE = torch.tensor([0.4, -0.3, 0.2, 0.9, -1.1, 1.3], dtype=torch.float64)  # m/s and rad/s
 STILL = torch.zeros(6, dtype=torch.float64)
+EYE = torch.eye(4, dtype=torch.float64)
+_NO_PLACES: Any = None  # the pose of a frame that was found asks for none
 
 
 def cloud(count: int = 200) -> Tensor:
@@ -153,6 +159,41 @@ def test_a_keyframe_whose_motion_is_known_better_is_seen_again() -> None:
     assert torch.equal(sparse_map.observations["uv"][~others], newest.features.uv[feature])
     assert torch.equal(sparse_map.observations["drift"][~others], newest.features.drift[feature])
     assert not torch.equal(sparse_map.observations["uv"][~others], before[~others])
+
+
+def test_a_frame_is_put_where_the_motion_says_that_is_known_later() -> None:
+    """Between keyframes, which bundle adjustment sees again, nothing else would put a pose right."""
+    config, T_cw = Config(), se3_exp(0.1 * SHAKE)
+    sparse_map = SparseMap(config.mapping, config.features, CAMERA)
+    first = sparse_map.insert(0, 0.0, EYE, features_of(CAMERA.project(cloud()), cloud()[:, 2]), torch.full((200,), -1))
+    read = rolled(cloud() @ T_cw[:3, :3].T + T_cw[:3, 3], SHAKE, KINECT.seconds)
+    localise = Localiser(MapTracker(config.tracking, config.features, CAMERA), _NO_PLACES, sparse_map, 15)
+
+    poses = PoseRecorder()
+    poses.record(0.0, Estimate(Status.TRACKED, T_cw, first.landmarks), first)
+    poses.record(0.1, Estimate(Status.TRACKED, se3_exp(0.2 * SHAKE), first.landmarks), first)
+    errors = []
+    for known in (STILL, SHAKE / 2, SHAKE):
+        found, points = sparse_map.behind(first.landmarks)
+        localise.again(RollingShutter(CAMERA)(read[found], known, KINECT), points, poses)
+        errors.append(float(se3_log(poses.T_pw @ invert(T_cw)).norm()))
+    assert errors[0] > 1.5 * errors[1] > 15 * errors[2]
+    assert torch.equal(poses.T_cw, se3_exp(0.2 * SHAKE))  # that of the frame after stays
+
+    few = slice(0, config.tracking.min_inliers - 1)
+    before = poses.T_pw
+    localise.again(read[torch.arange(200)[few]], points[few], poses)
+    assert torch.equal(poses.T_pw, before)
+
+
+def test_only_landmarks_that_live_are_behind_features() -> None:
+    sparse_map = mapped(KINECT)
+    first = sparse_map.keyframes[0]
+    shown = torch.where(torch.arange(len(first.landmarks)) % 2 == 0, first.landmarks, -1)
+    sparse_map.landmarks["alive"][shown[4]] = False
+    found, points = sparse_map.behind(shown)
+    assert found.tolist() == [i for i in range(0, len(shown), 2) if i != 4]
+    assert torch.equal(points, sparse_map.landmarks["point"][first.landmarks[found]])
 
 
 def test_features_keep_their_drift_when_some_are_chosen() -> None:

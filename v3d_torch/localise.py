@@ -54,6 +54,18 @@ class Localiser:
         nothing = torch.full((len(static),), -1, dtype=torch.int64)
         return Estimate(Status.ODOMETRY if known else Status.LOST, T_cw, nothing)
 
+    def again(self, features: Features, points: Tensor, poses: PoseRecorder) -> None:
+        """Refine the pose of the frame before the last, now that it is known better what that saw.
+
+        Args:
+            features: of that frame, put right.
+            points: the landmarks that they show, world frame, metres, float64, shape :math:`(L, 3)`.
+            poses: of all frames.
+        """
+        refined = self._track.refine(poses.T_pw, points, features, rounds=1)
+        if refined is not None:
+            poses.correct(refined.T_cw)
+
     def reference(self, estimate: Estimate) -> Keyframe | None:
         """The keyframe that shares most with the frame, else the last one; None while there is none."""
         keyframes = self._map.keyframes

@@ -219,13 +219,17 @@ class V3DSLAM:
         return self.unroll(features, velocity, self.mapper.map.readout)
 
     def _look_back(self) -> None:
-        """Put the features of the last frame right, if it is a keyframe: how the camera passed it is known only now."""
+        """Put the last frame right: how the camera passed it, and so what it saw at once, is known only now."""
         sparse_map, last, velocity = self.mapper.map, self._last, self.poses.passed
-        if velocity is None or last is None or not sparse_map.keyframes:
+        if velocity is None or last is None or last.landmarks is None or not sparse_map.keyframes:
             return
         newest = sparse_map.keyframes[-1]
         if newest.frame == last.frame.index:
             sparse_map.see(newest, self._at_once(newest.features, last.depth, last.frame, velocity))
+        elif self.config.shutter.enabled:
+            found, points = sparse_map.behind(last.landmarks)
+            features = self._at_once(last.features[found], last.depth, last.frame, velocity)
+            self.localise.again(features, points, self.poses)
 
     def _move_world(self, T_new_old: Tensor) -> None:
         """Carry what is remembered along when the world is corrected under it."""

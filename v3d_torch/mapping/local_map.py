@@ -203,6 +203,20 @@ class SparseMap:
         seen[self.observations["landmark"][chosen[self.observations["keyframe"]]]] = True
         return self.look_up(torch.nonzero(seen)[:, 0])
 
+    def behind(self, landmarks: Tensor) -> tuple[Tensor, Tensor]:
+        """Where landmarks are that features show.
+
+        Args:
+            landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
+
+        Returns:
+            Indices of the features whose landmark still lives, int64, shape :math:`(L,)`, and its place in the world,
+            metres, float64, shape :math:`(L, 3)`.
+        """
+        found = torch.nonzero(landmarks >= 0)[:, 0]
+        found = found[self.landmarks["alive"][landmarks[found]]]
+        return found, self.landmarks["point"].index_select(0, landmarks[found])
+
     def look_up(self, landmarks: Tensor) -> LocalMap:
         """Landmarks as a frame looks for them, those that are still alive.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import ClassVar
 
@@ -112,6 +112,11 @@ class PoseRecorder:
         """World to camera of the last frame, float64, shape :math:`(4, 4)`."""
         return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
 
+    @property
+    def T_pw(self) -> Tensor:
+        """World to camera of the frame before the last, of at least two, float64, shape :math:`(4, 4)`."""
+        return self._entries[-2].T_cw
+
     def outlook(self) -> Outlook:
         """How the camera is expected to go on from the last frame; where there is none it stands at the origin."""
         stamp = self._entries[-1].stamp if self._entries else 0.0
@@ -163,6 +168,11 @@ class PoseRecorder:
         if estimate.count:
             self.landmarks = estimate.landmarks[estimate.landmarks >= 0]
         return T_new_old
+
+    def correct(self, T_pw: Tensor) -> None:
+        """Take the frame before the last for taken from another pose, which has become known since."""
+        before = self._entries[-2]
+        self._entries[-2] = replace(before, T_ck=rigid(T_pw @ invert(_pose(before.keyframe))))
 
     def _put_right(self, T_new_old: Tensor, keyframe: Keyframe | None, *, linked: bool, first: bool) -> None:
         """Move the lost frames before one that is found, as far back as motions are known; all, before the first."""

@@ -71,43 +71,43 @@ class MapTracker:
         """
         row = torch.searchsorted(local.ids, carried).clamp(max=max(len(local.ids) - 1, 0))
         feature = torch.nonzero((carried >= 0) & (local.ids[row] == carried))[:, 0] if len(local.ids) else row[:0]
-        first = self._refine(features, T_cw, local, torch.stack([row[feature], feature], dim=1), rounds=2)
+        first = self.refine(T_cw, local.points[row[feature]], features[feature], rounds=2)
         if first is None:
             seen = self._search.project(T_cw, local)
-            pairs = self._search(features, seen, local, self._config.search_radius)
-            first = self._refine(features, T_cw, local, pairs, rounds=2)
+            landmark, feature = self._search(features, seen, local, self._config.search_radius).unbind(dim=1)
+            first = self.refine(T_cw, local.points[landmark], features[feature], rounds=2)
         if first is None:
             return None
         # From the refined pose, what the prediction had put out of reach is found as well, within half the radius.
         seen = self._search.project(first.T_cw, local)
-        pairs = self._search(features, seen, local, 0.5 * self._config.search_radius)
-        found = self._refine(features, first.T_cw, local, pairs, rounds=4)
+        landmark, feature = self._search(features, seen, local, 0.5 * self._config.search_radius).unbind(dim=1)
+        found = self.refine(first.T_cw, local.points[landmark], features[feature], rounds=4)
         if found is None:
             return None
-        landmark, feature = pairs[found.inliers].unbind(dim=1)
         ids = torch.full((len(features),), -1, dtype=torch.int64)
-        ids[feature] = local.ids[landmark]
+        ids[feature[found.inliers]] = local.ids[landmark[found.inliers]]
         visible = seen.rows if depth is None else seen.rows[~self._hidden(seen, depth)]
         return Tracking(found.T_cw, ids, local.ids[visible])
+
+    def refine(self, T_cw: Tensor, points: Tensor, features: Features, *, rounds: int) -> PoseRefinement | None:
+        """Refine a pose from landmarks that are known to be behind features, but for outliers.
+
+        Args:
+            T_cw: world to camera, about.
+            points: the landmarks, world frame, metres, float64, shape :math:`(N, 3)`.
+            features: that show them.
+            rounds: see `refine_pose`.
+
+        Returns:
+            None when fewer than ``min_inliers`` agree.
+        """
+        config = self._config
+        if len(features) < config.min_inliers:
+            return None
+        refined = refine_pose(T_cw, points, measurements(features, config, self._features), self._camera, rounds=rounds)
+        return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
     def _hidden(self, seen: Projection, depth: Tensor) -> Tensor:
         """Which landmarks lie behind what is seen in their places, by more than depth errs; bool, shape (V,)."""
         z = depth_under(self._camera.distort(seen.pixels).round().to(torch.int64), depth, torch.inf)
         return (z > 0) & (1 / z - 1 / seen.depth > _ERRS * self._config.inverse_depth_sigma)
-
-    def _refine(
-        self, features: Features, T_cw: Tensor, local: LocalMap, pairs: Tensor, *, rounds: int
-    ) -> PoseRefinement | None:
-        """Pose from pairs (row in ``local``, feature); None when too few agree."""
-        config = self._config
-        if pairs.shape[0] < config.min_inliers:
-            return None
-        landmark, feature = pairs.unbind(dim=1)
-        refined = refine_pose(
-            T_cw,
-            local.points[landmark],
-            measurements(features[feature], config, self._features),
-            self._camera,
-            rounds=rounds,
-        )
-        return refined if int(refined.inliers.sum()) >= config.min_inliers else None
