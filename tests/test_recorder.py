@@ -105,6 +105,19 @@ def test_the_jump_to_where_a_lost_camera_is_found_is_no_velocity() -> None:
 # --- lost frames
 
 
+def test_a_jump_to_a_place_seen_before_is_no_motion_that_a_frame_was_passed_with() -> None:
+    """A camera may be found elsewhere at once, without having been lost: no motion joins the two frames."""
+    poses, step = PoseRecorder(), se3_exp(0.1 * TWIST)
+    there = [EYE, step, step @ step, se3_exp(30 * TWIST), step @ se3_exp(30 * TWIST), step @ step @ se3_exp(30 * TWIST)]
+    passed = []
+    for index, T_cw in enumerate(there):
+        poses.record(0.1 * index, estimate(T_cw), None, None if index in (0, 3) else step)
+        passed.append(poses.passed)
+    assert passed[0] is None and passed[3] is None
+    for known in (*passed[1:3], *passed[4:]):
+        torch.testing.assert_close(known, TWIST, rtol=0, atol=1e-9)
+
+
 def test_without_frames_the_trajectory_is_empty() -> None:
     trajectory = PoseRecorder().trajectory()
     assert len(trajectory) == 0 and trajectory.T_wc.shape == (0, 4, 4)

@@ -161,7 +161,8 @@ class PoseRecorder:
                 self._velocity = self._velocity * (stamp - self._last_found() < Outlook.LONGEST)
             elif self.status is not Status.LOST and elapsed > 0:
                 velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
-                self.passed = velocity if len(self._entries) == 1 else (self._velocity + velocity) / 2
+                if T_cp is not None:  # else it may be a jump to a place seen before
+                    self.passed = (self._velocity + velocity) / 2 if self._entries[-1].linked else velocity
                 self._velocity = velocity
         T_ck = rigid(estimate.T_cw @ invert(T_kw))
         self._entries.append(_Entry(stamp, status, keyframe, T_ck, linked=T_cp is not None))

@@ -83,14 +83,16 @@ class MotionEstimator:
             a: known view; its features with depth take part.
             b: new view.
             elapsed: time between the views, seconds, which bounds how far a camera can have come.
-            guess: motion that the camera may have made, ``T_ba``, float64, shape :math:`(4, 4)`; None if unknown.
+            guess: motion that the camera may have made, ``T_ba``, float64, shape :math:`(4, 4)`; None if unknown, as
+                where a place is seen again: then all features are matched, of which few show the same.
 
         Returns:
             None when fewer than ``min_inliers`` matches agree on one motion, or on one that no hand can make.
         """
         config = self._config
         chosen = torch.nonzero(a.depth > 0)[:, 0]
-        chosen = chosen[spread(a.pixel[chosen], config.count, self._cell)]
+        if guess is not None:
+            chosen = chosen[spread(a.pixel[chosen], config.count, self._cell)]
         pairs = match_descriptors(
             a.descriptors[chosen], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
         )
