@@ -151,7 +151,7 @@ class V3DSLAM:
         """
         check_order(percept.frame, self.poses.stamp)
         frame, instances, depth = percept.frame, percept.instances, percept.depth
-        self._memory = percept.memory  # not as the segmentation has it now: it may be a frame ahead
+        self._memory = percept.memory  # not as the segmentation has it now: it may be frames ahead
         self.clock.add(percept.seconds)
         with self.clock("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             last, outlook = self._last, self.poses.outlook()

@@ -153,7 +153,6 @@ class PoseRecorder:
             correction, first = rigid(invert(estimate.T_cw) @ expected), not self.located
             self._put_right(correction, keyframe, linked=T_cp is not None, first=first)
             T_new_old = correction if first else None
-        T_kw = _pose(keyframe)
         self.passed = None
         if self._entries:
             elapsed = stamp - self._entries[-1].stamp
@@ -164,7 +163,7 @@ class PoseRecorder:
                 if T_cp is not None:  # else it may be a jump to a place seen before
                     self.passed = (self._velocity + velocity) / 2 if self._entries[-1].linked else velocity
                 self._velocity = velocity
-        T_ck = rigid(estimate.T_cw @ invert(T_kw))
+        T_ck = _relative(estimate.T_cw, keyframe)
         self._entries.append(_Entry(stamp, status, keyframe, T_ck, linked=T_cp is not None))
         if estimate.count:
             self.landmarks = estimate.landmarks[estimate.landmarks >= 0]
@@ -173,7 +172,7 @@ class PoseRecorder:
     def correct(self, T_pw: Tensor) -> None:
         """Take the frame before the last for taken from another pose, which has become known since."""
         before = self._entries[-2]
-        self._entries[-2] = replace(before, T_ck=rigid(T_pw @ invert(_pose(before.keyframe))))
+        self._entries[-2] = replace(before, T_ck=_relative(T_pw, before.keyframe))
 
     def _put_right(self, T_new_old: Tensor, keyframe: Keyframe | None, *, linked: bool, first: bool) -> None:
         """Move the lost frames before one that is found, as far back as motions are known; all, before the first."""
@@ -182,7 +181,7 @@ class PoseRecorder:
             entry = self._entries[index]
             if entry.status is not Status.LOST or not (linked or first):
                 break
-            T_ck = rigid(entry.T_cw @ invert(T_new_old) @ invert(_pose(keyframe)))
+            T_ck = _relative(entry.T_cw @ invert(T_new_old), keyframe)
             self._entries[index] = _Entry(entry.stamp, found if linked else Status.LOST, keyframe, T_ck, entry.linked)
             linked = linked and entry.linked
 
@@ -212,6 +211,11 @@ class PoseRecorder:
 def _pose(keyframe: Keyframe | None) -> Tensor:
     """World to camera of a keyframe; the world itself, where there is none."""
     return torch.eye(4, dtype=torch.float64) if keyframe is None else keyframe.T_cw
+
+
+def _relative(T_cw: Tensor, keyframe: Keyframe | None) -> Tensor:
+    """A pose as it is tied to a keyframe, keyframe to camera, float64, shape :math:`(4, 4)`."""
+    return rigid(T_cw @ invert(_pose(keyframe)))
 
 
 def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:
