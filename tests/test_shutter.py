@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.camera import LONGEST_READOUT, PinholeCamera
 from v3d_torch.config import Config
 from v3d_torch.lie import invert, se3_exp, se3_log
 from v3d_torch.localise import Localiser
@@ -115,9 +116,16 @@ def test_a_camera_that_is_known_for_sure_learns_nothing() -> None:
     assert learn_readout(GLOBAL_SHUTTER, slope=5.0, curvature=1e6) == GLOBAL_SHUTTER
 
 
+def test_what_the_camera_says_of_itself_is_sure_and_else_something_is_expected() -> None:
+    expected = Config().shutter
+    assert Readout.of_camera(CAMERA, expected) == Readout(expected.readout, expected.sigma**-2)
+    assert Readout.of_camera(replace(CAMERA, readout=0.0), expected) == GLOBAL_SHUTTER
+    assert learn_readout(Readout.of_camera(replace(CAMERA, readout=0.025), expected), 5.0, 1e6).seconds == 0.025
+
+
 def test_no_camera_takes_longer_than_it_can() -> None:
     learnt = learn_readout(Readout(0.01, 1.0), slope=-2e6 * 2.99, curvature=2e6)
-    assert learnt.seconds == pytest.approx(Readout.LONGEST, abs=1e-6)
+    assert learnt.seconds == pytest.approx(LONGEST_READOUT, abs=1e-6)
 
 
 @pytest.mark.parametrize("about", [{"seconds": 0.1, "information": 1.0}, {"seconds": math.nan, "information": 1.0}])

@@ -15,6 +15,9 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.validation import number
 
+LONGEST_READOUT = 0.05
+"""Seconds: no camera takes longer to read the rows of an image."""
+
 
 @dataclass(frozen=True)
 class PinholeCamera:
@@ -29,6 +32,8 @@ class PinholeCamera:
         height: rows of the images, pixels.
         distortion: k1, k2, p1, p2, k3 of the Brown model in OpenCV's order; as it gives them, an array of four or more.
         depth_scale: units of the depth image per metre (TUM: 5000).
+        readout: time from the first row of a colour image to the last, seconds, where it is known: 0 of a global
+            shutter, as rendered images have, less than 0 where rows are read from below; None where the images tell.
 
     Raises:
         InputError: one of them is no such number. A focal length below 0, as ICL-NUIM publishes for a y axis that
@@ -43,6 +48,7 @@ class PinholeCamera:
     height: int = 480
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: float = 5000.0
+    readout: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "width", "height", "depth_scale"):
@@ -60,6 +66,11 @@ class PinholeCamera:
         if not all(map(math.isfinite, lens)):
             raise InputError(f"the camera's distortion is {self.distortion!r}; give the numbers k1, k2, p1, p2, k3")
         object.__setattr__(self, "distortion", (*lens, *[0.0] * (5 - len(lens))))
+        if self.readout is not None:
+            readout = number(self.readout)
+            if not abs(readout) <= LONGEST_READOUT:
+                raise InputError(f"the camera's readout is {self.readout!r}; give seconds, at most {LONGEST_READOUT}")
+            object.__setattr__(self, "readout", readout)
 
     def __getstate__(self) -> dict[str, object]:
         """What it is made of: what is cached follows from that, and takes megabytes."""

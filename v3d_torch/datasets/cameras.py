@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.camera import LONGEST_READOUT, PinholeCamera
 from v3d_torch.errors import InputError
 from v3d_torch.files import read_text
 from v3d_torch.home import at_home
@@ -46,6 +46,7 @@ class _CameraFile(BaseModel):
     height: _Pixels
     distortion: tuple[_Finite, _Finite, _Finite, _Finite, _Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
+    readout: Annotated[float, Field(ge=-LONGEST_READOUT, le=LONGEST_READOUT)] | None = None
 
 
 def load_camera(path_or_name: str | Path) -> PinholeCamera:

@@ -14,8 +14,9 @@ from v3d_torch.errors import InputError
 from v3d_torch.trajectory import read_trajectory
 from v3d_torch.types import Trajectory
 
-CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5)
-"""As published, but fy, which is -480 there because the ray tracer's y axis points up: the images have theirs down."""
+CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5, readout=0.0)
+"""As published, but fy, which is -480 there because the ray tracer's y axis points up: the images have theirs down.
+Rendered images have all rows of one time."""
 
 _RATE = 30.0
 """Frames a second: the lists number the frames."""

@@ -94,7 +94,8 @@ def adjust_locally(
         tolerance=config.mapping.bundle_tolerance,
     )
     readout = sparse_map.readout
-    if config.shutter.enabled and (keyframe.index <= config.shutter.keyframes or keyframe.index % _SELDOM == 0):
+    asks = keyframe.index <= config.shutter.keyframes or keyframe.index % _SELDOM == 0
+    if asks and config.shutter.enabled and not readout.sure:
         readout = learn_readout(readout, *found.errors.profile(table["drift"].index_select(0, rows)))
     T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
     return Adjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit], readout)

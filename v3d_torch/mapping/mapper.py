@@ -29,7 +29,7 @@ class Mapper:
         if known is None:
             known = SparseMap(config.mapping, config.features, camera)
             if config.shutter.enabled:
-                known.readout = Readout(config.shutter.readout, config.shutter.sigma**-2)
+                known.readout = Readout.of_camera(camera, config.shutter)
         self.map = known
 
     def __call__(

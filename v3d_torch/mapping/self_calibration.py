@@ -8,8 +8,7 @@ it is.
 
 from __future__ import annotations
 
-import math
-
+from v3d_torch.camera import LONGEST_READOUT
 from v3d_torch.odometry.shutter import Readout
 
 _MEMORY = 0.8
@@ -33,9 +32,9 @@ def learn_readout(known: Readout, slope: float, curvature: float) -> Readout:
         ``known`` where that is sure, and where no readout costs less than others: the camera stood still, or always
         moved alike.
     """
-    if math.isinf(known.information) or curvature <= 0:
+    if known.sure or curvature <= 0:
         return known
     bottom = known.seconds - slope / curvature
     before, told = _MEMORY * known.information, _TRUST * curvature / 2
-    seconds = (before * known.seconds + told * min(max(bottom, -Readout.LONGEST), Readout.LONGEST)) / (before + told)
+    seconds = (before * known.seconds + told * min(max(bottom, -LONGEST_READOUT), LONGEST_READOUT)) / (before + told)
     return Readout(seconds, before + told)

@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.camera import LONGEST_READOUT, PinholeCamera
+from v3d_torch.config import ShutterConfig
 from v3d_torch.odometry.motion_field import motion_field
 from v3d_torch.odometry.orb import Features
 
@@ -34,7 +34,17 @@ class Readout:
     seconds: float
     information: float
 
-    LONGEST: ClassVar[float] = 0.05  # seconds: no camera takes longer
+    @property
+    def sure(self) -> bool:
+        """Whether no image can tell another."""
+        return math.isinf(self.information)
+
+    @classmethod
+    def of_camera(cls, camera: PinholeCamera, expected: ShutterConfig) -> Readout:
+        """What the camera says of itself, for sure; what is to be expected, where it says nothing."""
+        if camera.readout is not None:
+            return cls(camera.readout, math.inf)
+        return cls(expected.readout, expected.sigma**-2)
 
     @classmethod
     def of(cls, about: Mapping[str, float]) -> Readout:
@@ -44,7 +54,7 @@ class Readout:
             ValueError: there is no such camera.
         """
         seconds, information = float(about["seconds"]), float(about["information"])
-        if not (abs(seconds) <= cls.LONGEST and information >= 0):
+        if not (abs(seconds) <= LONGEST_READOUT and information >= 0):
             raise ValueError(f"a readout of {seconds} s")
         return cls(seconds, information)
 

@@ -18,8 +18,8 @@ from v3d_torch.datasets.demo.render import Renderer
 from v3d_torch.datasets.demo.room import build_room
 from v3d_torch.datasets.demo.sensor import sense_colour, sense_depth
 
-CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
-"""The default calibration of a Kinect."""
+CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, readout=0.0)
+"""The default calibration of a Kinect; rendered images have all rows of one time."""
 FRAMES = 120
 RATE = 30.0
 """Frames per second."""
