@@ -10,7 +10,7 @@ from v3d_torch.lie import se3_exp
 from v3d_torch.mapping.local_map import Keyframe
 from v3d_torch.odometry.orb import Features
 
-CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240)
+CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 ROOM = torch.tensor([[-1.53, -1.11, -1.47], [1.49, 1.17, 1.83]])
 """Lower and upper corner, metres, not on the faces of any voxels."""
 CRATE = torch.tensor([[-0.33, 0.41, 0.55], [0.37, 1.17, 1.21]])

@@ -20,7 +20,7 @@ from v3d_torch.lie import invert
 from v3d_torch.mapping.recorder import Status
 from v3d_torch.types import RGBDFrame
 
-CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 FRAMES = 90
 """Of a round: 4 degrees and 5 cm a frame."""
 

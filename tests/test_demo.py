@@ -27,7 +27,7 @@ from v3d_torch.datasets.demo.sequence import CAMERA, FRAMES, RATE, SEED, write_s
 from v3d_torch.datasets.demo.texturing import TextureTable
 from v3d_torch.errors import OutputError
 
-SMALL = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
+SMALL = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, readout=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.trajectory import read_trajectory
 from v3d_torch.types import Instances, RGBDFrame, Trajectory
 
-CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240)
+CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 WALL = 2.0
 """Distance of the wall, metres."""
 STEP = 4

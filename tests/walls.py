@@ -11,7 +11,7 @@ from v3d_torch.camera import PinholeCamera
 from v3d_torch.lie import se3_exp
 from v3d_torch.types import RGBDFrame, Trajectory
 
-CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240)
+CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 DISTANCE = 2.0
 """From the camera to the wall, metres."""
 LENGTH = 1600

@@ -19,7 +19,7 @@ STEP = 2
 """Pixels by which the image moves from frame to frame."""
 CAMERA = (
     f"fx: {FOCAL}\nfy: {FOCAL}\ncx: {(WIDTH - 1) / 2}\ncy: {(HEIGHT - 1) / 2}\n"
-    f"width: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: {SCALE}\n"
+    f"width: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: {SCALE}\nreadout: 0\n"
 )
 NOISE = np.random.default_rng(2).integers(0, 256, 5000, dtype=np.uint8).tobytes()
 STAMPS = [f"{1305031102 + i / 10:.6f}" for i in range(FRAMES)]

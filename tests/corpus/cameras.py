@@ -205,6 +205,11 @@ CASES = [
         ),
     ),
     Case(
+        "readout in milliseconds",
+        field("readout", "33"),
+        Says("{seq}/camera.yaml: readout: input should be less than or equal to 0.05, got 33; correct the camera"),
+    ),
+    Case(
         "lens of four numbers",
         edit(YAML, lambda content: content + b"distortion: [0.1, 0.1, 0, 0]\n"),
         Says("{seq}/camera.yaml: distortion.4: field required, got [0.1, 0.1, 0, 0]; correct the camera"),
