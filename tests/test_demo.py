@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import yaml
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import demo
+from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.demo import materials
 from v3d_torch.datasets.demo.geometry import Box, Figure, Pose, Rectangle, Scene
 from v3d_torch.datasets.demo.lighting import bake
@@ -70,8 +70,7 @@ def test_same_bytes_again_with_more_threads_and_another_selection(sequence: Path
 
 
 def test_layout(sequence: Path) -> None:
-    camera = yaml.safe_load((sequence / "camera.yaml").read_text())
-    assert camera["fx"] == CAMERA.fx and camera["distortion"] == [0.0] * 5 and camera["depth_scale"] == 5000
+    assert load_camera(sequence / "camera.yaml") == CAMERA and CAMERA.readout == 0
     lines = (sequence / "associations.txt").read_text().splitlines()
     assert [line.split()[0] for line in lines] == ["1.000000", "2.333333"]
     for line in lines:

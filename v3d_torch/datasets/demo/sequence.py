@@ -101,6 +101,7 @@ def _write_lists(folder: Path, frames: range) -> None:
             *(f"{key}: {getattr(CAMERA, key)}" for key in ("width", "height", "fx", "fy", "cx", "cy")),
             f"distortion: {list(CAMERA.distortion)}  # k1 k2 p1 p2 k3 (OpenCV)",
             f"depth_scale: {CAMERA.depth_scale:g}  # units per metre",
+            f"readout: {CAMERA.readout}  # seconds from the first row to the last",
         ],
     }
     for name, lines in lists.items():
