@@ -122,6 +122,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, Witne
     witness = Witness(slam)
     pipeline = Pipeline(sequence, slam, viewer=make_viewer(None, path, sequence))
     run = pipeline(witness)
+    pipeline.settle()
     assert run.failure is None
     return Recording(path), witness, pipeline
 
@@ -296,7 +297,9 @@ def test_what_a_loop_corrects_is_logged_again(tmp_path: Path) -> None:
             viewer.show(frame, scene, slam, {})
         witness(frame, scene, status)
 
-    Pipeline(sequence, slam, viewer=viewer)(on_frame)
+    pipeline = Pipeline(sequence, slam, viewer=viewer)
+    pipeline(on_frame)
+    pipeline.settle()
     recording = Recording(tmp_path / "run.rrd")
     moved = recording.at("/world/trajectory")[FRAMES - 1]["strips"][0]
     np.testing.assert_allclose(moved, slam.poses.trajectory().T_wc[:, :3, 3], atol=1e-6)
@@ -315,6 +318,7 @@ def test_a_ground_truth_without_orientations_is_not_laid_anywhere(tmp_path: Path
     sequence.groundtruth.T_wc[:, :3, :3] = torch.eye(3, dtype=torch.float64)
     pipeline = Pipeline(sequence, V3DSLAM(CAMERA, squares), viewer=make_viewer(None, tmp_path / "run.rrd", sequence))
     pipeline()
+    pipeline.settle()
     assert "/world/groundtruth" not in Recording(tmp_path / "run.rrd").entities
 
 
@@ -332,6 +336,7 @@ def test_poses_are_the_same_with_and_without_a_viewer(recorded: tuple[Recording,
     _, _, looked_on = recorded
     alone = Pipeline(Tilted(), V3DSLAM(CAMERA, squares, load_config(overrides=CONFIG)))
     alone()
+    alone.settle()
     assert torch.equal(alone.slam.poses.trajectory().T_wc, looked_on.slam.poses.trajectory().T_wc)
     assert "viewer" not in alone.slam.clock.seconds
 
@@ -363,7 +368,9 @@ def test_a_file_that_cannot_be_written_to_the_end_fails_the_run_after_its_result
 
     viewer._stream.flush = flush  # type: ignore[method-assign, assignment]
     pipeline = Pipeline(sequence, V3DSLAM(CAMERA, squares), viewer=viewer)
-    failure = pipeline().failure
+    pipeline()
+    pipeline.settle()
+    failure = pipeline.run.failure
     assert failure is not None and "the recording for rerun is not complete (File-writer" in failure
     assert len(pipeline.slam.poses.statuses) == FRAMES
 
@@ -409,6 +416,7 @@ def test_a_viewer_is_started_and_is_sent_the_run(
     listening = [at.laddr.ip for at in viewer_process.net_connections() if at.status == psutil.CONN_LISTEN]
     assert listening == ["127.0.0.1"]  # what a camera sees at home is nobody else's
     pipeline()
+    pipeline.settle()
     assert list(Recording(file).at("/world/camera")) == [0, 1, 2]
     deadline = time.monotonic() + 20
     while (not saved.is_file() or saved.stat().st_size < 10_000) and time.monotonic() < deadline:

@@ -153,10 +153,6 @@ class Pipeline:
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
                 self.run.failure = f"interrupted after {done} of {total} frames"
         self.run.seconds, self._percepts = before + time.perf_counter() - start, None
-        try:
-            self._viewer.finish(self.slam)
-        except V3DError as error:
-            self.run.failure = self.run.failure or str(error)
         return self.run
 
     def get_ready(self) -> Lookahead:
@@ -167,8 +163,12 @@ class Pipeline:
 
     @torch.inference_mode()
     def settle(self) -> None:
-        """After the last frame: take in what is still being solved for it."""
+        """After the last frame: take in what is still being solved for it, and let the viewer show how all came out."""
         self.slam.settle()
+        try:
+            self._viewer.finish(self.slam)
+        except V3DError as error:
+            self.run.failure = self.run.failure or str(error)
 
     def _coming(self) -> Iterator[RGBDFrame]:
         done = len(self.slam.poses.statuses) if isinstance(self.sequence, RGBDSequence) else 0
