@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from walls import CAMERA, Slide
 from v3d_torch.config import Config
 from v3d_torch.config_file import load_config
 from v3d_torch.errors import InputError, OutputError
-from v3d_torch.lie import invert, se3_exp
+from v3d_torch.lie import invert, se3_exp, se3_log
 from v3d_torch.mapping.columns import to_columns
 from v3d_torch.mapping.local_map import Loop, SparseMap
 from v3d_torch.mapping.recorder import Status
@@ -366,6 +367,21 @@ def test_a_run_that_begins_beside_the_map_is_put_right_when_it_comes_in(
     error = error_in_the_maps_world(done, into)
     assert error[-10:].max() < 0.01
     assert error.max() < 0.1  # over 3 m of the wall, by odometry
+
+
+def test_a_lost_camera_does_not_turn_by_what_is_taken_for_its_shutter(wall: tuple[Path, Pipeline]) -> None:
+    """Images of one velocity are bent alike: each step is right, also where the readout is wrong, as it is here."""
+    path, _ = wall
+    rolling = replace(CAMERA, readout=0.02)
+    known = load_map(path, rolling, LOCALISE).map
+    known.readout = Readout(0.02, math.inf)
+    slam = V3DSLAM(rolling, NoSegmentation(), LOCALISE, known)
+    into = Slide(100, 760, step=15)
+    for index in range(len(into)):
+        slam(into[index])
+    T_wc = slam.poses.trajectory().T_wc
+    turned = se3_log(invert(T_wc[2]) @ T_wc[slam.poses.statuses.index(Status.TRACKED) - 1])[3:]
+    assert turned.norm() < 0.02  # 0.1 with no velocity while the camera is lost
 
 
 def test_before_a_gap_in_the_motion_frames_stay_lost(wall: tuple[Path, Pipeline]) -> None:

@@ -93,6 +93,14 @@ def test_a_lost_camera_goes_on_for_a_moment_and_then_stands() -> None:
     assert steps.sum() < 0.3 * speed
 
 
+def test_a_lost_camera_whose_motions_are_known_goes_on_as_they_tell() -> None:
+    """Images are unrolled by the velocity: with none, each pair of them would be bent unalike."""
+    poses, step = walk([0.0, 0.1]), se3_exp(-0.1 * TWIST)
+    for k in range(2, 20):
+        poses.record(0.1 * k, estimate(step @ poses.T_cw, Status.LOST), None, step)
+        torch.testing.assert_close(poses.outlook().velocity, -TWIST, rtol=0, atol=1e-9)
+
+
 def test_the_jump_to_where_a_lost_camera_is_found_is_no_velocity() -> None:
     poses = walk([0.0, 1 / 30], lost=())
     for k in range(2, 20):

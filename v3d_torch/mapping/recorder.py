@@ -156,7 +156,9 @@ class PoseRecorder:
         self.passed = None
         if self._entries:
             elapsed = stamp - self._entries[-1].stamp
-            if estimate.status is Status.LOST:
+            if estimate.status is Status.LOST and T_cp is not None:
+                self._velocity = se3_log(T_cp) / elapsed
+            elif estimate.status is Status.LOST:
                 self._velocity = self._velocity * (stamp - self._last_found() < Outlook.LONGEST)
             elif self.status is not Status.LOST and elapsed > 0:
                 velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
