@@ -70,7 +70,8 @@ def test_same_bytes_again_with_more_threads_and_another_selection(sequence: Path
 
 
 def test_layout(sequence: Path) -> None:
-    assert load_camera(sequence / "camera.yaml") == CAMERA and CAMERA.readout == 0
+    camera = load_camera(sequence / "camera.yaml")
+    assert camera == CAMERA and camera.distortion == (0.0,) * 5 and camera.depth_scale == 5000 and camera.readout == 0
     lines = (sequence / "associations.txt").read_text().splitlines()
     assert [line.split()[0] for line in lines] == ["1.000000", "2.333333"]
     for line in lines:

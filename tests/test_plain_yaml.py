@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from v3d_torch.plain_yaml import parse_yaml
 
+LINE_BREAKS = set("\x85\u2028\u2029")
 SCALARS = st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(allow_nan=False) | st.text(max_size=12)
 TREES = st.recursive(
     SCALARS,
@@ -27,10 +28,11 @@ class Unaliased(yaml.SafeDumper):
 
 @given(tree=TREES)
 def test_values_are_those_of_the_usual_loader(tree: object) -> None:
-    text = yaml.dump(tree, Dumper=Unaliased)
-    assert parse_yaml(text) == yaml.safe_load(text) == tree
-    unescaped = yaml.dump(tree, Dumper=Unaliased, allow_unicode=True)  # which takes a few marks for line breaks
-    assert parse_yaml(unescaped) == yaml.safe_load(unescaped)
+    for allow_unicode in (False, True):
+        text = yaml.dump(tree, Dumper=Unaliased, allow_unicode=allow_unicode)
+        assert parse_yaml(text) == yaml.safe_load(text)
+        if not LINE_BREAKS & set(text):  # which PyYAML writes as they are, and reads as a space
+            assert parse_yaml(text) == tree
 
 
 def test_a_byte_order_mark_and_infinity() -> None:

@@ -356,7 +356,7 @@ class ShutterConfig(Section):
     readout: float = Field(0.02, ge=-0.05, le=0.05)
     """Time from the first row to the last, seconds, as long as neither the camera nor the map tells another. The colour
     cameras of most RGB-D cameras roll (Kinect, Xtion, D415, D435), and take 20 to 30 ms; of some, all rows are read at
-    once (D455). Where none was expected, the first frames were off, before the map could tell."""
+    once (D455). Were none expected, the first frames would be off, before the map can tell."""
     sigma: float = Field(0.015, gt=0)
     """How sure that is, standard deviation, seconds: a global shutter and the slowest are both within 2 of it."""
     keyframes: int = Field(20, ge=0)
