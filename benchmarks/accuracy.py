@@ -31,7 +31,7 @@ from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.cells import row, spread
 from v3d_torch.evaluation.tables import paper_scores, paper_sequence
-from v3d_torch.mapping.recorder import Status
+from v3d_torch.types import TrackingStatus
 
 CONFIGURATIONS = {
     "full": [],
@@ -119,13 +119,13 @@ def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root
 
 def runs_table(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """A row per sequence and configuration: how many frames were found and how, and how fast."""
-    yield row(["sequence", "configuration", "runs failed", *Status, "coverage", "frames a second"])
-    yield row(["---"] * 2 + ["---:"] * (3 + len(Status)))
+    yield row(["sequence", "configuration", "runs failed", *TrackingStatus, "coverage", "frames a second"])
+    yield row(["---"] * 2 + ["---:"] * (3 + len(TrackingStatus)))
     for sequence, configuration in unique((outcome.sequence, outcome.configuration) for outcome in outcomes):
         runs = [o for o in outcomes if (o.sequence, o.configuration) == (sequence, configuration)]
         metrics = [outcome.metrics for outcome in runs if outcome.metrics is not None]
         failed = f"{len(runs) - len(metrics)} of {len(runs)}"
-        statuses = [spread([m[status] for m in metrics if status in m], ".0f") for status in Status]
+        statuses = [spread([m[status] for m in metrics if status in m], ".0f") for status in TrackingStatus]
         coverage = spread([m["coverage"] for m in metrics if "coverage" in m], ".1%")
         fps = spread([m["fps"] for m in metrics], ".1f")
         yield row([sequence, configuration, failed, *statuses, coverage, fps])

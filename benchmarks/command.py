@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from v3d_torch.errors import OutputError
-from v3d_torch.files import write_text
+from v3d_torch.io.files import write_text
 
 
 def command_line(description: str) -> argparse.ArgumentParser:

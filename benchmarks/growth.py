@@ -23,13 +23,13 @@ from replay import Replay, forth_and_back
 from sequences import located
 from torch import Tensor
 
+from v3d_torch.backend.keyframe_database import KeyframeDatabase
+from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import Config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.cells import row
-from v3d_torch.lie import invert, se3_exp
-from v3d_torch.loop.places import PlaceIndex
-from v3d_torch.loop.pose_graph import optimise_pose_graph
+from v3d_torch.geometry.se3 import invert, se3_exp
 
 BLOCKS = 10
 SHARES = (0.1, 0.25, 0.5, 1.0)
@@ -57,12 +57,12 @@ def long_run(sequence: RGBDSequence, frames: int) -> Iterator[str]:
     slam = system.slam
 
     def mark() -> Mark:
-        keyframes = len(slam.mapper.map.kept)
-        return Mark(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loops.count)
+        keyframes = len(slam.mapper.map.active_keyframes)
+        return Mark(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loop_closer.loop_count)
 
     marks = [mark()]
     system(lambda *_: marks.append(mark()))
-    stages = list(slam.clock.seconds)
+    stages = list(slam.timer.seconds)
     columns = ["frames", "ms a frame", "slowest", "CPU ms a frame", "resident MB", "keyframes", "loops"]
     yield row([*columns, *(f"{stage} ms" for stage in stages)])
     yield row(["---:"] * (len(columns) + len(stages)))
@@ -72,7 +72,7 @@ def long_run(sequence: RGBDSequence, frames: int) -> Iterator[str]:
             continue
         then, now = marks[first], marks[end]
         slowest = max(marks[i + 1].clock - marks[i].clock for i in range(first, end))
-        rows = system.pipeline.run.frames[first:end]
+        rows = system.pipeline.record.frames[first:end]
         yield row(
             [
                 f"{first + 1}-{end}",
@@ -99,7 +99,7 @@ def many_keyframes(most: int) -> Iterator[str]:
     yield row(["---:"] * (1 + len(columns)))
     generator = torch.Generator().manual_seed(0)
     ring(LOOKS, generator)  # the first is slow
-    places, candidates = PlaceIndex(), Config().loop.candidates
+    places, candidates = KeyframeDatabase(), Config().loop.candidates
     adding: list[float] = []
     for count in sorted({max(round(share * most), LOOKS) for share in SHARES}):
         while len(places) < count:

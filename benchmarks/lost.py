@@ -20,18 +20,17 @@ from sequences import located
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.config_file import load_config
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import InputError, V3DError
-from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.ate import absolute_errors, align
 from v3d_torch.evaluation.cells import row
-from v3d_torch.lie import invert, se3_log
-from v3d_torch.mapping.recorder import Status
-from v3d_torch.segmentation import NoSegmentation, StoredMasks
+from v3d_torch.evaluation.pose_association import match
+from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.runtime.process import set_num_threads
+from v3d_torch.segmentation import MaskFolder, NoSegmentation
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.threads import share_out
-from v3d_torch.types import Instances, RGBDFrame, Trajectory
+from v3d_torch.types import Instances, RGBDFrame, TrackingStatus, Trajectory
 
 COVERED = NOWHERE = -1
 """Stands in the place of a frame that shows nothing, of a position that there is not."""
@@ -45,7 +44,7 @@ NEAR = 0.3
 ALIKE = 0.26
 """Radians between them: 15 degrees, a quarter of what a Kinect sees."""
 
-FOUND = (Status.TRACKED, Status.ODOMETRY)
+FOUND = (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
 """Statuses of a pose that is claimed to be right; the others say that it may be wrong."""
 
 
@@ -119,7 +118,7 @@ class MaskedWay:
     """The stored masks of a sequence's frames, for those of a way."""
 
     def __init__(self, sequence: RGBDSequence, case: Case, folder: Path) -> None:
-        self._sequence, self._shown, self._stored = sequence, case.shown, StoredMasks(folder)
+        self._sequence, self._shown, self._stored = sequence, case.shown, MaskFolder(folder)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
         """Instances of the frame that is shown."""
@@ -140,13 +139,13 @@ class Result:
     """
 
     T_wc: Tensor
-    online: list[Status]
-    statuses: list[Status]
+    online: list[TrackingStatus]
+    statuses: list[TrackingStatus]
 
 
 def follow(sequence: RGBDSequence, case: Case, config: Config, masks: Path | None) -> Result:
     """Run a case; without masks nobody is left out."""
-    share_out(config.threads)
+    set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     segment = NoSegmentation() if masks is None else MaskedWay(sequence, case, masks)
     slam = V3DSLAM(sequence.camera, segment, config)
@@ -203,7 +202,7 @@ def score(case: Case, result: Result, plain: Result, T_gc: Tensor) -> Score:
     return Score(
         recovery=recovery(case, result.online, truth),
         unflagged=sum(
-            status is Status.TRACKED
+            status is TrackingStatus.TRACKED
             for status, index in zip(result.statuses, case.shown, strict=True)
             if index == COVERED
         ),
@@ -215,14 +214,14 @@ def score(case: Case, result: Result, plain: Result, T_gc: Tensor) -> Score:
     )
 
 
-def recovery(case: Case, online: Sequence[Status], truth: Tensor) -> float | None:
+def recovery(case: Case, online: Sequence[TrackingStatus], truth: Tensor) -> float | None:
     """Frames from the first after the interruption that shows a known place to the first tracked; inf for never."""
     apart = se3_log(invert(truth[: case.cut])[None] @ truth[case.back :, None])
     known = (apart[..., :3].norm(dim=-1) < NEAR) & (apart[..., 3:].norm(dim=-1) < ALIKE)
     places = known.any(dim=1).nonzero()[:, 0].tolist()
     if not places:
         return None
-    tracked = [k for k in range(case.back, len(online)) if online[k] is Status.TRACKED]
+    tracked = [k for k in range(case.back, len(online)) if online[k] is TrackingStatus.TRACKED]
     return max(tracked[0] - case.back - places[0], 0) if tracked else torch.inf
 
 

@@ -18,17 +18,17 @@ import typer
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.config_file import load_config
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
-from v3d_torch.datasets.base import KnowsWhoMoves
-from v3d_torch.mapping.dense import fuse_points
-from v3d_torch.mapping.mesh import fuse_mesh
-from v3d_torch.mapping.storage import load_map, save_map
-from v3d_torch.mapping.views import StaticViews
+from v3d_torch.datasets.base import HasMotionMasks
+from v3d_torch.mapping.map_io import load_map, save_map
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.reconstruction.mesh import fuse_mesh
+from v3d_torch.reconstruction.point_map import fuse_points
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
 
-TRUSTING = load_config(overrides=["objects.background.min_tolerance=1000"])
+TRUSTING = load_config(overrides=["objects.free_space.min_tolerance=1000"])
 """Nothing is ever looked through."""
 
 Made = TypeVar("Made")
@@ -65,13 +65,13 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
         keyframes = slam.mapper.map.keyframes
         if not keyframes or keyframes[-1].frame != frame.index:
             continue
-        truth = sequence.who_moves(frame.index) if isinstance(sequence, KnowsWhoMoves) else None
+        truth = sequence.motion_mask(frame.index) if isinstance(sequence, HasMotionMasks) else None
         if truth is None:
             raise typer.BadParameter(f"{sequence.name} has no mask for frame {frame.index}")
         white = ((truth > 0) & (truth < 255)).to(torch.uint8).mul(255).expand(3, -1, -1)
-        views.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
-        masked.add(keyframes[-1], white, frame.depth, scene.unpeopled)
-        every.add(keyframes[-1], white, frame.depth, torch.ones_like(scene.unpeopled))
+        views.add(keyframes[-1], frame.image, frame.depth, scene.static_without_people)
+        masked.add(keyframes[-1], white, frame.depth, scene.static_without_people)
+        every.add(keyframes[-1], white, frame.depth, torch.ones_like(scene.static_without_people))
     return slam, views, {"what the system takes for static": masked, "all": every}
 
 

@@ -26,12 +26,12 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 
-from v3d_torch.depth import smooth_depth
+from v3d_torch.geometry.depth_smoother import smooth_depth
+from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.objects.chamfer import chamfer_distance
-from v3d_torch.objects.clusters import largest_clusters
 from v3d_torch.objects.dbscan import dbscan
+from v3d_torch.objects.largest_clusters import largest_clusters
 from v3d_torch.objects.voting import hough_vote
-from v3d_torch.objects.voxel import voxel_pool
 
 OURS = "v3d_torch"
 SIZES = [(5, 500), (5, 5000), (50, 500), (50, 5000)]

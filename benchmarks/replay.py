@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.datasets.stored import StoredSequence
 
 
-class Replay(StoredFrames):
+class Replay(StoredSequence):
     """Frames of another sequence, without its ground truth and masks.
 
     Time goes on by as much as lies between two frames in the other, in whichever direction.

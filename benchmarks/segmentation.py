@@ -18,19 +18,19 @@ from heading import heading
 from sequences import located
 from torch import Tensor
 
-from v3d_torch.config_file import load_config
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.cells import row
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.threads import share_out
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
-SERIAL = ("lookahead=false",)  # as in v3d_torch/run.py
+SERIAL = ("prefetch=false",)  # as in v3d_torch/cli/run.py
 
 REFERENCE = "yolov8n 640x480, 32 bits"
 FULL = ("segmentation.width=640", "segmentation.height=480")
@@ -85,7 +85,7 @@ def compare(sequence: RGBDSequence) -> Iterator[str]:
     reference: dict[int, Tensor] = {}
     for name, variant in VARIANTS.items():
         config = load_config(overrides=[*SERIAL, *variant.overrides])
-        share_out(config.threads)
+        set_num_threads(config.threads)
         watched = Watched(make_segmenter(config.segmentation), variant.every)
         pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, watched, config))
         run = pipeline()

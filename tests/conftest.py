@@ -12,7 +12,7 @@ from v3d_torch.datasets.demo.sequence import write_sequence
 
 torch.set_num_threads(1)
 
-SLOWEST = ("test_real_sequences.py", "test_run_command.py", "test_corpus.py", "test_ablate_command.py")
+SLOWEST = ("test_real_sequences.py", "cli/test_run.py", "test_corpus.py", "cli/test_ablate.py")
 """Begin with these, so that with several workers (``-n 2``) none is left alone with one of them in the end."""
 
 

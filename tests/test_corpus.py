@@ -13,12 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from corpus import CATEGORIES
-from corpus.base import write_base
-from corpus.case import Case, Place, Right, Says
+from helpers.corpus import CATEGORIES
+from helpers.corpus.base import write_base
+from helpers.corpus.case import Case, Place, Right, Says
 from typer.testing import CliRunner
 
-from v3d_torch import report, run
+from v3d_torch.cli import report, run
 
 CASES = [
     pytest.param(category, case, id=f"{category}: {case.name}")
@@ -109,7 +109,7 @@ def test_a_broken_sequence(
     category: str, case: Case, place: Place, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if category not in DRAWN:
-        monkeypatch.setattr("v3d_torch.results.draw_run", lambda *_: None)
+        monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
     case.make(place)
     with case.during(place), little_memory():
         done = CliRunner().invoke(run.app, arguments(place))
@@ -146,7 +146,7 @@ def test_results_of_an_earlier_run_are_replaced_and_other_files_stay(place: Plac
 
 def test_nothing_that_a_run_writes_is_left_for_the_next(place: Place) -> None:
     """Whoever adds a file to the results adds it to what `prepare_folder` removes."""
-    from v3d_torch.earlier_results import prepare_folder
+    from v3d_torch.runs.result_folder import prepare_folder
 
     assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks", "--mesh"]).exit_code == 0
     assert CliRunner().invoke(report.app, [str(place.out)]).exit_code == 0

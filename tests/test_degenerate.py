@@ -10,30 +10,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import rooms
 import sklearn.cluster
 import torch
+from helpers import rooms
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import Config
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, scale_error
-from v3d_torch.lie import invert, rigid, se3_exp, se3_log
-from v3d_torch.loop.pose_graph import optimise_pose_graph
-from v3d_torch.mapping.bundle import Observations, bundle_adjust
-from v3d_torch.mapping.mesh import fuse_mesh
-from v3d_torch.mapping.normals import surface_normals
-from v3d_torch.mapping.views import StaticViews
+from v3d_torch.features.orb import Features
+from v3d_torch.features.ransac import epipolar_inliers
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.normals import surface_normals
+from v3d_torch.geometry.se3 import invert, rigid, se3_exp, se3_log
+from v3d_torch.geometry.voxel import voxel_pool
+from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
+from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.chamfer import chamfer_distance
 from v3d_torch.objects.dbscan import dbscan
-from v3d_torch.objects.intra_motion import intra_object_motion
+from v3d_torch.objects.deformation import intra_object_motion
 from v3d_torch.objects.voting import hough_vote
-from v3d_torch.objects.voxel import voxel_pool
-from v3d_torch.odometry.motion import MotionEstimator
-from v3d_torch.odometry.orb import Features
-from v3d_torch.odometry.ransac import epipolar_inliers
-from v3d_torch.odometry.refine import Measurements, refine_pose
+from v3d_torch.odometry.motion_estimator import MotionEstimator
+from v3d_torch.optim.pose_refinement import refine_pose
+from v3d_torch.optim.reprojection import Measurements
+from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
@@ -175,7 +176,7 @@ def test_motion_before_a_plane_and_of_a_camera_that_only_turns(shape: str, motio
     T_ba = se3_exp(MOTIONS[motion])
     a, b = views(points(shape), T_ba)
     assert epipolar_inliers(a.uv, b.uv, threshold=1.0, iterations=200, seed=0).float().mean() > 0.9
-    found = MotionEstimator(Config().motion, Config().features, CAMERA, seed=0)(a, b)
+    found = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
     assert found is not None
     assert se3_log(found.T_ba @ invert(T_ba)).abs().max() < 1e-5
 
@@ -186,7 +187,7 @@ def test_motion_that_points_do_not_determine(shape: str, motion: str) -> None:
     """None, or one of those that explain what is seen."""
     T_ba = se3_exp(MOTIONS[motion])
     a, b = views(points(shape), T_ba)
-    found = MotionEstimator(Config().motion, Config().features, CAMERA, seed=0)(a, b)
+    found = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
     if found is not None:
         moved = points(shape)[found.pairs[:, 0]] @ found.T_ba[:3, :3].T + found.T_ba[:3, 3]
         assert (CAMERA.project(moved) - b.uv[found.pairs[:, 1]]).norm(dim=1).max() < 3

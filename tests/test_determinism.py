@@ -10,17 +10,17 @@ import pytest
 import torch
 
 from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
-from v3d_torch.config_file import load_config
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
+from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.trajectory import write_trajectory
 
 FRAMES = 14
 RUNS = {
     "by default": (),
-    "one by one": ("lookahead=false",),
+    "one by one": ("prefetch=false",),
     "two threads for the network": ("segmentation.threads=2",),
-    "one by one, two threads": ("lookahead=false", "threads=2"),
+    "one by one, two threads": ("prefetch=false", "threads=2"),
     "two threads": ("threads=2",),
 }
 

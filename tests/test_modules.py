@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 import v3d_torch as v3d
-from v3d_torch.lie import se3_exp
-from v3d_torch.objects.lift import ObjectClouds
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.objects.instance_clouds import InstanceClouds
 
 DTYPES = [torch.float32, torch.float64]
 CAMERA = v3d.PinholeCamera(fx=12.0, fy=11.0, cx=4.5, cy=3.5, width=10, height=8)
@@ -314,7 +314,7 @@ def test_gradients_flow_from_pixels_to_votes() -> None:
 # ---------------------------------------------------------------- ids
 
 
-def boxes(count: int, shift: float, dtype: torch.dtype) -> tuple[v3d.Instances, ObjectClouds, Tensor]:
+def boxes(count: int, shift: float, dtype: torch.dtype) -> tuple[v3d.Instances, InstanceClouds, Tensor]:
     """A grid of things 0.3 m apart before a wall, moved to the right; instances, their clouds, depth."""
     camera = TRACKED
     place = torch.stack([torch.arange(count) % 10, torch.arange(count) // 10], dim=1).to(dtype) * 0.3 - 1.4
@@ -327,7 +327,7 @@ def boxes(count: int, shift: float, dtype: torch.dtype) -> tuple[v3d.Instances, 
     inside = (u >= low[:, :1, None]) & (u <= high[:, :1, None]) & (v >= low[:, 1:, None]) & (v <= high[:, 1:, None])
     depth = torch.where(inside.any(dim=0), 2.0, 4.0).to(dtype)[None]
     instances = v3d.Instances(inside, torch.zeros(count, dtype=torch.int64), torch.ones(count), torch.zeros(count, 4))
-    clouds = ObjectClouds(points, torch.ones(count, 9, dtype=torch.bool), points.mean(dim=1), inside)
+    clouds = InstanceClouds(points, torch.ones(count, 9, dtype=torch.bool), points.mean(dim=1), inside)
     return instances, clouds, depth
 
 
@@ -355,7 +355,7 @@ def test_matching_in_batches(batch: int, count: int, dtype: torch.dtype) -> None
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("count", [0, 1, 100])
 def test_tracker_alone(count: int, dtype: torch.dtype) -> None:
-    track = v3d.InstanceTracker(v3d.Config().objects.identity, TRACKED, voxel_size=0.05)
+    track = v3d.InstanceTracker(v3d.Config().objects.tracker, TRACKED, voxel_size=0.05)
     here = torch.eye(4, dtype=torch.float64)
     for frame in range(3):
         instances, clouds, depth = boxes(count, 0.05 * frame, dtype)

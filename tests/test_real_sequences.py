@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from v3d_torch.trajectory import read_trajectory
+from v3d_torch.datasets.tum_trajectory import read_trajectory
 
 Run = Callable[..., dict[str, Any]]
 
@@ -41,7 +41,7 @@ def test_a_camera_that_stands_among_walkers(run: Run) -> None:
     metrics = run("crowd_static")
     assert metrics["frames"] == 108
     assert metrics["ate"]["rmse"] < 0.01
-    assert metrics["lost"] + metrics["adrift"] == 0
+    assert metrics["lost"] + metrics["disconnected"] == 0
 
 
 def test_a_camera_that_turns_among_walkers_needs_to_know_who_moves(run: Run) -> None:
@@ -50,7 +50,7 @@ def test_a_camera_that_turns_among_walkers_needs_to_know_who_moves(run: Run) -> 
     assert metrics["ate"]["rmse"] < 0.03
     assert abs(metrics["readout"]) < 0.002  # a rendered camera has no rolling shutter
     assert metrics["ate"]["rmse"] < 0.6 * without["ate"]["rmse"]
-    assert metrics["lost"] + metrics["adrift"] == 0
+    assert metrics["lost"] + metrics["disconnected"] == 0
 
 
 def test_fast_turns_before_a_desk(run: Run) -> None:

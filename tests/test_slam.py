@@ -9,14 +9,14 @@ import pytest
 import torch
 from PIL import Image
 
-from v3d_torch import V3DSLAM, PinholeCamera, RGBDFrame, Tracked, load_sequence
-from v3d_torch.config_file import load_config
+from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_sequence
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.depth import DepthSmoother
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.lie import invert
-from v3d_torch.mapping.recorder import Status
+from v3d_torch.geometry.depth_smoother import DepthSmoother
+from v3d_torch.geometry.se3 import invert
 from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.types import TrackingStatus
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))
 
@@ -30,12 +30,12 @@ def test_frames_bring_their_camera_and_poses_come_back(demo: RGBDSequence) -> No
     slam = V3DSLAM(config=NO_NETWORK)
     for index in range(3):
         pose = slam(demo[index])
-        assert isinstance(pose, Tracked)
+        assert isinstance(pose, FrameResult)
         assert pose.stamp == float(demo.stamps[index])
         assert pose.T_wc.shape == (4, 4) and pose.T_wc.dtype == torch.float64
         assert torch.equal(pose.T_wc, invert(slam.poses.T_cw))
-        assert pose.status is Status.TRACKED
-        assert pose.static.shape == (480, 640) and pose.objects == []
+        assert pose.status is TrackingStatus.TRACKED
+        assert pose.static_mask.shape == (480, 640) and pose.objects == []
 
 
 def test_a_camera_given_or_carried_gives_the_same(demo: RGBDSequence) -> None:
@@ -52,7 +52,7 @@ def test_arrays_as_opencv_gives_them_give_the_same(demo: RGBDSequence) -> None:
         image = frame.image.permute(1, 2, 0).numpy()
         metres = frame.depth[0].numpy().astype(np.float64)
         metres[metres == 0] = np.nan
-        made = RGBDFrame.of(index, frame.stamp, image, metres, demo.camera)
+        made = RGBDFrame.from_arrays(index, frame.stamp, image, metres, demo.camera)
         assert torch.equal(made.image, frame.image) and torch.equal(made.depth, frame.depth)
         assert torch.equal(stored(frame).T_wc, from_arrays(made).T_wc)
 
@@ -60,9 +60,11 @@ def test_arrays_as_opencv_gives_them_give_the_same(demo: RGBDSequence) -> None:
 def test_depth_in_the_cameras_units_becomes_metres(demo: RGBDSequence) -> None:
     image = torch.zeros(480, 640, 3, dtype=torch.uint8)
     units = np.full((480, 640), 5000, np.uint16)
-    assert RGBDFrame.of(0, 0.0, image, units, demo.camera).depth.unique().item() == 5000 / demo.camera.depth_scale
-    assert RGBDFrame.of(0, 0.0, image, units).depth.unique().item() == 5.0
-    assert RGBDFrame.of(0, 0.0, image, torch.full((480, 640), -1.0)).depth.unique().item() == 0.0
+    assert (
+        RGBDFrame.from_arrays(0, 0.0, image, units, demo.camera).depth.unique().item() == 5000 / demo.camera.depth_scale
+    )
+    assert RGBDFrame.from_arrays(0, 0.0, image, units).depth.unique().item() == 5.0
+    assert RGBDFrame.from_arrays(0, 0.0, image, torch.full((480, 640), -1.0)).depth.unique().item() == 0.0
 
 
 @pytest.mark.parametrize(
@@ -78,7 +80,7 @@ def test_depth_in_the_cameras_units_becomes_metres(demo: RGBDSequence) -> None:
 )
 def test_arrays_of_another_shape_or_type_are_refused(image: np.ndarray, depth: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"frame 7: .*; give "):
-        RGBDFrame.of(7, 0.0, image, depth)
+        RGBDFrame.from_arrays(7, 0.0, image, depth)
 
 
 def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
@@ -91,9 +93,9 @@ def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
         (Image.fromarray(rgb), Image.fromarray(metres.numpy())),
         (torch.from_numpy(rgb), metres.clone().requires_grad_()),  # a network's
     ):
-        made = RGBDFrame.of(0, frame.stamp, image, depth, demo.camera)
+        made = RGBDFrame.from_arrays(0, frame.stamp, image, depth, demo.camera)
         assert torch.equal(made.image, frame.image) and torch.equal(made.depth, frame.depth)
-    half = RGBDFrame.of(0, 0.0, rgb, metres.to(torch.bfloat16), demo.camera)
+    half = RGBDFrame.from_arrays(0, 0.0, rgb, metres.to(torch.bfloat16), demo.camera)
     torch.testing.assert_close(half.depth, frame.depth, rtol=4e-3, atol=0)
 
 
@@ -117,7 +119,7 @@ def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
 def test_what_is_no_frame_is_said(change: dict[str, object], message: str) -> None:
     given = {"stamp": 0.0, "image": np.zeros((480, 640, 3), np.uint8), "depth": np.ones((480, 640))} | change
     with pytest.raises(InputError, match=f"^frame 7: {message}"):
-        RGBDFrame.of(7, **given)
+        RGBDFrame.from_arrays(7, **given)
 
 
 def test_without_any_camera_it_says_so(demo: RGBDSequence) -> None:
@@ -130,8 +132,8 @@ def test_without_any_camera_it_says_so(demo: RGBDSequence) -> None:
 def test_a_stage_can_be_replaced_at_any_time(demo: RGBDSequence, known: bool) -> None:
     slam = V3DSLAM(demo.camera if known else None, NoSegmentation(), NO_NETWORK)
     seen = []
-    smooth = slam.smooth if known else DepthSmoother(5, 1.0, 0.05)
-    slam.smooth = lambda depth: seen.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
+    smooth = slam.smooth_depth if known else DepthSmoother(5, 1.0, 0.05)
+    slam.smooth_depth = lambda depth: seen.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
     slam(demo[0])
     assert seen == [(1, 1, 480, 640)]
 
@@ -147,11 +149,11 @@ def test_a_map_that_drops_what_nobody_needs_tracks_the_same_to_the_bit(
     """Landmarks that are dead and that nobody refers to go; the others get other ids, and nothing else changes."""
     runs = {}
     for name, worth in (("never", math.inf), ("with every keyframe", 0)):
-        monkeypatch.setattr("v3d_torch.mapping.local_map._LANDMARKS", worth)
+        monkeypatch.setattr("v3d_torch.mapping.sparse_map._LANDMARKS", worth)
         slam = V3DSLAM(demo.camera, config=load_config(None, ("segmentation.source=none",)))
         for index in range(60):
             slam(demo[index])
-        slam.settle()
+        slam.flush()
         runs[name] = slam
     packed, whole = runs["with every keyframe"].mapper.map, runs["never"].mapper.map
     assert len(packed.keyframes) == len(whole.keyframes) > 3

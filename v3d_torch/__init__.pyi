@@ -1,29 +1,28 @@
-from .camera import BackProjector, PinholeCamera, back_project
 from .config import Config
-from .config_file import load_config
+from .config.loading import load_config
 from .datasets import SourceOptions, load_sequence, open_source
-from .depth import DepthSmoother, smooth_depth
+from .datasets.tum_trajectory import read_trajectory, write_trajectory
 from .errors import ConfigError, DownloadError, GroundTruthWarning, InputError, V3DError
-from .mapping.dense import PointMap, fuse_points
-from .mapping.mesh import Mesh, fuse_mesh
-from .mapping.normals import surface_normals
-from .mapping.recorder import Status
-from .mapping.storage import StoredMap, load_map, save_map
-from .mapping.views import StaticViews
+from .frame_result import FrameResult
+from .geometry.camera import BackProjector, PinholeCamera, back_project
+from .geometry.depth_smoother import DepthSmoother, smooth_depth
+from .geometry.normals import surface_normals
+from .geometry.voxel import VoxelPool, Voxels, voxel_pool
+from .mapping.map_io import StoredMap, load_map, save_map
+from .mapping.static_views import StaticViews
 from .objects.assignment import match_instances
 from .objects.chamfer import ChamferDistance, chamfer_distance
-from .objects.clusters import LargestClusters, largest_clusters
 from .objects.dbscan import DBSCAN, dbscan
-from .objects.dynamics import Judged, Verdict
-from .objects.intra_motion import Deformation, IntraObjectMotion, intra_object_motion
-from .objects.tracker import InstanceTracker
+from .objects.deformation import Deformation, IntraObjectMotion, intra_object_motion
+from .objects.instance_tracker import InstanceTracker
+from .objects.largest_clusters import LargestClusters, largest_clusters
+from .objects.motion_classifier import MotionState, TrackedObject
 from .objects.voting import HoughVoting, Votes, hough_vote
-from .objects.voxel import VoxelPool, Voxels, voxel_pool
-from .percept import Tracked
+from .reconstruction.mesh import Mesh, fuse_mesh
+from .reconstruction.point_map import PointMap, fuse_points
+from .runs.state import load_state, save_state
 from .slam import V3DSLAM
-from .state import load_state, save_state
-from .trajectory import read_trajectory, write_trajectory
-from .types import Instances, RGBDFrame, Trajectory
+from .types import Instances, RGBDFrame, TrackingStatus, Trajectory
 
 __all__ = [
     "DBSCAN",
@@ -35,26 +34,26 @@ __all__ = [
     "Deformation",
     "DepthSmoother",
     "DownloadError",
+    "FrameResult",
     "GroundTruthWarning",
     "HoughVoting",
     "InputError",
     "InstanceTracker",
     "Instances",
     "IntraObjectMotion",
-    "Judged",
     "LargestClusters",
     "Mesh",
+    "MotionState",
     "PinholeCamera",
     "PointMap",
     "RGBDFrame",
     "SourceOptions",
     "StaticViews",
-    "Status",
     "StoredMap",
-    "Tracked",
+    "TrackedObject",
+    "TrackingStatus",
     "Trajectory",
     "V3DError",
-    "Verdict",
     "Votes",
     "VoxelPool",
     "Voxels",

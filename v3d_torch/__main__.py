@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from v3d_torch import ablate, batch, evaluate, record, report, reproduce, run
+from v3d_torch.cli import ablate, batch, evaluate, record, report, reproduce, run
 
 COMMANDS: tuple[ModuleType, ...] = (run, batch, evaluate, ablate, reproduce, record, report)
 """Modules with one command each, which ``python -m v3d_torch.run`` and so on call as well."""

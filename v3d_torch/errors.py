@@ -34,4 +34,4 @@ class GroundTruthWarning(UserWarning):
 
 
 class NumericsError(V3DError):
-    """A stage gave a number that is NaN or infinite; raised in debug mode, see `v3d_torch.doors`."""
+    """A stage gave a number that is NaN or infinite; raised in debug mode, see `v3d_torch.runs.numerics_check`."""

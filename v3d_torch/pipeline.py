@@ -13,24 +13,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.base import KnowsWhoMoves, RGBDSequence, RGBDStream
-from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
+from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
-from v3d_torch.files import write_png
-from v3d_torch.lookahead import Lookahead
-from v3d_torch.mapping.recorder import Status
-from v3d_torch.mapping.views import StaticViews
-from v3d_torch.memory import give_back
-from v3d_torch.objects.dynamics import Judged, Scene, Verdict
+from v3d_torch.io.files import write_png
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.objects.motion_classifier import FrameObjects, MotionState, TrackedObject
+from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
+from v3d_torch.runtime.process import trim_memory
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import RGBDFrame
+from v3d_torch.types import RGBDFrame, TrackingStatus
 from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
 
 _LOG = logging.getLogger(__name__)
 
-FrameCallback = Callable[[RGBDFrame, Scene, Status], None]
+FrameCallback = Callable[[RGBDFrame, FrameObjects, TrackingStatus], None]
 
 
 @dataclass(frozen=True)
@@ -39,11 +38,11 @@ class Snapshot:
 
     frame: RGBDFrame
     T_cw: Tensor
-    scene: Scene
+    scene: FrameObjects
 
 
 @dataclass
-class Run:
+class RunRecord:
     """What a run leaves behind beside the trajectory.
 
     Attributes:
@@ -62,13 +61,13 @@ class Run:
     frames: list[dict[str, float]] = field(default_factory=list)
     dynamics: list[dict[str, object]] = field(default_factory=list)
     snapshots: list[Snapshot] = field(default_factory=list)
-    liveliest: Snapshot | None = None
+    most_dynamic_snapshot: Snapshot | None = None
     mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)
     seconds: float = 0.0
     failure: str | None = None
     interrupted: bool = False
-    unscored: str | None = None
-    unsaved: str | None = None
+    mask_error: str | None = None
+    save_error: str | None = None
 
 
 class Pipeline:
@@ -102,20 +101,20 @@ class Pipeline:
         self.sequence = sequence
         self.slam = slam
         self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
-        self.run = Run()
-        self.whole = True
+        self.record = RunRecord()
+        self.between_frames = True
         self._masks = masks
         self._viewer = viewer
         self._score = score
         self._step = 1
-        self._percepts: Lookahead | None = None
+        self._percepts: FramePrefetcher | None = None
 
     @property
     def frames(self) -> int:
         """Frames that there are to take in; of a stream, which does not know, those taken in."""
         return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses.statuses)
 
-    def __call__(self, on_frame: FrameCallback | None = None) -> Run:
+    def __call__(self, on_frame: FrameCallback | None = None) -> RunRecord:
         """Process all frames. What was computed is kept when a frame cannot be read or the user interrupts.
 
         An interrupt is how a stream without an end is meant to end, and no failure.
@@ -123,76 +122,76 @@ class Pipeline:
         Args:
             on_frame: called after each frame.
         """
-        self.run.failure, self.run.interrupted = None, False
-        before, start = self.run.seconds, time.perf_counter()
+        self.record.failure, self.record.interrupted = None, False
+        before, start = self.record.seconds, time.perf_counter()
         try:
             # Nobody learns through a run: to keep no gradients in mind saves a tenth of the time.
             with torch.inference_mode(), closing(self.get_ready()) as percepts:
                 start = time.perf_counter()
                 for percept in percepts:
-                    self.whole = False
-                    frame, scene = percept.frame, self.slam.take_in(percept)
-                    seconds = self.slam.clock.lap()
-                    self.run.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
+                    self.between_frames = False
+                    frame, scene = percept.frame, self.slam.track(percept)
+                    seconds = self.slam.timer.lap()
+                    self.record.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
                     self._note(frame, scene)
                     self._viewer.show(frame, scene, self.slam, seconds)
-                    self.run.seconds, self.whole = before + time.perf_counter() - start, True
+                    self.record.seconds, self.between_frames = before + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, scene, self.slam.poses.statuses[-1])
-                    if len(self.run.frames) % self._TIDY == 0:
-                        give_back()
+                    if len(self.record.frames) % self._TIDY == 0:
+                        trim_memory()
         except V3DError as error:
-            self.run.failure = str(error)
+            self.record.failure = str(error)
         except Exception as error:  # what was computed is worth keeping when the program is at fault, too
             _LOG.exception("the run broke")
             why = (str(error).splitlines() or [""])[0]
-            self.run.failure = f"the program failed with {type(error).__name__}: {why}; report it with the run.log"
+            self.record.failure = f"the program failed with {type(error).__name__}: {why}; report it with the run.log"
         except KeyboardInterrupt:
-            self.run.interrupted = True
+            self.record.interrupted = True
             if isinstance(self.sequence, Sized):
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
-                self.run.failure = f"interrupted after {done} of {total} frames"
-        self.run.seconds, self._percepts = before + time.perf_counter() - start, None
-        return self.run
+                self.record.failure = f"interrupted after {done} of {total} frames"
+        self.record.seconds, self._percepts = before + time.perf_counter() - start, None
+        return self.record
 
-    def get_ready(self) -> Lookahead:
+    def get_ready(self) -> FramePrefetcher:
         """What looks at the frames, begun and up, which may take seconds: a call does it first of all."""
         if self._percepts is None:
-            self._percepts = Lookahead(self._coming(), self.slam, ahead=self.slam.config.lookahead)
+            self._percepts = FramePrefetcher(self._coming(), self.slam, ahead=self.slam.config.prefetch)
         return self._percepts
 
     @torch.inference_mode()
-    def settle(self) -> None:
+    def flush(self) -> None:
         """After the last frame: take in what is still being solved for it, and let the viewer show how all came out."""
-        self.slam.settle()
+        self.slam.flush()
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:
-            self.run.failure = self.run.failure or str(error)
+            self.record.failure = self.record.failure or str(error)
 
     def _coming(self) -> Iterator[RGBDFrame]:
         done = len(self.slam.poses.statuses) if isinstance(self.sequence, RGBDSequence) else 0
-        if isinstance(self.sequence, StoredFrames):
-            return self.sequence.since(done)
+        if isinstance(self.sequence, StoredSequence):
+            return self.sequence.frames_from(done)
         return islice(iter(self.sequence), done, None)
 
-    def _note(self, frame: RGBDFrame, scene: Scene) -> None:
-        self.run.dynamics.extend(_row(frame, judged) for judged in scene.objects)
+    def _note(self, frame: RGBDFrame, scene: FrameObjects) -> None:
+        self.record.dynamics.extend(_row(frame, judged) for judged in scene.objects)
         self._evaluate_masks(frame, scene)
         if self._masks is not None:
-            left_out = (~scene.static).to(torch.uint8) * 255
+            left_out = (~scene.static_mask).to(torch.uint8) * 255
             write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
         keyframes = self.slam.mapper.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.views.add(keyframes[-1], frame.image, frame.depth, scene.unpeopled)
+            self.views.add(keyframes[-1], frame.image, frame.depth, scene.static_without_people)
         self._keep_for_figures(Snapshot(frame, self.slam.poses.T_cw, scene))
 
     def _keep_for_figures(self, shot: Snapshot) -> None:
         """Keep every so manieth frame; of a stream, whose length is not known, ever fewer. And the liveliest."""
-        best = self.run.liveliest
+        best = self.record.most_dynamic_snapshot
         if best is None or _liveliness(shot.scene) > _liveliness(best.scene):
-            self.run.liveliest = shot
-        snapshots = self.run.snapshots
+            self.record.most_dynamic_snapshot = shot
+        snapshots = self.record.snapshots
         if isinstance(self.sequence, Sized):
             step = max(len(self.sequence) // self._SNAPSHOTS, 1)
             wanted = shot.frame.index % step == step // 2 and len(snapshots) < self._SNAPSHOTS
@@ -204,24 +203,24 @@ class Pipeline:
         if wanted:
             snapshots.append(shot)
 
-    def _evaluate_masks(self, frame: RGBDFrame, scene: Scene) -> None:
+    def _evaluate_masks(self, frame: RGBDFrame, scene: FrameObjects) -> None:
         truth = None
-        if self._score and isinstance(self.sequence, KnowsWhoMoves) and self.run.unscored is None:
+        if self._score and isinstance(self.sequence, HasMotionMasks) and self.record.mask_error is None:
             try:
-                truth = self.sequence.who_moves(frame.index)
+                truth = self.sequence.motion_mask(frame.index)
             except InputError as error:  # the truth is for the scores only
-                self.run.unscored = str(error)
+                self.record.mask_error = str(error)
         if truth is not None:
             objects = {judged.id: judged.mask for judged in scene.objects}
-            self.run.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static, objects)
+            self.record.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static_mask, objects)
 
 
-def _liveliness(scene: Scene) -> tuple[int, int]:
-    dynamic = {judged.id for judged in scene.objects if judged.verdict is Verdict.DYNAMIC}
-    return sum(elected in dynamic for _, elected in scene.ballots), len(scene.objects)
+def _liveliness(scene: FrameObjects) -> tuple[int, int]:
+    dynamic = {judged.id for judged in scene.objects if judged.motion_state is MotionState.DYNAMIC}
+    return sum(elected in dynamic for _, elected in scene.vote_pairs), len(scene.objects)
 
 
-def _row(frame: RGBDFrame, judged: Judged) -> dict[str, object]:
+def _row(frame: RGBDFrame, judged: TrackedObject) -> dict[str, object]:
     x, y, z = judged.centroid.tolist()
     return {
         "frame": frame.index,
@@ -233,6 +232,6 @@ def _row(frame: RGBDFrame, judged: Judged) -> dict[str, object]:
         "z": z,
         "votes": judged.votes,
         "chamfer": judged.chamfer,
-        "verdict": judged.verdict.value,
+        "motion_state": judged.motion_state.value,
         "missed": judged.missed,
     }

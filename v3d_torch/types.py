@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
-from v3d_torch.validation import number
+from v3d_torch.geometry.camera import PinholeCamera
 
 
 @dataclass(frozen=True)
@@ -42,16 +43,16 @@ class RGBDFrame:
     depth: Tensor
     T_cw: Tensor | None = None
     camera: PinholeCamera | None = None
-    delay: float = 0.0
+    depth_delay: float = 0.0
 
     @staticmethod
-    def of(
+    def from_arrays(
         index: int,
         stamp: float,
         image: NDArray[np.uint8] | Tensor,
         depth: NDArray[np.generic] | Tensor,
         camera: PinholeCamera | None = None,
-        delay: float = 0.0,
+        depth_delay: float = 0.0,
     ) -> RGBDFrame:
         """A frame from images as cameras, simulators and image libraries give them.
 
@@ -84,8 +85,8 @@ class RGBDFrame:
                 f"frame {index}: the depth image is {measured.dtype}; give metres in floating point, or whole numbers"
                 " in the camera's units"
             )
-        for name, seconds in (("stamp", stamp), ("delay", delay)):
-            if not math.isfinite(number(seconds)):
+        for name, seconds in (("stamp", stamp), ("delay", depth_delay)):
+            if not math.isfinite(to_float(seconds)):
                 raise InputError(f"frame {index}: the {name} is {seconds!r}; give seconds, as a finite number")
         if not isinstance(camera, PinholeCamera | None):
             raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
@@ -99,7 +100,9 @@ class RGBDFrame:
             metres = metres / (camera.depth_scale if camera is not None else 1000)
         metres = metres.where(metres.isfinite() & (metres > 0), 0.0)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
-        return RGBDFrame(index, number(stamp), channels, metres[None], camera=camera, delay=number(delay))
+        return RGBDFrame(
+            index, to_float(stamp), channels, metres[None], camera=camera, depth_delay=to_float(depth_delay)
+        )
 
 
 def _array(image: object) -> NDArray[Any]:
@@ -135,7 +138,7 @@ class Instances:
             return self
         return Instances(self.masks[keep], self.labels[keep], self.scores[keep], self.boxes[keep])
 
-    def joined(self, others: Instances) -> Instances:
+    def concatenate(self, others: Instances) -> Instances:
         """These instances, then the others; without others, these themselves."""
         if len(others) == 0:
             return self
@@ -182,6 +185,35 @@ def remind(segment: object, memory: object) -> None:
     """Give a segmenter, where it goes by the frames before, what one made alike remembered of them."""
     if isinstance(segment, Remembering):
         segment.memory = memory
+
+
+class TrackingStatus(StrEnum):
+    """How a frame's pose was found."""
+
+    TRACKED = "tracked"  # in the map
+    ODOMETRY = "odometry"  # by its motion since the frame before, or to the one after
+    DISCONNECTED = "disconnected"  # in a part of the map that only a guess joins to the rest
+    LOST = "lost"  # not at all: predicted, and interpolated once the camera is found again
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """A frame's pose as it was found.
+
+    Attributes:
+        status: how.
+        T_cw: world to camera, float64, shape :math:`(4, 4)`.
+        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
+    """
+
+    status: TrackingStatus
+    T_cw: Tensor
+    landmarks: Tensor
+
+    @property
+    def count(self) -> int:
+        """Number of landmarks found."""
+        return int((self.landmarks >= 0).sum())
 
 
 @dataclass(frozen=True)

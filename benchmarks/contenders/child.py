@@ -15,8 +15,8 @@ from replay import Replay
 from contenders import OURS, PEERS
 from contenders.base import Contender
 from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import V3DError
-from v3d_torch.trajectory import write_trajectory
 
 
 def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> Contender:

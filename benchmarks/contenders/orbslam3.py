@@ -14,9 +14,9 @@ import numpy as np
 import pyorbslam3
 import torch
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.trajectory import read_trajectory
+from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Trajectory
 
 VIEWER = (

@@ -6,17 +6,17 @@ from collections.abc import Mapping
 
 import torch
 
-from v3d_torch.config_file import load_config
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.threads import share_out
 from v3d_torch.types import Trajectory
 
 OVERRIDES = {
     "v3d_torch": [],
-    "v3d_torch --serial": ["lookahead=false"],  # as in v3d_torch/run.py
+    "v3d_torch --serial": ["prefetch=false"],  # as in v3d_torch/cli/run.py
     "v3d_torch --segmenter none": ["segmentation.source=none"],
 }
 
@@ -36,7 +36,7 @@ class Ours:
 
     def __init__(self, sequence: RGBDSequence, name: str, seed: int) -> None:
         config = load_config(overrides=[f"seed={seed}", *OVERRIDES[name]])
-        share_out(config.threads)
+        set_num_threads(config.threads)
         torch.manual_seed(seed)
         self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
         self.pipeline = Pipeline(sequence, self.slam, score=False)  # comparing true masks takes time of its own
@@ -45,7 +45,7 @@ class Ours:
     @property
     def stages(self) -> Mapping[str, float]:
         """Seconds by stage; of two that run side by side, each has its own."""
-        return self.slam.clock.seconds
+        return self.slam.timer.seconds
 
     def __call__(self, on_frame: FrameCallback | None = None) -> None:
         """Take in all frames.
@@ -59,7 +59,7 @@ class Ours:
         failure = self.pipeline(on_frame).failure
         if failure is not None:
             raise RuntimeError(failure)
-        self.pipeline.settle()
+        self.pipeline.flush()
 
     def trajectory(self) -> Trajectory:
         """A pose for every frame."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from v3d_torch.trajectory import read_trajectory
+from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.types import Trajectory
 
 LONGEST = 3600

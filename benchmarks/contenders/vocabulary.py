@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.download import cache_dir
-from v3d_torch.files import one_process_makes, write_text
+from v3d_torch.io.download import cache_dir
+from v3d_torch.io.files import file_lock, write_text
 
 BRANCHES, DEPTH = 10, 6
 """As in ORB-SLAM3's own vocabulary: it compares features within the nodes four levels above the leaves of a tree that
@@ -60,7 +60,7 @@ def vocabulary(sequences: Iterable[RGBDSequence], images: int = 200, features: i
     contents = [(s.name, len(s), float(s.stamps[0])) for s in sequences]
     key = sha256(repr((contents, images, features, BRANCHES, DEPTH)).encode()).hexdigest()[:12]
     path = cache_dir() / f"orb_vocabulary_{key}.txt"
-    with one_process_makes(path):
+    with file_lock(path):
         if not path.is_file():
             write_text(path, text(train(*collect(sequences, images, features))))
     return path

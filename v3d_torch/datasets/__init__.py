@@ -12,12 +12,12 @@ from v3d_torch.datasets.locate import sequence_path
 from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
 from v3d_torch.datasets.realsense import open_camera
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
-from v3d_torch.datasets.stored import StoredFrames
+from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
-from v3d_torch.download import Progress, cache_dir
 from v3d_torch.errors import GroundTruthWarning, InputError
-from v3d_torch.files import StrPath
-from v3d_torch.home import at_home
+from v3d_torch.io.download import Progress, cache_dir
+from v3d_torch.io.files import StrPath
+from v3d_torch.io.paths import expand_user
 
 __all__ = [
     "PAPER_SEQUENCES",
@@ -83,7 +83,7 @@ def _checked(
     if options.fps is not None and not _RATES[0] <= options.fps <= _RATES[1]:
         raise InputError(f"--fps {options.fps:g}: give frames a second, between {_RATES[0]:g} and {_RATES[1]:g}")
     try:
-        root = None if data_root is None else at_home(data_root)
+        root = None if data_root is None else expand_user(data_root)
         return _open(os.fspath(name), root, camera, options, download, progress)
     except OSError as error:  # a folder that may not be looked into, a name that is too long
         raise InputError(
@@ -93,7 +93,7 @@ def _checked(
 
 def _warn_of_truth(source: RGBDStream) -> None:
     """Say where the caller of this module stands that a source came without its ground truth."""
-    if isinstance(source, StoredFrames) and source.groundtruth_error is not None:
+    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
         warnings.warn(f"{source.groundtruth_error}; there are no true poses", GroundTruthWarning, stacklevel=3)
 
 
@@ -116,7 +116,7 @@ def _open(
         return open_camera(name, camera, fps=options.fps)
     path = sequence_path(name, data_root=data_root, download=download, progress=progress)
     source = open_path(path, camera, options, progress)
-    if isinstance(source, StoredFrames):
+    if isinstance(source, StoredSequence):
         source.check_first_frame(path)
     return source
 
@@ -143,7 +143,7 @@ def load_sequence(
     if not isinstance(source, RGBDSequence):
         raise InputError(
             f"{name}: is a stream, whose frames come only once and in order; save it first with"
-            f" python -m v3d_torch.record --seq {name} --out FOLDER"
+            f" python -m v3d_torch record --seq {name} --out FOLDER"
         )
     _warn_of_truth(source)
     return source

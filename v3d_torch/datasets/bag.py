@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from v3d_torch.association import associate
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.bag_topics import Topics, choose_topics
 from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
 from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.lists import MAX_DIFFERENCE
-from v3d_torch.datasets.stored import StoredFrames
-from v3d_torch.download import Progress
+from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.download import Progress
+from v3d_torch.io.timestamps import associate
 
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Reader1
@@ -36,7 +36,7 @@ _LENSES = ("plumb_bob", "rational_polynomial", "")
 """Lens models that begin with k1, k2, p1, p2, k3; the second goes on."""
 
 
-class BagSequence(StoredFrames):
+class BagSequence(StoredSequence):
     """Frames of a bag: colour and depth images of two topics, paired by the stamps in their headers.
 
     The bag is read through once for the stamps, and images are read when they are asked for.

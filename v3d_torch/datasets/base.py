@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
 
 
@@ -47,10 +47,10 @@ class RGBDSequence(RGBDStream, Protocol):
 
 
 @runtime_checkable
-class KnowsWhoMoves(Protocol):
+class HasMotionMasks(Protocol):
     """A sequence that has true masks besides its frames. They are for evaluation: the system must not see them."""
 
-    def who_moves(self, index: int) -> Tensor | None:
+    def motion_mask(self, index: int) -> Tensor | None:
         """What moves in frame ``index``; None where it is not known.
 
         Returns:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import torch
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.tum import TUMSequence, is_tum
-from v3d_torch.lie import rigid
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import rigid
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(
@@ -40,7 +40,7 @@ class BonnSequence(TUMSequence):
     """Frames of a folder such as ``rgbd_bonn_crowd``, with the poses of its camera as ground truth.
 
     ``groundtruth.txt`` holds the poses of the markers, 2 cm from the camera: the published transforms take them to the
-    camera. Most published tables compare with the file as it stands, as ``python -m v3d_torch.evaluate`` does.
+    camera. Most published tables compare with the file as it stands, as ``python -m v3d_torch evaluate`` does.
 
     Args:
         folder: the sequence's folder.
@@ -59,7 +59,7 @@ class BonnSequence(TUMSequence):
 def is_bonn(path: Path) -> bool:
     """Whether a folder is called as the dataset's are and holds what they hold.
 
-    One with a ``camera.yaml`` was written by ``python -m v3d_torch.record``, its poses are the camera's.
+    One with a ``camera.yaml`` was written by ``python -m v3d_torch record``, its poses are the camera's.
     """
     return "rgbd_bonn" in path.resolve().name.lower() and is_tum(path) and not (path / "camera.yaml").is_file()
 

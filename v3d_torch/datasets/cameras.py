@@ -12,12 +12,12 @@ from typing import Annotated, Any
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from v3d_torch.camera import LONGEST_READOUT, PinholeCamera
+from v3d_torch.config.validation import first_error
 from v3d_torch.errors import InputError
-from v3d_torch.files import read_text
-from v3d_torch.home import at_home
-from v3d_torch.plain_yaml import parse_yaml
-from v3d_torch.validation import first_error
+from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
+from v3d_torch.io.files import read_text
+from v3d_torch.io.paths import expand_user
+from v3d_torch.io.safe_yaml import parse_yaml
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
 PRESETS: tuple[str, ...] = tuple(
@@ -46,7 +46,7 @@ class _CameraFile(BaseModel):
     height: _Pixels
     distortion: tuple[_Finite, _Finite, _Finite, _Finite, _Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
-    readout: Annotated[float, Field(ge=-LONGEST_READOUT, le=LONGEST_READOUT)] | None = None
+    readout: Annotated[float, Field(ge=-MAX_READOUT, le=MAX_READOUT)] | None = None
 
 
 def load_camera(path_or_name: str | Path) -> PinholeCamera:
@@ -62,7 +62,7 @@ def load_camera(path_or_name: str | Path) -> PinholeCamera:
     """
     if str(path_or_name) in PRESETS:
         return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name))
-    path = at_home(path_or_name)
+    path = expand_user(path_or_name)
     if not path.is_file():
         near = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
         hint = f"did you mean {near[0]}?" if near else f"the presets are {', '.join(PRESETS)}"

@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from v3d_torch.datasets.lists import Pair
+from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.errors import InputError
-from v3d_torch.stamps import seconds
+from v3d_torch.io.timestamps import parse_timestamp
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
 
@@ -30,13 +30,13 @@ def frame_number(path: Path) -> int | None:
 def stamp(path: Path) -> float | None:
     """Seconds, where the name is a time: ``1305031102.175304.png``, ``1403636579763555584.png``; else None."""
     if match := re.search(r"(?<!\d)(\d+\.\d+)$", path.stem):
-        return seconds(match[1])
+        return parse_timestamp(match[1])
     if match := re.search(r"(?<!\d)(\d{13}|\d{16}|\d{19})$", path.stem):  # milli-, micro-, nanoseconds since 1970
-        return seconds(match[1])
+        return parse_timestamp(match[1])
     return None
 
 
-def numbered_pairs(folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float) -> list[Pair]:
+def numbered_pairs(folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float) -> list[ImagePair]:
     """Join the images of equal frame numbers.
 
     Args:
@@ -52,4 +52,6 @@ def numbered_pairs(folder: Path, colour: Iterable[Path], depth: Iterable[Path], 
     numbers = sorted(number for number in by_number[0].keys() & by_number[1].keys() if number is not None)
     if not numbers:
         raise InputError(f"{folder}: no colour image has the number of a depth image; do they belong together?")
-    return [Pair(number / rate, *(str(files[number].relative_to(folder)) for files in by_number)) for number in numbers]
+    return [
+        ImagePair(number / rate, *(str(files[number].relative_to(folder)) for files in by_number)) for number in numbers
+    ]

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.lists import Pair, read_associations
+from v3d_torch.datasets.lists import ImagePair, read_associations
 from v3d_torch.datasets.paired import PairedImages
+from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
-from v3d_torch.trajectory import read_trajectory
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5, readout=0.0)
@@ -37,7 +37,8 @@ class ICLNUIMSequence(PairedImages):
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
         pairs = [
-            Pair(pair.stamp / _RATE, pair.colour, pair.depth) for pair in read_associations(folder / "associations.txt")
+            ImagePair(pair.stamp / _RATE, pair.colour, pair.depth)
+            for pair in read_associations(folder / "associations.txt")
         ]
         truths = sorted(folder.glob("*.gt.freiburg*"))
         if len(truths) > 1:

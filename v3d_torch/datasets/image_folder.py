@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from v3d_torch.association import associate
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.file_names import images_in, stamp
-from v3d_torch.datasets.lists import MAX_DIFFERENCE, Pair
+from v3d_torch.datasets.lists import MAX_DIFFERENCE, ImagePair
 from v3d_torch.datasets.paired import PairedImages
 from v3d_torch.errors import InputError
+from v3d_torch.io.timestamps import associate
 
 _COLOUR = re.compile(r"rgb|colou?r|image|img|photo", re.IGNORECASE)
 _DEPTH = re.compile(r"depth", re.IGNORECASE)
@@ -36,7 +36,7 @@ class ImageFolder(PairedImages):
         files = _matched(folder, colour, depth)
         stamps = _stamps(folder, [path for path, _ in files], fps)
         pairs = [
-            Pair(seconds, *(str(path.relative_to(folder)) for path in both))
+            ImagePair(seconds, *(str(path.relative_to(folder)) for path in both))
             for seconds, both in sorted(dict(zip(stamps, files, strict=True)).items())
         ]
         super().__init__(folder, pairs, choose_camera(camera, folder))

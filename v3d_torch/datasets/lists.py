@@ -11,11 +11,10 @@ from pathlib import Path
 from statistics import median
 from typing import TypeVar
 
-from v3d_torch.association import associate
 from v3d_torch.datasets.images import is_depth
 from v3d_torch.errors import InputError
-from v3d_torch.files import numbered_lines
-from v3d_torch.stamps import seconds
+from v3d_torch.io.files import numbered_lines
+from v3d_torch.io.timestamps import associate, parse_timestamp
 
 _T = TypeVar("_T")
 
@@ -29,13 +28,13 @@ MAX_DIFFERENCE = 0.02
 
 
 @dataclass(frozen=True)
-class Pair:
+class ImagePair:
     """A colour and a depth image that belong together; files relative to the sequence's folder."""
 
     stamp: float
     colour: str
     depth: str
-    delay: float = field(default=0.0, kw_only=True)  # of the depth image, seconds after the colour image
+    depth_delay: float = field(default=0.0, kw_only=True)  # of the depth image, seconds after the colour image
 
 
 def read_image_list(path: Path) -> list[tuple[float, str]]:
@@ -61,7 +60,7 @@ def read_image_list(path: Path) -> list[tuple[float, str]]:
     return _in_order(entries, path)
 
 
-def read_associations(path: Path) -> list[Pair]:
+def read_associations(path: Path) -> list[ImagePair]:
     """Read lines of ``stamp file stamp file``, in order of the colour stamps.
 
     Colour may come first or depth: both are in use, and a look at the images of the first line tells.
@@ -85,10 +84,12 @@ def read_associations(path: Path) -> list[Pair]:
     if rows and is_depth(path.parent / rows[0][1]) and not is_depth(path.parent / rows[0][3]):
         rows = [(stamp, colour, other, depth) for other, depth, stamp, colour in rows]
     ordered = _in_order(((stamp, (colour, depth, other)) for stamp, colour, other, depth in rows), path)
-    return [Pair(stamp, colour, depth, delay=_delay(stamp, other)) for stamp, (colour, depth, other) in ordered]
+    return [
+        ImagePair(stamp, colour, depth, depth_delay=_delay(stamp, other)) for stamp, (colour, depth, other) in ordered
+    ]
 
 
-def pair_lists(colour: Path, depth: Path) -> list[Pair]:
+def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
     """Join the images of two lists in a folder one to one by nearest stamps, at most `MAX_DIFFERENCE` apart.
 
     Returns:
@@ -109,10 +110,10 @@ def pair_lists(colour: Path, depth: Path) -> list[Pair]:
             f"{colour.parent}: no stamp in {colour.name} lies within {MAX_DIFFERENCE} s of one in {depth.name};"
             " do both lists belong to this sequence?"
         )
-    return [Pair(*images[i], depths[j][1], delay=_delay(images[i][0], depths[j][0])) for i, j in indices]
+    return [ImagePair(*images[i], depths[j][1], depth_delay=_delay(images[i][0], depths[j][0])) for i, j in indices]
 
 
-def refuse_other_units(pairs: Sequence[Pair], folder: Path) -> None:
+def refuse_other_units(pairs: Sequence[ImagePair], folder: Path) -> None:
     """Raise InputError where frames lie so far apart that their stamps cannot be seconds."""
     gap = median(later.stamp - earlier.stamp for earlier, later in pairwise(pairs)) if len(pairs) > 1 else 0.0
     if gap > _MAX_GAP:
@@ -129,7 +130,7 @@ def _parts_names(before: str, word: str) -> bool:
 
 def _stamp(word: str, path: Path, number: int) -> float:
     try:
-        stamp = seconds(word)
+        stamp = parse_timestamp(word)
     except ValueError:
         stamp = math.nan
     if not math.isfinite(stamp):

@@ -8,18 +8,18 @@ from pathlib import Path
 
 from v3d_torch.datasets.names import canonical_name, download_url, short_name, unknown_name
 from v3d_torch.datasets.tum import is_tum
-from v3d_torch.download import Progress, cache_dir, fetch
 from v3d_torch.errors import DownloadError, InputError
-from v3d_torch.extract import extract_tar
-from v3d_torch.files import one_process_makes
-from v3d_torch.home import at_home
+from v3d_torch.io.download import Progress, cache_dir, fetch
+from v3d_torch.io.extract import extract_tar
+from v3d_torch.io.files import file_lock
+from v3d_torch.io.paths import expand_user
 
 
 def sequence_path(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
     """The folder or file of a sequence.
 
     Looked for in this order: ``name`` as a folder or file; in ``data_root``, else ``$V3D_DATA``; in the cache
-    (`v3d_torch.download.cache_dir`). In the latter two a folder may be called by any name of the sequence. Last, a TUM
+    (`v3d_torch.io.download.cache_dir`). In the latter two a folder may be called by any name of the sequence. Last, a TUM
     sequence is downloaded into ``data_root`` where it is given, else into the cache; ``$V3D_DATA`` is only read, it may
     be shared.
 
@@ -45,7 +45,7 @@ def sequence_path(name: str, *, data_root: Path | None, download: bool, progress
 
 def stored_path(name: str, data_root: Path | None) -> Path | None:
     """The folder or file of a sequence that is here, looked for as `sequence_path` does; None where there is none."""
-    if (path := at_home(name)).exists():
+    if (path := expand_user(name)).exists():
         return path
     found = (_find(root, name, canonical_name(name)) for root in (data_folder(data_root), cache_dir()))
     return next((path for path in found if path is not None), None)
@@ -54,7 +54,7 @@ def stored_path(name: str, data_root: Path | None) -> Path | None:
 def data_folder(data_root: Path | None) -> Path:
     """Where sequences are kept: ``data_root`` if given, else ``$V3D_DATA``, else the cache."""
     shared = os.environ.get("V3D_DATA")
-    return data_root or (at_home(shared) if shared else cache_dir())
+    return data_root or (expand_user(shared) if shared else cache_dir())
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:
@@ -69,7 +69,7 @@ def _find(root: Path, name: str, full_name: str | None) -> Path | None:
 
 def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
     folder, archive = root / full_name, root / f"{full_name}.tgz"
-    with one_process_makes(cache_dir() / full_name):  # in the cache: the data may be on a file system without locks
+    with file_lock(cache_dir() / full_name):  # in the cache: the data may be on a file system without locks
         if not folder.is_dir():
             fetch(download_url(full_name), archive, progress=progress)
             try:

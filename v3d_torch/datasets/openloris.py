@@ -8,14 +8,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
 from v3d_torch.datasets.lists import pair_lists
 from v3d_torch.datasets.opencv_yaml import matrix, read_opencv_yaml
 from v3d_torch.datasets.paired import PairedImages
+from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
-from v3d_torch.lie import invert, rigid
-from v3d_torch.trajectory import read_trajectory
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert, rigid
 from v3d_torch.types import Trajectory
 
 _COLOUR = "d400_color_optical_frame"

@@ -6,21 +6,21 @@ from pathlib import Path
 
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.images import read_colour, read_depth
-from v3d_torch.datasets.lists import Pair
-from v3d_torch.datasets.stored import ReadTruth, StoredFrames
+from v3d_torch.datasets.lists import ImagePair
+from v3d_torch.datasets.stored import ReadTruth, StoredSequence
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
 
 
-class PairedImages(StoredFrames):
+class PairedImages(StoredSequence):
     """Frames of a folder of images.
 
     Args:
         folder: the sequence's folder.
         pairs: the frames' files, in order of time.
         camera: that took them.
-        groundtruth: see `StoredFrames`.
+        groundtruth: see `StoredSequence`.
         name: for tables; None takes the folder's name.
 
     Raises:
@@ -30,7 +30,7 @@ class PairedImages(StoredFrames):
     def __init__(
         self,
         folder: Path,
-        pairs: list[Pair],
+        pairs: list[ImagePair],
         camera: PinholeCamera,
         groundtruth: ReadTruth | None = None,
         *,
@@ -42,7 +42,7 @@ class PairedImages(StoredFrames):
                 f"{folder / missing[0]}: is listed but not there ({len(missing)} such files);"
                 " copy the whole sequence again"
             )
-        stamps, delays = [pair.stamp for pair in pairs], [pair.delay for pair in pairs]
+        stamps, delays = [pair.stamp for pair in pairs], [pair.depth_delay for pair in pairs]
         super().__init__(name or folder.resolve().name, stamps, camera, groundtruth, delays)
         self.folder = folder
         self._pairs = pairs

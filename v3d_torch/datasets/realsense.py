@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets import realsense_device
 from v3d_torch.datasets.bag import topic_types
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
@@ -20,6 +19,7 @@ from v3d_torch.datasets.images import metres
 from v3d_torch.datasets.realsense_camera import camera_of, library, per_metre
 from v3d_torch.datasets.realsense_device import Device
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame
 
 _WAIT = 200

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
 
 
 def library(source: str) -> Any:

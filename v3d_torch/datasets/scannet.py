@@ -10,14 +10,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
 from v3d_torch.datasets.file_names import frame_number, images_in, numbered_pairs
 from v3d_torch.datasets.images import image_size, read_colour
-from v3d_torch.datasets.lists import Pair
+from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.matrices import read_matrix, read_poses
 from v3d_torch.datasets.paired import PairedImages
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
 
 _RATE = 30.0
 """Frames a second: the files are numbered as the sensor counted, also where an export left some out."""
@@ -94,7 +94,7 @@ def _intrinsics(frames: Path, kind: str) -> Path | None:
     return next((frames / name for name in names if (frames / name).is_file()), None)
 
 
-def _depth_camera(frames: Path, pair: Pair) -> PinholeCamera | None:
+def _depth_camera(frames: Path, pair: ImagePair) -> PinholeCamera | None:
     """The depth images' camera; without a file of it the colour images' one, which has the same view, scaled."""
     width, height = image_size(frames / pair.depth)
     source = _intrinsics(frames, "depth") or _intrinsics(frames, "color")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.file_names import numbered_pairs
 from v3d_torch.datasets.matrices import read_poses
 from v3d_torch.datasets.paired import PairedImages
+from v3d_torch.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, depth_scale=1000.0)
 """Of the depth, as published. Its colour was never registered to it: pixels are a few centimetres' worth apart."""

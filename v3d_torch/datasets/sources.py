@@ -18,8 +18,8 @@ from v3d_torch.datasets.scannet import ScanNetSequence, is_scannet
 from v3d_torch.datasets.seven_scenes import SevenScenesSequence, is_seven_scenes
 from v3d_torch.datasets.tum import TUMSequence, is_tum
 from v3d_torch.datasets.video import VideoSequence, is_video
-from v3d_torch.download import Progress
 from v3d_torch.errors import InputError
+from v3d_torch.io.download import Progress
 
 
 @dataclass(frozen=True)

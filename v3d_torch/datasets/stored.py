@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
 
 ReadTruth = Callable[[], Trajectory | None]
@@ -20,7 +20,7 @@ _DEPTHS = (0.05, 50.0)
 """Metres between which an RGB-D camera measures, with room to spare."""
 
 
-class StoredFrames(ABC):
+class StoredSequence(ABC):
     """An `RGBDSequence` of which a subclass says how a frame's images are read.
 
     Args:
@@ -58,11 +58,11 @@ class StoredFrames(ABC):
         return self.stamps.shape[0]
 
     def __iter__(self) -> Iterator[RGBDFrame]:
-        return self.since(0)
+        return self.frames_from(0)
 
-    def since(self, index: int) -> Iterator[RGBDFrame]:
+    def frames_from(self, index: int) -> Iterator[RGBDFrame]:
         """The frames from one on, read as they are asked for."""
-        return Following(self, index)
+        return FrameIterator(self, index)
 
     def __getitem__(self, index: int) -> RGBDFrame:
         """Decode frame ``index``, from 0.
@@ -82,7 +82,7 @@ class StoredFrames(ABC):
             raise IndexError(f"{self.name} has {len(self)} frames, there is none with index {index}")
         image, depth = self._read(index)
         stamp = float(self.stamps[index])
-        return RGBDFrame(index, stamp, image, depth, camera=self.camera, delay=self._delays[index])
+        return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._delays[index])
 
     def check_first_frame(self, source: object) -> None:
         """Decode the first frame, so that what is wrong with every frame is said before anything else is done.
@@ -129,7 +129,7 @@ class StoredFrames(ABC):
         return image
 
 
-class Following(Iterator[RGBDFrame]):
+class FrameIterator(Iterator[RGBDFrame]):
     """Frames of a stored sequence one after the other.
 
     Args:
@@ -140,17 +140,17 @@ class Following(Iterator[RGBDFrame]):
         index: of the next; who has got that frame otherwise may step over it.
     """
 
-    def __init__(self, sequence: StoredFrames, first: int) -> None:
+    def __init__(self, sequence: StoredSequence, first: int) -> None:
         self.sequence = sequence
         self.index = first
 
     @property
-    def left(self) -> int:
+    def remaining(self) -> int:
         """Frames from the next on."""
         return max(len(self.sequence) - self.index, 0)
 
     def __next__(self) -> RGBDFrame:
-        if not self.left:
+        if not self.remaining:
             raise StopIteration
         frame = self.sequence[self.index]
         self.index += 1

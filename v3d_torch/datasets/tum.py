@@ -10,11 +10,11 @@ from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.images import image_size
-from v3d_torch.datasets.lists import Pair, pair_lists, read_associations, refuse_other_units
+from v3d_torch.datasets.lists import ImagePair, pair_lists, read_associations, refuse_other_units
 from v3d_torch.datasets.names import short_name
 from v3d_torch.datasets.paired import PairedImages
+from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
-from v3d_torch.trajectory import read_trajectory
 
 
 class TUMSequence(PairedImages):
@@ -46,8 +46,8 @@ class TUMSequence(PairedImages):
             name=short_name(folder.resolve().name) if name is None else name,
         )
 
-    def who_moves(self, index: int) -> Tensor | None:
-        """True mask of frame ``index``, see `KnowsWhoMoves`; None where there is no such file.
+    def motion_mask(self, index: int) -> Tensor | None:
+        """True mask of frame ``index``, see `HasMotionMasks`; None where there is no such file.
 
         Raises:
             InputError: it is broken, not 8-bit grey or not of the camera's size.
@@ -71,7 +71,7 @@ def is_tum(path: Path) -> bool:
     return any((path / name).is_file() for name in ("associations.txt", "rgb.txt", "depth.txt"))
 
 
-def _read_pairs(folder: Path) -> list[Pair]:
+def _read_pairs(folder: Path) -> list[ImagePair]:
     if (folder / "associations.txt").is_file():
         return read_associations(folder / "associations.txt")
     return pair_lists(folder / "rgb.txt", folder / "depth.txt")

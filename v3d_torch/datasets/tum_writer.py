@@ -11,11 +11,11 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.images import SATURATED
+from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import OutputError
-from v3d_torch.files import write_text, written_whole
-from v3d_torch.trajectory import write_trajectory
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.types import RGBDFrame, Trajectory
 
 
@@ -62,7 +62,7 @@ class TUMWriter:
 
     def add(self, frame: RGBDFrame) -> None:
         """Write a frame's images; depth that 16 bits of the camera's units cannot tell is no measurement."""
-        stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.delay:.6f}"
+        stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self.camera.depth_scale)
         units[units >= SATURATED] = 0
         colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
@@ -73,5 +73,5 @@ class TUMWriter:
 
 def _save(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     encoded = cv2.imencode(".png", image)[1]
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(encoded.tobytes())

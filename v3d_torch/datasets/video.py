@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v3d_torch.association import associate
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.images import metres
 from v3d_torch.datasets.lists import MAX_DIFFERENCE
-from v3d_torch.datasets.stored import StoredFrames
-from v3d_torch.download import Progress
+from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
+from v3d_torch.io.download import Progress
+from v3d_torch.io.timestamps import associate
 from v3d_torch.types import RGBDFrame
 
 # FFmpeg, in OpenCV, writes to stderr by itself what it thinks of a broken file; what matters is raised here.
@@ -32,7 +32,7 @@ _WHOLE = 0.9
 _SUFFIXES = frozenset({".mkv", ".mp4", ".avi", ".mov", ".webm", ".m4v"})
 
 
-class VideoSequence(StoredFrames):
+class VideoSequence(StoredSequence):
     """Frames of two videos, paired by their times.
 
     Depth needs 16 bits a pixel without loss, which FFV1 in an ``.mkv`` or ``.avi`` has (``ffmpeg -c:v ffv1 -pix_fmt
@@ -70,12 +70,12 @@ class VideoSequence(StoredFrames):
         self._depths = Cursor(lambda: _frames(depth, raw=True))
 
     def since(self, index: int) -> Iterator[RGBDFrame]:
-        """See `StoredFrames.since`.
+        """See `StoredSequence.frames_from`.
 
         Raises:
             InputError: as `__getitem__`; and behind the last frame, where a video breaks off.
         """
-        yield from super().since(index)
+        yield from super().frames_from(index)
         if self._cut is not None:
             raise InputError(self._cut)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.config_file import FULL
+from v3d_torch.config.loading import FULL
 from v3d_torch.evaluation.cells import Cell, row, shown_lowest, spread
 from v3d_torch.evaluation.layout import ErrorTable
 from v3d_torch.evaluation.outcome import Outcome, values_of
@@ -22,14 +22,14 @@ VARIANTS = (
     "baseline",
     "no_voting",
     "no_chamfer",
-    "no_bridging",
-    "no_unnamed",
-    "as_held",
+    "no_prediction",
+    "no_unlabelled",
+    "not_upright",
     "global_shutter",
     "paper",
     FULL,
 )
-"""Names of the configurations that are compared (`v3d_torch.config_file.CONFIGS`), the whole system last."""
+"""Names of the configurations that are compared (`v3d_torch.config.loading.CONFIGS`), the whole system last."""
 
 LEGEND = (
     "Median and [range] over the seeds. ATE and RPE (over 1 s): RMSE; SD: of the ATE. Moving out, static out: share of"

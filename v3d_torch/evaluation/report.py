@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, match
 from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align, scale_error
+from v3d_torch.evaluation.pose_association import MAX_TIME_DIFFERENCE, match
 from v3d_torch.evaluation.rpe import RPE, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.types import Trajectory

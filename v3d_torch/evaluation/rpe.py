@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.evaluation.association import Matches
+from v3d_torch.evaluation.pose_association import Matches
 from v3d_torch.evaluation.statistics import Statistics
-from v3d_torch.lie import invert, se3_log
+from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.types import Trajectory
 
 

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import MappingConfig
-from v3d_torch.mapping.local_map import Keyframe, SparseMap
-from v3d_torch.mapping.table import distinct
+from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.mapping.tensor_table import unique_ids
 
 
-def cull_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfig) -> None:
+def cull_redundant_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfig) -> None:
     """Retire the neighbours of a new keyframe that are redundant by now; never the first, which fixes the world.
 
     Args:
@@ -22,19 +23,19 @@ def cull_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfi
         newest: the new keyframe.
         config: when a keyframe is redundant.
     """
-    neighbours = sparse_map.covisible(newest.seen, config.bundle_keyframes).tolist()
+    neighbours = sparse_map.covisible_keyframes(newest.landmark_ids, config.bundle_keyframes).tolist()
     around = _Neighbourhood(sparse_map, neighbours)
-    carriers: dict[int, int] = {}
+    references: dict[int, int] = {}
     shares = around.redundancy(config.redundant_views)
     for index in neighbours:
-        if index in (0, newest.index) or shares[index] <= config.redundant_share:
+        if index in (0, newest.index) or shares[index] <= config.redundant_ratio:
             continue
-        carriers[index] = around.nearest(index)
+        references[index] = around.nearest(index)
         around.drop(index)
         shares = around.redundancy(config.redundant_views)
-        carriers = {gone: carriers.get(carrier, carrier) for gone, carrier in carriers.items()}
-    if carriers:
-        sparse_map.retire(carriers)
+        references = {gone: references.get(reference, reference) for gone, reference in references.items()}
+    if references:
+        sparse_map.cull_keyframes(references)
 
 
 class _Neighbourhood:
@@ -47,7 +48,7 @@ class _Neighbourhood:
         theirs[table["landmark"][usable & torch.isin(table["keyframe"], torch.tensor(keyframes))]] = True
         rows = usable & theirs[table["landmark"]]
         self._keyframe, self._octave = table["keyframe"][rows], table["octave"][rows]
-        landmarks, self._landmark = distinct(table["landmark"][rows], len(sparse_map.landmarks))
+        landmarks, self._landmark = unique_ids(table["landmark"][rows], len(sparse_map.landmarks))
         self._landmarks = len(landmarks)
         self._levels, self._keyframes = sparse_map.features.levels, len(sparse_map.keyframes)
 

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.geometry.camera import PinholeCamera
 
 _CELL = 4
 """Side of the cells in which the depths of a cloud are gathered, pixels: those of the network's masks."""
@@ -113,7 +113,7 @@ class Silhouette:
         explained[v, u] = fits
         return torch.from_numpy(explained)
 
-    def share_seen(self, depth: Tensor, tolerance: float) -> float:
+    def visible_fraction(self, depth: Tensor, tolerance: float) -> float:
         """Share of the points where the depth is theirs; 0 where no point is in the image.
 
         Args:

@@ -10,13 +10,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from v3d_torch.config import IdentityConfig
-from v3d_torch.objects.motion_filter import MotionFilter
-from v3d_torch.segmentation.coco import UNNAMED
+from v3d_torch.config import TrackerConfig
+from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.segmentation.coco import UNLABELLED
 
 
 @dataclass(frozen=True, eq=False)  # a sighting is itself, not its values
-class Sighting:
+class Detection3D:
     """Where an object was at one time.
 
     Attributes:
@@ -30,7 +30,7 @@ class Sighting:
     cloud: Tensor
 
     @cached_property
-    def located(self) -> bool:
+    def is_located(self) -> bool:
         """Whether the centroid is known."""
         return bool(torch.isfinite(self.centroid).all())
 
@@ -58,52 +58,52 @@ class Track:
 
     id: int
     mask: Tensor
-    own: Tensor
-    coarse: Tensor
+    cloud_pixels: Tensor
+    coarse_mask: Tensor
     first_seen: float
-    config: IdentityConfig
-    sightings: list[Sighting] = field(default_factory=list)
+    config: TrackerConfig
+    detections: list[Detection3D] = field(default_factory=list)
     missed: bool = False
     labels: Counter[int] = field(default_factory=Counter)
-    label: int = UNNAMED
+    label: int = UNLABELLED
     score: float = 0.0
-    evidence: int = 0
+    dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
 
     _TOLERANCE: ClassVar[float] = 1e-3  # seconds: stamps are rounded, frame times jitter
 
     def __post_init__(self) -> None:
-        self._motion = MotionFilter(self.config)
+        self._motion = ConstantVelocityKalmanFilter(self.config)
         self._most_points = 1
 
-    def name(self, label: int, score: float) -> None:
+    def update_label(self, label: int, score: float) -> None:
         """Take in the class that the network gives it in a frame, and with which score."""
         self.labels[label] += 1
         self.score += score
-        named = Counter({label: count for label, count in self.labels.items() if label != UNNAMED})
+        named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
         self.label = (named or self.labels).most_common(1)[0][0]
 
     @property
-    def newest(self) -> Sighting:
+    def newest(self) -> Detection3D:
         """The last time that the network saw the object."""
-        return self.sightings[-1]
+        return self.detections[-1]
 
     @property
-    def located(self) -> Sighting:
+    def last_located(self) -> Detection3D:
         """The last sighting with a centroid; the newest one when none has."""
-        return next((sighting for sighting in reversed(self.sightings) if sighting.located), self.newest)
+        return next((sighting for sighting in reversed(self.detections) if sighting.is_located), self.newest)
 
-    def pair(self, baseline: float) -> tuple[Sighting, Sighting] | None:
+    def detection_pair(self, baseline: float) -> tuple[Detection3D, Detection3D] | None:
         """The newest sighting and the newest one at least ``baseline`` seconds before it; 0 means the one before.
 
         Returns:
             (then, now), both with a centroid; None when there is no such pair.
         """
         now = self.newest
-        for then in reversed(self.sightings[:-1]):
+        for then in reversed(self.detections[:-1]):
             if now.stamp - then.stamp >= baseline - self._TOLERANCE:
-                return (then, now) if then.located and now.located else None
+                return (then, now) if then.is_located and now.is_located else None
         return None
 
     @property
@@ -119,21 +119,21 @@ class Track:
         """The newest cloud, moved on with constant velocity, world frame, float64, shape :math:`(P, 3)`."""
         return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
 
-    def extend(self, sighting: Sighting) -> None:
+    def add_detection(self, sighting: Detection3D) -> None:
         """Take in a new sighting, and forget what is older than the history."""
         self._most_points = max(self._most_points, len(sighting.cloud))
         hidden = 1 - len(sighting.cloud) / self._most_points  # the centroid of a part is not that of the whole
         sigma = self.config.centroid_sigma + self.config.partial_sigma * hidden
         self._motion.update(sighting.stamp, sighting.centroid, sigma)
-        self.sightings.append(sighting)
+        self.detections.append(sighting)
         oldest = sighting.stamp - self.config.history - self._TOLERANCE
-        while self.sightings[0].stamp < oldest and len(self.sightings) > 2:
-            self.sightings.pop(0)
+        while self.detections[0].stamp < oldest and len(self.detections) > 2:
+            self.detections.pop(0)
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Carry all of it along when the map is corrected under it, see `InstanceTracker.move_world`."""
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
         self._motion.move_world(T_new_old)
-        self.sightings = [
-            Sighting(s.stamp, R @ s.centroid + t, s.cloud @ R.T.to(s.cloud) + t.to(s.cloud)) for s in self.sightings
+        self.detections = [
+            Detection3D(s.stamp, R @ s.centroid + t, s.cloud @ R.T.to(s.cloud) + t.to(s.cloud)) for s in self.detections
         ]

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from v3d_torch.config import DenseConfig
-from v3d_torch.levenberg import student_t, student_t_scale
-from v3d_torch.lie import se3_exp
+from v3d_torch.config import DenseOdometryConfig
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.odometry.dense_view import Level
+from v3d_torch.optim.levenberg_marquardt import student_t, student_t_scale
 
 State = tuple[Tensor, Tensor]  # T_ba (4, 4); gain and bias from the reference's brightness to the current one's (2,)
 System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba @ exp(xi), gain, bias
@@ -52,14 +52,14 @@ class Problem:
     _GRADIENT_NOISE = 0.3
 
     def __init__(
-        self, reference: Level, current: Level, start: State, inverse_depth_sigma: float, config: DenseConfig
+        self, reference: Level, current: Level, start: State, inverse_depth_sigma: float, config: DenseOdometryConfig
     ) -> None:
         self.anchors, self._current, self._config = reference.anchors, current, config
         first = self.compare(start)
         self._sigma = torch.tensor([[self._BRIGHTNESS_SIGMA], [inverse_depth_sigma]], dtype=torch.float64)
         for sigma, residuals, compared in zip(self._sigma, first.residuals, first.compared, strict=True):
             if compared.any():
-                sigma.clamp_(min=student_t_scale(residuals[compared].square(), config.freedom))
+                sigma.clamp_(min=student_t_scale(residuals[compared].square(), config.degrees_of_freedom))
         by_light = torch.zeros(2, len(self.anchors.points), 2, dtype=torch.float64)
         by_light[0] = -torch.stack([self.anchors.values[0], torch.ones_like(self.anchors.values[0])], dim=-1)
         gains = torch.stack([start[1][0], torch.ones_like(start[1][0])])
@@ -93,7 +93,7 @@ class Problem:
         now = self.compare(state)
         if int(now.compared.sum()) < self._LEAST:
             return torch.inf, (torch.zeros(8, 8, dtype=torch.float64), torch.zeros(8, dtype=torch.float64))
-        costs, weights = student_t((now.residuals / self._sigma).square(), self._config.freedom)
+        costs, weights = student_t((now.residuals / self._sigma).square(), self._config.degrees_of_freedom)
         weights = (weights * now.compared / self._sigma.square()).flatten()
         weighted = (self._jacobian * weights[:, None]).T
         # A hidden point costs as much as one about to be: else a motion could gain by hiding what disagrees.

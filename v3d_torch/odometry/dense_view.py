@@ -14,9 +14,9 @@ from kornia.filters import spatial_gradient
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d, pixel_unshuffle
 
-from v3d_torch.camera import PinholeCamera
-from v3d_torch.config import DenseConfig
-from v3d_torch.odometry.refine import Measurements, reprojection_jacobian
+from v3d_torch.config import DenseOdometryConfig
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Level:
 
     channels: Tensor
     lens: Lens
-    config: DenseConfig
+    config: DenseOdometryConfig
 
     @cached_property
     def anchors(self) -> Anchors:
@@ -92,9 +92,9 @@ class Level:
         """
         gradient = spatial_gradient(self.channels[None])[0]  # Sobel; 2 x (x, y) x H x W
         inverse = self.channels[1]
-        same_surface = (2 * gradient[1].abs() <= self.config.edge * inverse).all(dim=0)
+        same_surface = (2 * gradient[1].abs() <= self.config.edge_ratio * inverse).all(dim=0)
         strength = gradient[0].square().sum(dim=0).where(inverse.isfinite(), torch.nan).nan_to_num(nan=-1.0)
-        cell = max(1, round((inverse.numel() / self.config.points) ** 0.5))
+        cell = max(1, round((inverse.numel() / self.config.max_points) ** 0.5))
         strongest, index = max_pool2d(strength[None], cell, ceil_mode=True, return_indices=True)
         index = index[strongest >= 0]
 
@@ -122,7 +122,7 @@ class DenseView:
     """
 
     def __init__(
-        self, grey: Tensor, depth: Tensor, static: Tensor, lenses: dict[int, Lens], config: DenseConfig
+        self, grey: Tensor, depth: Tensor, static: Tensor, lenses: dict[int, Lens], config: DenseOdometryConfig
     ) -> None:
         static = static[None] & grey.isfinite()
         inverse = torch.where(static & (depth > 0) & (depth <= config.max_depth), 1 / depth, 0.0)
@@ -131,7 +131,7 @@ class DenseView:
         for halvings in range(max(lenses) + 1):
             if halvings:
                 grey, static = avg_pool2d(grey, 2), avg_pool2d(static.to(torch.float32), 2) == 1
-                inverse = _halve(inverse, config.edge)
+                inverse = _halve(inverse, config.edge_ratio)
             if halvings in lenses:
                 channels = torch.cat([grey.where(static, torch.nan), inverse.where(static & (inverse > 0), torch.nan)])
                 self.levels[halvings] = Level(channels, lenses[halvings], config)

@@ -8,17 +8,17 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.config import Config
-from v3d_torch.odometry.dense import DenseAligner
+from v3d_torch.features.orb import Features
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.odometry.dense_aligner import DenseAligner
 from v3d_torch.odometry.dense_view import DenseView
-from v3d_torch.odometry.motion import Motion, MotionEstimator
-from v3d_torch.odometry.orb import Features
+from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion
 from v3d_torch.types import RGBDFrame
 
 
 @dataclass(frozen=True)
-class View:
+class TrackedFrame:
     """What a frame saw, and what of it stood still.
 
     Attributes:
@@ -35,18 +35,18 @@ class View:
     static: Tensor | None = None
     landmarks: Tensor | None = None
 
-    def matched(self, motion: Motion | None) -> Tensor:
+    def matched(self, motion: RelativeMotion | None) -> Tensor:
         """Which features a motion to this view was seen on, bool, shape :math:`(N,)`; none where there is none."""
         matched = torch.zeros(len(self.features), dtype=torch.bool)
         if motion is not None:
             matched[motion.pairs[:, 1]] = True
         return matched
 
-    def carried(self, motion: Motion | None, then: View | None) -> Tensor:
+    def carried(self, motion: RelativeMotion | None, then: TrackedFrame | None) -> Tensor:
         """Ids of the landmarks that the motion's matches carry over from a view, -1 for none, :math:`(N,)`."""
         if motion is None or then is None or then.landmarks is None:
             return torch.full((len(self.features),), -1, dtype=torch.int64)
-        return motion.carry(then.landmarks, len(self.features))
+        return motion.propagate_landmarks(then.landmarks, len(self.features))
 
 
 class Odometry:
@@ -61,9 +61,9 @@ class Odometry:
     def __init__(self, config: Config, camera: PinholeCamera, by_features: MotionEstimator) -> None:
         self._config = config
         self._by_features = by_features
-        self._align = DenseAligner(config.dense, camera)
+        self._align = DenseAligner(config.dense_odometry, camera)
 
-    def __call__(self, then: View, now: View, T_ba: Tensor) -> Motion | None:
+    def __call__(self, then: TrackedFrame, now: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
         """Motion of the camera from an earlier view to the newest one.
 
         Args:
@@ -81,10 +81,10 @@ class Odometry:
         aligned = self._align(self._dense(then), self._dense(now), T_ba)
         if aligned is None:
             return None
-        motion = Motion(aligned.T_ba, torch.zeros(0, 2, dtype=torch.int64))
-        return motion if motion.is_possible(elapsed, self._config.motion) else None
+        motion = RelativeMotion(aligned.T_ba, torch.zeros(0, 2, dtype=torch.int64))
+        return motion if motion.is_plausible(elapsed, self._config.odometry) else None
 
-    def _dense(self, view: View) -> DenseView:
+    def _dense(self, view: TrackedFrame) -> DenseView:
         grey = rgb_to_grayscale(view.frame.image.to(torch.float32) / 255)
         everywhere = torch.ones(grey.shape[-2:], dtype=torch.bool)
         return self._align.view(grey, view.depth, everywhere if view.static is None else view.static)

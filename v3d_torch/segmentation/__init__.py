@@ -7,45 +7,47 @@ from pathlib import Path
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.errors import ConfigError
 from v3d_torch.segmentation.coco import COCO_NAMES, PERSON
+from v3d_torch.segmentation.mask_files import MaskFolder
 from v3d_torch.segmentation.none import NoSegmentation
-from v3d_torch.segmentation.stored import StoredMasks
-from v3d_torch.segmentation.upright import Upright
+from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.segmentation.yolo import YOLOSegmenter
 from v3d_torch.types import Segmenter
 
 __all__ = [
     "COCO_NAMES",
     "PERSON",
+    "MaskFolder",
     "NoSegmentation",
-    "StoredMasks",
-    "Upright",
+    "UprightSegmenter",
     "YOLOSegmenter",
-    "held_upright",
+    "keep_upright",
+    "make_instance_source",
     "make_segmenter",
-    "make_source",
 ]
 
 
 def make_segmenter(config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None) -> Segmenter:
     """The source of instances that the configuration names, for one run: it follows the camera's roll.
 
-    See `make_source` for arguments and errors.
+    See `make_instance_source` for arguments and errors.
     """
-    return held_upright(make_source(config, weights, masks_dir), config)
+    return keep_upright(make_instance_source(config, weights, masks_dir), config)
 
 
-def held_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
+def keep_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
     """A network that is shown upright images where the configuration says so; masks from files are as they are."""
-    return Upright(source) if config.upright and config.source == "yolo" else source
+    return UprightSegmenter(source) if config.upright and config.source == "yolo" else source
 
 
-def make_source(config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None) -> Segmenter:
+def make_instance_source(
+    config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None
+) -> Segmenter:
     """The source of instances, one image like another.
 
     Args:
         config: of the stage; ``source`` decides.
         weights: for the network, see `YOLOSegmenter`.
-        masks_dir: folder of id images, see `StoredMasks`.
+        masks_dir: folder of id images, see `MaskFolder`.
 
     Raises:
         ConfigError: if masks are to be read but no folder is given, or what is given is not what is to be used.
@@ -63,5 +65,5 @@ def make_source(config: SegmentationConfig, weights: Path | None = None, masks_d
     if config.source == "masks":
         if masks_dir is None:
             raise ConfigError("segmentation.source=masks: name the folder of the id images with --masks")
-        return StoredMasks(masks_dir)
+        return MaskFolder(masks_dir)
     return YOLOSegmenter(config, weights)

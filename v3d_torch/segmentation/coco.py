@@ -18,7 +18,7 @@ COCO_NAMES: tuple[str, ...] = (
 PERSON = COCO_NAMES.index("person")
 """The class that the paper sets aside as potentially moving (Sec. III-A)."""
 
-UNNAMED = -1
+UNLABELLED = -1
 """What moves and has no class: the network missed it, or has no name for it."""
 
 LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
@@ -29,5 +29,5 @@ THINGS = frozenset(range(len(COCO_NAMES))) - LIVING
 
 
 def class_name(label: int) -> str:
-    """Name of a class index, also of `UNNAMED`."""
-    return "unnamed" if label == UNNAMED else COCO_NAMES[label]
+    """Name of a class index, also of `UNLABELLED`."""
+    return "unnamed" if label == UNLABELLED else COCO_NAMES[label]

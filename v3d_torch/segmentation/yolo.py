@@ -14,11 +14,11 @@ from v3d_torch.errors import WeightsError
 from v3d_torch.segmentation.coco import COCO_NAMES
 from v3d_torch.segmentation.decode import decode
 from v3d_torch.segmentation.duplicates import without_duplicates
-from v3d_torch.segmentation.export import exported
+from v3d_torch.segmentation.export import exported_path
 from v3d_torch.segmentation.letterbox import CELL, letterbox
 from v3d_torch.segmentation.networks.head import STRIDES
 from v3d_torch.segmentation.networks.prototypes import PROTOTYPES
-from v3d_torch.segmentation.quantise import is_worth_it, quantised
+from v3d_torch.segmentation.quantise import has_int8_instructions, quantised_path
 from v3d_torch.segmentation.weights import REGISTRY, resolve
 from v3d_torch.types import Instances, RGBDFrame
 
@@ -39,9 +39,9 @@ class YOLOSegmenter:
         if weights is not None and weights.suffix == ".onnx":
             path = weights
         else:
-            path = exported(config.model, resolve(config.model, weights), config.height, config.width)
-            if config.precision == "int8" and is_worth_it():
-                path = quantised(path)
+            path = exported_path(config.model, resolve(config.model, weights), config.height, config.width)
+            if config.precision == "int8" and has_int8_instructions():
+                path = quantised_path(path)
         self.config = config
         self._path = path
         self._session = _open_session(path, config.threads)
@@ -85,7 +85,7 @@ class YOLOSegmenter:
             iou_threshold=self._iou_threshold,
             max_instances=self.config.max_instances,
         )
-        return without_duplicates(instances, self.config.duplicate_share)
+        return without_duplicates(instances, self.config.duplicate_overlap)
 
 
 def _open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:

@@ -17,11 +17,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from torch import Tensor
 
-from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.ate import absolute_errors, align
+from v3d_torch.evaluation.pose_association import match
 from v3d_torch.evaluation.report import is_oriented
 from v3d_torch.evaluation.statistics import Statistics
-from v3d_torch.files import written_whole
+from v3d_torch.io.files import atomic_write
 from v3d_torch.types import Trajectory
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Overlay = tuple[Tensor, str, str]
 """Mask (bool, H x W), text such as "person 3", verdict such as "dynamic"."""
 
-VERDICT_COLOURS = {
+MOTION_STATE_COLOURS = {
     "static": "#2ca02c",
     "dynamic": "#d62728",
     "deforming": "#ff7f0e",
@@ -113,7 +113,7 @@ def mask_strip(images: Sequence[Tensor], overlays: Sequence[Sequence[Overlay]], 
 
     Args:
         images: uint8 RGB, shape :math:`(3, H, W)` each; the first six are drawn.
-        overlays: for each image its objects: mask (bool, shape :math:`(H, W)`), text, verdict (`VERDICT_COLOURS`).
+        overlays: for each image its objects: mask (bool, shape :math:`(H, W)`), text, verdict (`MOTION_STATE_COLOURS`).
         path: image to write.
 
     Raises:
@@ -135,8 +135,10 @@ def mask_strip(images: Sequence[Tensor], overlays: Sequence[Sequence[Overlay]], 
         axes.axis("off")
     for axes, (image, objects) in zip(grid, frames, strict=False):
         draw_objects(axes, image, objects)
-    present = {known_verdict(verdict) for _, objects in frames for _, _, verdict in objects}
-    handles = [Patch(color=colour, label=verdict) for verdict, colour in VERDICT_COLOURS.items() if verdict in present]
+    present = {parse_motion_state(verdict) for _, objects in frames for _, _, verdict in objects}
+    handles = [
+        Patch(color=colour, label=verdict) for verdict, colour in MOTION_STATE_COLOURS.items() if verdict in present
+    ]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     save(figure, path)
@@ -182,7 +184,7 @@ def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
     picture = image.permute(1, 2, 0).numpy().astype(np.float32) / 255
     outlines = []
     for mask, _, verdict in objects:
-        colour = VERDICT_COLOURS[known_verdict(verdict)]
+        colour = MOTION_STATE_COLOURS[parse_motion_state(verdict)]
         inside = mask.numpy()
         picture[inside] = (1 - _TINT) * picture[inside] + _TINT * np.array(to_rgb(colour), dtype=np.float32)
         contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -195,7 +197,7 @@ def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
     for mask, text, verdict in sorted(objects, key=lambda overlay: overlay[2] != "static"):  # who moves on top
         if not mask.any() or not text:
             continue
-        colour = VERDICT_COLOURS[known_verdict(verdict)]
+        colour = MOTION_STATE_COLOURS[parse_motion_state(verdict)]
         rows, columns = mask.nonzero(as_tuple=True)
         x, y = float(columns.double().mean()), float(rows.double().quantile(0.1))
         side = "left" if x < _MARGIN * width else "right" if x > (1 - _MARGIN) * width else "center"
@@ -211,15 +213,15 @@ def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
             va="center",
             bbox={
                 "boxstyle": "round,pad=0.25",
-                "facecolor": VERDICT_COLOURS[known_verdict(verdict)],
+                "facecolor": MOTION_STATE_COLOURS[parse_motion_state(verdict)],
                 "edgecolor": "none",
             },
         )
 
 
-def known_verdict(word: str) -> str:
+def parse_motion_state(word: str) -> str:
     """The verdict itself, or unknown where it has no colour."""
-    return word if word in VERDICT_COLOURS else "unknown"
+    return word if word in MOTION_STATE_COLOURS else "unknown"
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -228,5 +230,5 @@ def save(figure: Figure, path: Path) -> None:
     Raises:
         OutputError: when the file cannot be written.
     """
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         figure.savefig(temporary)

@@ -9,10 +9,10 @@ import torch
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Trajectory
 
-STATUS_COLOURS = {"odometry": "#ff7f0e", "adrift": "#d62728", "lost": "#d62728", "earlier": "#7f7f7f"}
+STATUS_COLOURS = {"odometry": "#ff7f0e", "disconnected": "#d62728", "lost": "#d62728", "earlier": "#7f7f7f"}
 """Colour of what is not tracked, or of an earlier run; what is tracked turns from dark blue to yellow with time."""
 
 _LENGTH = 0.08  # metres from the camera's centre to its image plane: in a room, seen from above, neither dot nor house
@@ -51,7 +51,7 @@ def camera_path(
     """
     right, bottom = camera.width - 0.5, camera.height - 0.5
     corners = torch.tensor([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [right / 2, -0.15 * bottom]])
-    image = camera.lift(corners.to(torch.float64), torch.full((5,), _LENGTH, dtype=torch.float64))
+    image = camera.back_project(corners.to(torch.float64), torch.full((5,), _LENGTH, dtype=torch.float64))
     shape = torch.cat([image.new_zeros(1, 3), image])  # the centre, the image's corners clockwise, a mark above it
     frustums = shape @ T_wk[:, :3, :3].mT + T_wk[:, None, :3, 3]
     first = len(trajectory) + len(shape) * torch.arange(len(T_wk))[:, None, None]

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from v3d_torch.viz.figures import VERDICT_COLOURS, known_verdict
+from v3d_torch.viz.figures import MOTION_STATE_COLOURS, parse_motion_state
 from v3d_torch.viz.timelines import borders, rows
 
 _MOST_OBJECTS = 20  # rows that a page holds
@@ -29,7 +29,7 @@ class ObjectRow:
         stamp: seconds.
         id: of the object.
         name: of its class.
-        verdict: one of `VERDICT_COLOURS`.
+        verdict: one of `MOTION_STATE_COLOURS`.
         votes: that it has.
         chamfer: metres; nan where it was not measured.
     """
@@ -37,7 +37,7 @@ class ObjectRow:
     stamp: float
     id: int
     name: str
-    verdict: str
+    motion_state: str
     votes: int
     chamfer: float
 
@@ -59,15 +59,15 @@ def draw_objects_over_time(
     """
     ids, left_out = _chosen(table)
     names = {row.id: f"{row.name} {row.id}" for row in table}
-    verdicts = list(VERDICT_COLOURS)
+    verdicts = list(MOTION_STATE_COLOURS)
     grids = {
-        "verdict": _grid(stamps, ids, table, lambda row: verdicts.index(known_verdict(row.verdict))),
+        "motion_state": _grid(stamps, ids, table, lambda row: verdicts.index(parse_motion_state(row.motion_state))),
         "votes": _grid(stamps, ids, table, lambda row: row.votes),
         "chamfer": _grid(stamps, ids, table, lambda row: row.chamfer),
     }
     voted = [i for i, row in enumerate(grids["votes"]) if np.nanmax(row, initial=0) > 0]
     measured = [i for i, row in enumerate(grids["chamfer"]) if np.isfinite(row).any()]
-    panels = [("verdict", list(range(len(ids)))), ("votes", voted), ("chamfer", measured)]
+    panels = [("motion_state", list(range(len(ids)))), ("votes", voted), ("chamfer", measured)]
     panels = [(what, chosen) for what, chosen in panels if chosen]
     seconds = [stamp - stamps[0] for stamp in stamps]
     figure, axes = rows(seconds, [max(3, len(chosen)) * _ROW for _, chosen in panels], labels=0.3)
@@ -75,8 +75,10 @@ def draw_objects_over_time(
         _paint(one, borders(seconds), grids[what][chosen], what, chamfer_threshold)
         one.set_yticks(np.arange(len(chosen)) + 0.5, [names[ids[i]] for i in chosen], fontsize="x-small")
         one.grid(False)
-    said = {known_verdict(row.verdict) for row in table}
-    handles = [Patch(color=colour, label=verdict) for verdict, colour in VERDICT_COLOURS.items() if verdict in said]
+    said = {parse_motion_state(row.motion_state) for row in table}
+    handles = [
+        Patch(color=colour, label=verdict) for verdict, colour in MOTION_STATE_COLOURS.items() if verdict in said
+    ]
     figure.legend(handles=handles, loc="outside upper right", ncols=len(handles), frameon=False)
     return figure, left_out
 
@@ -87,7 +89,7 @@ def _chosen(table: Sequence[ObjectRow]) -> tuple[list[int], int]:
     lively: set[int] = set()
     for row in table:
         frames[row.id] = frames.get(row.id, 0) + 1
-        if known_verdict(row.verdict) in ("dynamic", "deforming"):
+        if parse_motion_state(row.motion_state) in ("dynamic", "deforming"):
             lively.add(row.id)
     best = sorted(frames, key=lambda number: (number not in lively, -frames[number], number))[:_MOST_OBJECTS]
     return [number for number in frames if number in set(best)], len(frames) - len(best)
@@ -109,10 +111,12 @@ def _paint(
     axes: Axes, edges: NDArray[np.float64], grid: NDArray[np.float64], what: str, chamfer_threshold: float | None
 ) -> None:
     rest = np.arange(len(grid) + 1)
-    if what == "verdict":
+    if what == "motion_state":
         title = "verdicts"
-        colours = ListedColormap(list(VERDICT_COLOURS.values()))
-        axes.pcolormesh(edges, rest, grid, cmap=colours, vmin=-0.5, vmax=len(VERDICT_COLOURS) - 0.5, rasterized=True)
+        colours = ListedColormap(list(MOTION_STATE_COLOURS.values()))
+        axes.pcolormesh(
+            edges, rest, grid, cmap=colours, vmin=-0.5, vmax=len(MOTION_STATE_COLOURS) - 0.5, rasterized=True
+        )
     else:
         above = f", deforming above {chamfer_threshold:g}" if chamfer_threshold is not None else ""
         title = "votes" if what == "votes" else f"Chamfer distance to its own past [m]{above}"

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from v3d_torch.camera import BackProjector
-from v3d_torch.objects.dynamics import Judged
+from v3d_torch.geometry.camera import BackProjector
+from v3d_torch.objects.motion_classifier import TrackedObject
 from v3d_torch.pipeline import Pipeline, Snapshot
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, clusters_figure
@@ -28,11 +28,11 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
         OutputError: when an image cannot be written.
     """
     trajectory_figure(pipeline.sequence.groundtruth, trajectory, folder / "trajectory.png", pipeline.sequence.name)
-    if snapshots := pipeline.run.snapshots:
+    if snapshots := pipeline.record.snapshots:
         overlays = [[_overlay(judged) for judged in shot.scene.objects] for shot in snapshots]
         mask_strip([shot.frame.image for shot in snapshots], overlays, folder / "masks.png")
-    shot = pipeline.run.liveliest
-    if shot is not None and shot.scene.ballots:
+    shot = pipeline.record.most_dynamic_snapshot
+    if shot is not None and shot.scene.vote_pairs:
         _draw_votes(folder / "voting.png", pipeline, shot)
     if shot is not None and (clusters := _clusters(pipeline, shot)):
         clusters_figure(clusters, folder / "clusters.png", _title(shot))
@@ -49,7 +49,7 @@ def _draw_votes(path: Path, pipeline: Pipeline, shot: Snapshot) -> None:
         in_camera = T_cw[:3, :3] @ judged.centroid + T_cw[:3, 3]
         if mask.any() and in_camera[2] > 0:  # in view, and neither unknown, which is nan, nor behind the camera
             centres[judged.id] = camera.distort(camera.project(in_camera[None]))[0]
-    voting_figure(shot.frame.image, objects, centres, shot.scene.ballots, path, _title(shot))
+    voting_figure(shot.frame.image, objects, centres, shot.scene.vote_pairs, path, _title(shot))
 
 
 def _clusters(pipeline: Pipeline, shot: Snapshot) -> list[Cluster]:
@@ -60,15 +60,15 @@ def _clusters(pipeline: Pipeline, shot: Snapshot) -> list[Cluster]:
     slam, count = pipeline.slam, len(seen)
     masks = torch.stack([judged.mask for judged in seen])
     labels = torch.tensor([judged.label for judged in seen])
-    depth = slam.smooth(shot.frame.depth[None])[0]
-    clouds = slam.lift(depth, Instances(masks, labels, torch.ones(count), torch.zeros(count, 4)))
+    depth = slam.smooth_depth(shot.frame.depth[None])[0]
+    clouds = slam.back_project_instances(depth, Instances(masks, labels, torch.ones(count), torch.zeros(count, 4)))
     points = BackProjector(pipeline.sequence.camera)(depth[None])[0]
     lifted = (depth[0] > 0) & (depth[0] <= slam.config.objects.clouds.max_depth)
     return [
         Cluster(
             text=_overlay(judged)[1],
             before=points[judged.mask & lifted],
-            kept=clouds.own[i][judged.mask & lifted],
+            kept=clouds.cloud_pixels[i][judged.mask & lifted],
             after=clouds.points[i, clouds.valid[i]],
         )
         for i, judged in enumerate(seen)
@@ -76,8 +76,8 @@ def _clusters(pipeline: Pipeline, shot: Snapshot) -> list[Cluster]:
     ]
 
 
-def _overlay(judged: Judged) -> Overlay:
-    return judged.mask, judged.name, judged.verdict.value
+def _overlay(judged: TrackedObject) -> Overlay:
+    return judged.mask, judged.name, judged.motion_state.value
 
 
 def _title(shot: Snapshot) -> str:

@@ -14,14 +14,14 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.ate import absolute_errors
+from v3d_torch.evaluation.pose_association import match
 from v3d_torch.evaluation.report import Evaluation
 from v3d_torch.evaluation.rpe import drift
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figures import with_gaps
 
-STATUS_COLOURS = {"tracked": "#2ca02c", "odometry": "#1f77b4", "adrift": "#ff7f0e", "lost": "#d62728"}
+STATUS_COLOURS = {"tracked": "#2ca02c", "odometry": "#1f77b4", "disconnected": "#ff7f0e", "lost": "#d62728"}
 """Colour of each way in which a frame's pose was found."""
 
 WIDTH = 9.0

@@ -11,14 +11,14 @@ from v3d_torch.errors import ConfigError, ViewerError
 from v3d_torch.types import RGBDFrame
 
 if TYPE_CHECKING:
-    from v3d_torch.objects.dynamics import Scene
+    from v3d_torch.objects.motion_classifier import FrameObjects
     from v3d_torch.slam import V3DSLAM
 
 
 class Viewer(Protocol):
     """Is shown every frame of a run, and changes nothing."""
 
-    def show(self, frame: RGBDFrame, scene: Scene, slam: V3DSLAM, seconds: Mapping[str, float]) -> None:
+    def show(self, frame: RGBDFrame, scene: FrameObjects, slam: V3DSLAM, seconds: Mapping[str, float]) -> None:
         """Show a frame that was taken in.
 
         Args:
@@ -39,7 +39,7 @@ class Viewer(Protocol):
 class NullViewer:
     """Shows nothing."""
 
-    def show(self, frame: RGBDFrame, scene: Scene, slam: V3DSLAM, seconds: Mapping[str, float]) -> None:
+    def show(self, frame: RGBDFrame, scene: FrameObjects, slam: V3DSLAM, seconds: Mapping[str, float]) -> None:
         """Do nothing."""
 
     def finish(self, slam: V3DSLAM) -> None:

@@ -13,7 +13,7 @@ from matplotlib.patheffects import Normal, Stroke
 from torch import Tensor
 
 from v3d_torch.viz.ballots import lines_of
-from v3d_torch.viz.figures import VERDICT_COLOURS, Overlay, draw_objects, known_verdict, save
+from v3d_torch.viz.figures import MOTION_STATE_COLOURS, Overlay, draw_objects, parse_motion_state, save
 
 VOTE_COLOUR = "#ff1f1f"
 """Of the lines between objects that voted, red in the paper."""
@@ -56,7 +56,7 @@ def draw_voting(
 
     Args:
         image: uint8 RGB, shape :math:`(3, H, W)`.
-        objects: by id: mask (bool, shape :math:`(H, W)`), text, verdict (`VERDICT_COLOURS`).
+        objects: by id: mask (bool, shape :math:`(H, W)`), text, verdict (`MOTION_STATE_COLOURS`).
         centres: by id: the centroid's pixel, (u, v), shape :math:`(2,)`; an object without one has no lines.
         ballots: ids of who voted and for whom; a vote that both gave each other is one line.
         title: printed above.
@@ -75,7 +75,7 @@ def draw_voting(
         style = {"colors": VOTE_COLOUR, "linewidths": linewidth, "alpha": alpha}
         axes.add_collection(LineCollection(lines, path_effects=effects, zorder=2.5, **style))
     for number, centre in centres.items():
-        colour = VERDICT_COLOURS[known_verdict(objects[number][2])]
+        colour = MOTION_STATE_COLOURS[parse_motion_state(objects[number][2])]
         axes.plot(*centre.tolist(), "o", color=colour, markeredgecolor="white", markersize=8, zorder=2.7)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), title=title)
     figure.legend(handles=_legend(objects, some_thin=bool(thin)), loc="outside lower center", ncols=6, frameon=False)
@@ -83,8 +83,8 @@ def draw_voting(
 
 
 def _legend(objects: Mapping[int, Overlay], *, some_thin: bool) -> list[Line2D]:
-    present = {known_verdict(verdict) for _, _, verdict in objects.values()}
-    shown = [(verdict, colour) for verdict, colour in VERDICT_COLOURS.items() if verdict in present]
+    present = {parse_motion_state(verdict) for _, _, verdict in objects.values()}
+    shown = [(verdict, colour) for verdict, colour in MOTION_STATE_COLOURS.items() if verdict in present]
     without_effect = [Line2D([], [], color=VOTE_COLOUR, alpha=0.5, linewidth=0.7, label="without effect")]
     return [
         Line2D([], [], color=VOTE_COLOUR, linewidth=2.0, label="vote: a distance that changed"),

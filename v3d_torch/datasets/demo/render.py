@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.demo.geometry import Rectangle, Scene
 from v3d_torch.datasets.demo.relief import intersect, relief_map
 from v3d_torch.datasets.demo.texturing import TextureTable
 from v3d_torch.datasets.demo.view import OVERSAMPLING, Rays, View
+from v3d_torch.geometry.camera import PinholeCamera
 
 
 @dataclass(frozen=True)

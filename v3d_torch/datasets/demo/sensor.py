@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, pad
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.geometry.camera import PinholeCamera
 
 BASELINE = 0.075
 """From the infrared camera to the projector at its right, metres."""

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.datasets.demo.path import camera_pose
 from v3d_torch.datasets.demo.render import Renderer
 from v3d_torch.datasets.demo.room import build_room
 from v3d_torch.datasets.demo.sensor import sense_colour, sense_depth
+from v3d_torch.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, readout=0.0)
 """The default calibration of a Kinect; rendered images have all rows of one time."""

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
+from v3d_torch.geometry.camera import PinholeCamera
 
 OVERSAMPLING = 2
 """Samples per pixel and axis."""

@@ -12,16 +12,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.camera import PinholeCamera
 from v3d_torch.errors import OutputError
-from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.pose_association import match
 from v3d_torch.evaluation.report import is_oriented
-from v3d_torch.lie import invert
-from v3d_torch.mapping.local_map import Keyframe, poses_of
-from v3d_torch.mapping.recorder import Status
-from v3d_torch.objects.dynamics import Scene
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.mapping.keyframe import Keyframe, stack_poses
+from v3d_torch.objects.motion_classifier import FrameObjects
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import RGBDFrame, Trajectory
+from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 from v3d_torch.viz.rerun.layout import layout
 from v3d_torch.viz.rerun.scene import in_words, log_scene, rgba, verdict_classes
 
@@ -43,7 +42,7 @@ class RerunViewer:
     ``world/map``                             ``landmarks`` and ``keyframes``, all again after each new keyframe
     ``world/trajectory``                      all poses, again after each new keyframe; ``newest``: those since
     ``world/groundtruth``                     true way of the camera, aligned at the first pose that has a true one
-    ``seconds``, ``votes``, ``chamfer``       curves, by stage and by id of the object
+    ``parse_timestamp``, ``votes``, ``chamfer``       curves, by stage and by id of the object
     ``verdicts``, ``log``                     the frame in words
     ========================================  ==========================================================================
 
@@ -76,9 +75,9 @@ class RerunViewer:
         pinhole = rr.Pinhole(image_from_camera=camera.K.numpy(), resolution=size, image_plane_distance=0.3)
         stream.log("world/camera/image", pinhole, static=True)
 
-    def show(self, frame: RGBDFrame, scene: Scene, slam: V3DSLAM, seconds: Mapping[str, float]) -> None:
+    def show(self, frame: RGBDFrame, scene: FrameObjects, slam: V3DSLAM, seconds: Mapping[str, float]) -> None:
         """Log a frame; the time that takes is that of the stage ``viewer``."""
-        with slam.clock("viewer"):
+        with slam.timer("viewer"):
             self._stream.set_time("frame", sequence=frame.index)
             self._stream.set_time("stamp", timestamp=frame.stamp)
             keyframes = slam.mapper.map.keyframes
@@ -132,15 +131,15 @@ class RerunViewer:
         points = landmarks["point"][landmarks["alive"]].numpy()
         grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/landmarks", grey)
-        frusta = _frusta(self._camera, invert(poses_of(slam.mapper.map.kept)))
+        frusta = _frusta(self._camera, invert(stack_poses(slam.mapper.map.active_keyframes)))
         self._stream.log("world/map/keyframes", _way(frusta, "tab:cyan", width=0.7))
         positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
         self._stream.log("world/trajectory", _way([positions], "tab:blue"))
         self._newest = list(positions[-1:])
 
-    def _align(self, stamp: float, T_ec: Tensor, status: Status | None) -> None:
+    def _align(self, stamp: float, T_ec: Tensor, status: TrackingStatus | None) -> None:
         """Log the ground truth as soon as a pose says where it lies in the estimate's world."""
-        if self._unaligned is None or status is Status.LOST:
+        if self._unaligned is None or status is TrackingStatus.LOST:
             return
         truth = self._unaligned
         matches = match(truth, Trajectory(torch.tensor([stamp], dtype=torch.float64), T_ec[None]))
@@ -151,17 +150,17 @@ class RerunViewer:
         self._stream.log("world/groundtruth", _way([positions], "goldenrod"))
         self._unaligned = None
 
-    def _say(self, frame: RGBDFrame, scene: Scene, slam: V3DSLAM, kept: bool) -> None:
+    def _say(self, frame: RGBDFrame, scene: FrameObjects, slam: V3DSLAM, kept: bool) -> None:
         status = slam.poses.statuses[-1]
         head = f"**frame {frame.index}** at {frame.stamp:.3f} s: {status.value}"
         self._stream.log("verdicts", rr.TextDocument(f"{head}\n\n{in_words(scene)}", media_type="text/markdown"))
-        events = [status.value] if status is not Status.TRACKED else []
+        events = [status.value] if status is not TrackingStatus.TRACKED else []
         events += [f"keyframe {len(slam.mapper.map.keyframes) - 1}"] if kept else []
-        if slam.loops.count > self._loops:
-            self._loops = slam.loops.count
+        if slam.loop_closer.loop_count > self._loops:
+            self._loops = slam.loop_closer.loop_count
             events.append("loop closed, map corrected")
         if events:
-            level = rr.TextLogLevel.WARN if status is Status.LOST else rr.TextLogLevel.INFO
+            level = rr.TextLogLevel.WARN if status is TrackingStatus.LOST else rr.TextLogLevel.INFO
             self._stream.log("log", rr.TextLog("; ".join(events), level=level))
 
 

@@ -1,0 +1,85 @@
+"""A room walked around twice: the loop stage closes the circle; without it the second round lies beside the first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from v3d_torch import V3DSLAM
+from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.demo import materials
+from v3d_torch.datasets.demo.geometry import Rectangle, Scene
+from v3d_torch.datasets.demo.path import LEVEL
+from v3d_torch.datasets.demo.render import Renderer
+from v3d_torch.datasets.demo.room import HIGH, LOW, build_room
+from v3d_torch.datasets.demo.sensor import sense_colour, sense_depth
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.types import RGBDFrame, TrackingStatus
+
+CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
+FRAMES = 90
+"""Of a round: 4 degrees and 5 cm a frame."""
+
+
+def walk(frame: int) -> np.ndarray:
+    """Pose ``T_wc`` on a circle through the demo's room, looking outwards, with some sway; both rounds are the same."""
+    angle = 2 * np.pi * frame / FRAMES
+    yaw, pitch = np.degrees(angle) - 90 + 6 * np.sin(3 * angle), -6 + 3 * np.sin(5 * angle)
+    roll = 2 * np.sin(4 * angle)
+    T_wc = np.eye(4)
+    T_wc[:3, :3] = Rotation.from_euler("ZXY", (yaw, pitch, roll), degrees=True).as_matrix() @ LEVEL
+    T_wc[:3, 3] = 0.7 * np.cos(angle), 0.9 + 0.8 * np.sin(angle), 1.45 + 0.05 * np.sin(3 * angle)
+    return T_wc
+
+
+def empty_room() -> Scene:
+    """The demo's room without the people who move, and with the wall that is behind its camera."""
+    room = build_room(7)
+    width, height = HIGH[0] - LOW[0], HIGH[2] - LOW[2]
+    bricks = materials.bricks(np.random.default_rng(0), width, height, 330, (0.6, 0.5, 0.5))
+    behind = Rectangle((HIGH[0], LOW[1], HIGH[2]), (-width, 0, 0), (0, 0, -height), bricks)
+    return Scene([*room.rectangles, behind], [figure for figure in room.figures if figure.mover == 0])
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[RGBDFrame]:
+    """Two rounds, with the noise of a sensor that is another one each time."""
+    renderer = Renderer(empty_room(), CAMERA)
+    taken = []
+    for index in range(2 * FRAMES):
+        rendering = renderer(walk(index), 0.0)
+        noise = torch.Generator().manual_seed(index)
+        colour = sense_colour(rendering.colour, noise).permute(2, 0, 1).contiguous()
+        depth = sense_depth(rendering.depth, CAMERA, noise).to(torch.float32)[None]
+        taken.append(RGBDFrame(index, index / 15, colour, depth, camera=CAMERA))
+    return taken
+
+
+@pytest.fixture(scope="module")
+def drift(frames: list[RGBDFrame]) -> dict[bool, float]:
+    """Error of the way from the first to the last frame as a share of the path, with the loop stage and without."""
+    truth = torch.from_numpy(np.stack([walk(index) for index in range(2 * FRAMES)]))
+    path = float((truth[1:, :3, 3] - truth[:-1, :3, 3]).norm(dim=1).sum())
+    drift = {}
+    for enabled in (True, False):
+        overrides = ("segmentation.source=none", f"loop.enabled={str(enabled).lower()}")
+        slam = V3DSLAM(CAMERA, config=load_config(None, overrides))
+        for frame in frames:
+            slam(frame)
+        assert slam.poses.statuses == [TrackingStatus.TRACKED] * len(frames)
+        assert (slam.loop_closer.loop_count > 0) is enabled
+        found = slam.poses.trajectory().T_wc
+        apart = (invert(found[0]) @ found[-1])[:3, 3] - (invert(truth[0]) @ truth[-1])[:3, 3]
+        drift[enabled] = float(apart.norm()) / path
+    return drift
+
+
+def test_with_loops_the_circle_closes(drift: dict[bool, float]) -> None:
+    assert drift[True] < 0.005
+
+
+def test_without_loops_it_does_not(drift: dict[bool, float]) -> None:
+    assert drift[False] > 3 * drift[True]

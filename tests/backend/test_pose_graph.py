@@ -1,0 +1,206 @@
+"""Pose graphs against gtsam, autograd, and graphs whose solution is known."""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import pypose as pp
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from v3d_torch.backend.pose_graph import edge_errors, optimise_pose_graph
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+
+SIGMA = torch.tensor([0.01] * 3 + [0.005] * 3, dtype=torch.float64)
+
+
+class Graph:
+    """Poses on a circle walked around twice, noisy measured motions between them, and the walk as it drifts."""
+
+    def __init__(self, poses: int, loops: int, noise: float = 1.0, seed: int = 0) -> None:
+        generator = torch.Generator().manual_seed(seed)
+
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        angle = torch.linspace(0, 4 * math.pi, poses, dtype=torch.float64)
+        o = torch.zeros_like(angle)
+        place = torch.stack([2 * angle.cos(), 2 * angle.sin(), 0.2 * (3 * angle).sin(), o, o, o], dim=1)
+        turn = torch.stack([o, o, o, o, o, angle], dim=1)
+        self.T_wc = se3_exp(place) @ se3_exp(turn) @ se3_exp(0.1 * normal(poses, 6))
+        chain = torch.stack([torch.arange(poses - 1), torch.arange(1, poses)], dim=1)
+        ends = torch.randint(0, poses, (loops, 2), generator=generator)
+        self.edges = torch.cat([chain, ends[ends[:, 0] != ends[:, 1]]])
+        i, j = self.edges.unbind(dim=1)
+        error = noise * SIGMA * normal(len(i), 6)
+        self.T_ij = invert(self.T_wc[i]) @ self.T_wc[j] @ se3_exp(error)
+        self.information = torch.diag(SIGMA**-2).expand(len(i), 6, 6)
+        walk = [self.T_wc[0]]
+        for T in self.T_ij[: poses - 1]:
+            walk.append(walk[-1] @ T)
+        self.start = torch.stack(walk)
+
+
+def with_gtsam(graph: Graph, information: Tensor, kernel: float | None = None) -> tuple[Tensor, float]:
+    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, T in enumerate(graph.start):
+        start.insert(k, gtsam.Pose3(T.numpy()))
+    factors.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3(graph.start[0].numpy())))
+    rotation_first = torch.tensor([3, 4, 5, 0, 1, 2])
+    for (i, j), T, omega in zip(graph.edges.tolist(), graph.T_ij, information, strict=True):
+        noise = gtsam.noiseModel.Gaussian.Information(omega[rotation_first][:, rotation_first].numpy())
+        if kernel is not None:
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(kernel), noise)
+        factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(T.numpy()), noise))
+    settings_ = gtsam.LevenbergMarquardtParams()
+    settings_.setRelativeErrorTol(1e-10)
+    best = gtsam.LevenbergMarquardtOptimizer(factors, start, settings_).optimize()
+    poses = torch.stack([torch.from_numpy(best.atPose3(k).matrix()) for k in range(graph.start.shape[0])])
+    return poses, 2 * factors.error(best)
+
+
+@pytest.mark.parametrize(("poses", "loops"), [(30, 3), (300, 40), (1000, 100)])
+def test_same_optimum_as_gtsam(poses: int, loops: int) -> None:
+    graph = Graph(poses, loops)
+    result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
+    expected, cost = with_gtsam(graph, graph.information)
+    assert result.converged
+    assert result.cost_after == pytest.approx(cost, rel=1e-6)
+    assert (result.T_wc - expected).abs().max() < 1e-5
+    drift = (graph.start - graph.T_wc)[:, :3, 3].norm(dim=1).max()
+    assert (result.T_wc - graph.T_wc)[:, :3, 3].norm(dim=1).max() < drift
+
+
+def test_same_robust_optimum_as_gtsam() -> None:
+    graph = Graph(60, 15)
+    graph.T_ij[-1] = graph.T_ij[-1] @ se3_exp(torch.tensor([0.5, 0.3, 0.0, 0.0, 0.4, 0.0], dtype=torch.float64))
+    result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information, robust=3.0)
+    expected, cost = with_gtsam(graph, graph.information, kernel=3.0)
+    assert result.cost_after == pytest.approx(cost, rel=1e-4)
+    assert (result.T_wc - expected).abs().max() < 1e-3
+    plain = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
+    clean = optimise_pose_graph(graph.start, graph.edges[:-1], graph.T_ij[:-1], graph.information[:-1])
+    error, plain_error = ((r.T_wc - clean.T_wc)[:, :3, 3].norm(dim=1).mean() for r in (result, plain))
+    assert error < 0.25 * plain_error
+
+
+def test_convention_information_orders_translation_first() -> None:
+    graph = Graph(20, 4)
+    information = torch.diag(torch.tensor([1e6, 1e2, 1e4, 1e3, 1e5, 1e4], dtype=torch.float64))
+    information = information.expand(graph.edges.shape[0], 6, 6)
+    result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, information)
+    expected, cost = with_gtsam(graph, information)
+    assert result.cost_after == pytest.approx(cost, rel=1e-6)
+    assert (result.T_wc - expected).abs().max() < 1e-5
+
+
+def test_jacobians_equal_autograd() -> None:
+    graph = Graph(12, 8, noise=20.0)
+    i, j = graph.edges.unbind(dim=1)
+    T_wi, T_wj, T_ji = graph.T_wc[i], graph.T_wc[j], invert(graph.T_ij)
+    count = len(i)
+
+    def errors(xi: Tensor, xj: Tensor) -> Tensor:
+        return se3_log(T_ji @ invert(T_wi @ se3_exp(xi)) @ T_wj @ se3_exp(xj))
+
+    zeros = torch.zeros(count, 6, dtype=torch.float64)
+    expected_i, expected_j = torch.autograd.functional.jacobian(errors, (zeros, zeros))
+    each = torch.arange(count)
+    error, by_i, by_j = edge_errors(*(pp.mat2SE3(T, check=False) for T in (T_wi, T_wj, T_ji)))
+    torch.testing.assert_close(error, errors(zeros, zeros), rtol=0, atol=1e-10)
+    torch.testing.assert_close(by_i, expected_i[each, :, each], rtol=0, atol=1e-9)
+    torch.testing.assert_close(by_j, expected_j[each, :, each], rtol=0, atol=1e-9)
+
+
+def test_convention_T_ij_is_j_seen_from_i() -> None:
+    step = se3_exp(torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.5], dtype=torch.float64))
+    identity = torch.eye(4, dtype=torch.float64)
+    result = optimise_pose_graph(torch.stack([identity, identity]), torch.tensor([[0, 1]]), step[None])
+    torch.testing.assert_close(result.T_wc[1], step, rtol=0, atol=1e-9)
+    assert torch.equal(result.T_wc[0], identity)
+
+
+@st.composite
+def consistent_graphs(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
+    """Poses and the edges of a connected graph on them, in any order and direction."""
+    count = draw(st.integers(2, 12))
+    numbers = draw(st.lists(st.floats(-1.5, 1.5), min_size=6 * count, max_size=6 * count))
+    T_wc = se3_exp(torch.tensor(numbers, dtype=torch.float64).reshape(count, 6))
+    tree = [(draw(st.integers(0, k - 1)), k) for k in range(1, count)]
+    pairs = st.tuples(st.integers(0, count - 1), st.integers(0, count - 1)).filter(lambda pair: pair[0] != pair[1])
+    edges = draw(st.permutations(tree + draw(st.lists(pairs, max_size=10))))
+    flipped = [(j, i) if draw(st.booleans()) else (i, j) for i, j in edges]
+    return T_wc, torch.tensor(flipped)
+
+
+@settings(deadline=None, max_examples=25)
+@given(consistent_graphs(), st.integers(0, 100))
+def test_consistent_measurements_are_met_exactly(graph: tuple[Tensor, Tensor], seed: int) -> None:
+    T_wc, edges = graph
+    T_ij = invert(T_wc[edges[:, 0]]) @ T_wc[edges[:, 1]]
+    generator = torch.Generator().manual_seed(seed)
+    wrong = 0.1 * torch.randn(T_wc.shape[0], 6, generator=generator, dtype=torch.float64)
+    wrong[0] = 0.0
+    result = optimise_pose_graph(T_wc @ se3_exp(wrong), edges, T_ij)
+    torch.testing.assert_close(result.T_wc, T_wc, rtol=0, atol=1e-4)
+    assert result.cost_after <= result.cost_before
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
+def test_moving_the_world_moves_the_solution(numbers: list[float]) -> None:
+    graph = Graph(20, 5)
+    T_vw = se3_exp(torch.tensor(numbers, dtype=torch.float64))
+    here = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
+    there = optimise_pose_graph(T_vw @ graph.start, graph.edges, graph.T_ij, graph.information)
+    torch.testing.assert_close(there.T_wc, T_vw @ here.T_wc, rtol=0, atol=1e-6)
+
+
+def test_exact_rotations_converge() -> None:
+    """Rotation errors of rounding size only, where PyPose's Jacobian has few digits left."""
+    count = 50
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    T_wc[:, 0, 3] = torch.arange(count) * 0.1
+    edges = torch.tensor([(k, k + d) for k in range(count) for d in (1, 7) if k + d < count])
+    T_ij = invert(T_wc[edges[:, 0]]) @ T_wc[edges[:, 1]]
+    start = T_wc.clone()
+    start[1:, 1, 3] += 0.3
+    result = optimise_pose_graph(start, edges, T_ij)
+    assert result.converged
+    torch.testing.assert_close(result.T_wc, T_wc, rtol=0, atol=1e-4)
+
+
+def test_fixed_poses_stay_to_the_bit() -> None:
+    graph = Graph(20, 5)
+    fixed = torch.zeros(20, dtype=torch.bool)
+    fixed[[3, 11]] = True
+    result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, fixed=fixed)
+    assert torch.equal(result.T_wc[fixed], graph.start[fixed])
+    assert not torch.equal(result.T_wc[0], graph.start[0])
+
+
+def test_poses_without_edges_stay_where_they_are() -> None:
+    graph = Graph(20, 5)
+    lonely = se3_exp(torch.tensor([[9.0, 0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
+    result = optimise_pose_graph(torch.cat([graph.start, lonely]), graph.edges, graph.T_ij)
+    torch.testing.assert_close(result.T_wc[-1:], lonely, rtol=0, atol=1e-12)
+
+
+def test_a_part_without_a_fixed_pose_keeps_its_shape() -> None:
+    graph = Graph(20, 0)
+    apart = graph.edges[(graph.edges != 10).all(dim=1)]
+    T_ij = graph.T_ij[(graph.edges != 10).all(dim=1)]
+    start = graph.start @ se3_exp(0.05 * torch.sin(torch.arange(120.0, dtype=torch.float64)).reshape(20, 6))
+    result = optimise_pose_graph(start, apart, T_ij)
+    assert result.cost_after < 1e-6
+    assert torch.isfinite(result.T_wc).all()
+
+
+def test_deterministic() -> None:
+    graph = Graph(50, 10)
+    first, second = (optimise_pose_graph(graph.start, graph.edges, graph.T_ij).T_wc for _ in range(2))
+    assert torch.equal(first, second)

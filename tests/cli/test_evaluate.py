@@ -1,0 +1,98 @@
+"""``python -m v3d_torch evaluate`` as a user calls it."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from typer.testing import CliRunner, Result
+
+from v3d_torch.cli.evaluate import app, main
+from v3d_torch.datasets.tum_trajectory import write_trajectory
+from v3d_torch.evaluation import evaluate
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.types import Trajectory
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[str, str]:
+    """A ground truth and an estimate that is 1 cm off now and then."""
+    generator = torch.Generator().manual_seed(0)
+    stamps = torch.arange(90, dtype=torch.float64) / 30
+    T_wc = se3_exp(torch.randn(90, 6, dtype=torch.float64, generator=generator))
+    write_trajectory(tmp_path / "groundtruth.txt", Trajectory(stamps, T_wc))
+    T_wc = T_wc.clone()
+    T_wc[::9, 0, 3] += 0.01
+    write_trajectory(tmp_path / "estimate.txt", Trajectory(stamps, T_wc))
+    return str(tmp_path / "groundtruth.txt"), str(tmp_path / "estimate.txt")
+
+
+def call(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments), env={"COLUMNS": "120", "NO_COLOR": "1"})
+
+
+def test_from_the_shell(files: tuple[str, str]) -> None:
+    command = [sys.executable, "-m", "v3d_torch", "evaluate", *files, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    values = json.loads(done.stdout)
+    assert values["ate"]["rmse"] == pytest.approx(0.01 * (10 / 90 * 80 / 90) ** 0.5, rel=0.02)
+    assert values["rpe"]["rot"]["max"] < 1e-4 and values["coverage"] is None
+
+
+def test_help_loads_nothing_heavy() -> None:
+    """What takes seconds to import is imported when there is work to do."""
+    heavy = {"torch", "scipy", "cv2", "numpy"}
+    probe = f"import sys, v3d_torch.cli.evaluate; print(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
+    assert done.stdout.strip() == "[]"
+
+
+def test_tables(files: tuple[str, str]) -> None:
+    result = call(*files, "--sequence", "fr3/w/rpy", "--frames", "100")
+    assert result.exit_code == 0
+    assert "90 of 90 poses have ground truth, 90.0% of the frames" in result.stdout
+    for words in ("ATE, m", "RPE, m/s", "RPE, deg/s", "DynaSLAM", "0.0354", "this result"):
+        assert words in result.stdout
+
+
+def test_the_sequence_is_guessed_from_a_path(files: tuple[str, str], tmp_path: Path) -> None:
+    assert "DynaSLAM" not in call(*files).stdout
+    named = tmp_path / "rgbd_dataset_freiburg3_walking_rpy.txt"
+    named.write_bytes(Path(files[0]).read_bytes())
+    assert "0.0354" in call(str(named), files[1]).stdout
+
+
+def test_another_delta_is_named_in_the_unit(files: tuple[str, str]) -> None:
+    assert "RPE, m/0.5 s" in call(*files, "--delta", "0.5").stdout
+
+
+def test_notes_are_shown(files: tuple[str, str]) -> None:
+    assert "note: no two poses with ground truth are 10 s apart: no RPE" in call(*files, "--delta", "10").stdout
+
+
+@pytest.mark.parametrize("case", ["missing", "broken", "elsewhere", "sequence"])
+def test_bad_input_is_one_sentence_and_exit_code_2(case: str, files: tuple[str, str], tmp_path: Path) -> None:
+    bad = tmp_path / "bad.txt"
+    arguments = [files[0], str(bad)]
+    if case == "broken":
+        bad.write_text("1 2 3\n")
+    elif case == "elsewhere":
+        T_wc = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+        write_trajectory(bad, Trajectory(torch.arange(500, 505, dtype=torch.float64), T_wc))
+    elif case == "sequence":
+        arguments = [*files, "--sequence", "bad.txt"]
+    result = call(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ") and "bad.txt" in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_the_commands_defaults_are_the_functions() -> None:
+    command, function = (inspect.signature(f).parameters for f in (main, evaluate))
+    assert command["max_difference"].default == function["max_time_difference"].default
+    assert command["delta"].default == function["rpe_delta"].default

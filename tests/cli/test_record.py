@@ -1,0 +1,171 @@
+"""``python -m v3d_torch record`` as a user calls it, and the folders that it writes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.bags import DEPTH, INFO, RGB, Messages
+from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
+from typer.testing import CliRunner, Result
+
+from v3d_torch.cli.record import app
+from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.datasets.tum_writer import TUMWriter
+from v3d_torch.errors import OutputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.types import RGBDFrame
+
+K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
+LISTS = {"rgb.txt", "depth.txt", "associations.txt", "camera.yaml"}
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "v3d_torch", "record", *map(str, arguments)]
+
+
+def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=100)  # noqa: S603
+
+
+def call_here(*arguments: str | Path) -> Result:
+    """In this process, which has loaded everything already."""
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def assert_one_sentence(done: Result, *words: str) -> None:
+    assert done.exit_code == 2, done.stderr
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
+    assert all(word in done.stderr for word in words), done.stderr
+
+
+def assert_equal(saved: RGBDSequence, source: RGBDSequence) -> None:
+    assert saved.camera == source.camera
+    assert saved.stamps.tolist() == pytest.approx(source.stamps.tolist(), abs=1e-6)
+    for frame, original in zip(saved, source, strict=True):
+        assert torch.equal(frame.image, original.image)
+        torch.testing.assert_close(frame.depth, original.depth, rtol=1e-6, atol=0)
+        assert frame.depth_delay == pytest.approx(original.depth_delay, abs=2e-6)
+
+
+def test_a_bag_becomes_a_folder(tmp_path: Path) -> None:
+    make = Messages("bag")
+    info = make.info(WIDTH, HEIGHT, K, [0.1, -0.2, 0.003, 0.004, 0.05], K[:3] * 4)
+    messages = [(INFO, 10.0, info)]
+    for i in range(3):
+        stamp = 1700000000 + i / 30
+        messages.append((RGB, stamp, make.image(stamp, "rgb8", colour_of(i))))
+        messages.append((DEPTH, stamp - 0.0125, make.image(stamp - 0.0125, "16UC1", depth_of(i))))
+    bag = make.write(tmp_path / "take", messages)
+    done = call("--seq", bag, "--out", tmp_path / "out [b]", "--rgb-topic", RGB)
+    assert (done.returncode, done.stderr, done.stdout.strip()) == (0, "", f"3 frames: {tmp_path / 'out [b]'}")
+    assert_equal(load_sequence(str(tmp_path / "out [b]")), load_sequence(str(bag)))
+    assert load_sequence(str(bag))[1].depth_delay == pytest.approx(-0.0125, abs=1e-6)
+
+
+def test_ground_truth_is_saved_and_not_transformed_twice(tmp_path: Path) -> None:
+    folder = tmp_path / "rgbd_bonn_tiny"
+    save(folder / "rgb" / "0.png", colour_of(0, 640, 480))
+    save(folder / "depth" / "0.png", depth_of(0, 640, 480))
+    (folder / "rgb.txt").write_text("10.0 rgb/0.png\n")
+    (folder / "depth.txt").write_text("10.0 depth/0.png\n")
+    (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0.6 0.8\n")
+    done = call_here("--seq", folder, "--out", tmp_path / "rgbd_bonn_copy")
+    assert (done.exit_code, done.stderr) == (0, "")
+    source, saved = load_sequence(str(folder)), load_sequence(str(tmp_path / "rgbd_bonn_copy"))
+    assert_equal(saved, source)
+    assert source.groundtruth is not None and saved.groundtruth is not None
+    torch.testing.assert_close(saved.groundtruth.T_wc, source.groundtruth.T_wc, atol=1e-8, rtol=0)
+
+
+def test_a_broken_ground_truth_costs_no_frame(tmp_path: Path) -> None:
+    folder = tmp_path / "take"
+    save(folder / "rgb" / "0.png", colour_of(0))
+    save(folder / "depth" / "0.png", depth_of(0))
+    for kind in ("rgb", "depth"):
+        (folder / f"{kind}.txt").write_text(f"10.0 {kind}/0.png\n")
+    (folder / "camera.yaml").write_text(CAMERA_YAML)
+    (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0 nan\n")
+    done = call_here("--seq", folder, "--out", tmp_path / "out")
+    assert_one_sentence(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite", "frames")
+    assert len(load_sequence(str(tmp_path / "out"))) == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
+def test_ctrl_c_ends_it_well(tmp_path: Path) -> None:
+    folder, out = tmp_path / "long", tmp_path / "out"
+    save(folder / "rgb.png", colour_of(0, 640, 480))
+    save(folder / "depth.png", depth_of(0, 640, 480))
+    (folder / "associations.txt").write_text("".join(f"{i} rgb.png {i} depth.png\n" for i in range(20000)))
+    (folder / "K.txt").write_text("500 500 320 240 1000 640 480")
+    arguments = command("--seq", folder, "--out", out)
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:  # noqa: S603
+        deadline = time.monotonic() + 60
+        while len(list((out / "depth").glob("[0-9]*"))) < 3 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stderr) == (0, "")
+    saved = load_sequence(str(out))
+    assert 3 <= len(saved) < 20000 and stdout == f"{len(saved)} frames: {out}\n"
+    files = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
+    stamps = [f"{stamp:.6f}.png" for stamp in saved.stamps.tolist()]
+    assert files == LISTS | {f"{kind}/{stamp}" for kind in ("rgb", "depth") for stamp in stamps}
+
+
+def test_what_users_get_wrong(tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "diary.txt").write_text("")
+    save(tmp_path / "rgb" / "1.png", colour_of(0))
+    save(tmp_path / "depth" / "1.png", depth_of(0))
+    (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
+    done = call_here("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
+    assert_one_sentence(done, str(tmp_path / "full"), "holds something already; choose another")
+    assert_one_sentence(call_here("--out", tmp_path / "new"), "realsense: ")
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_is_written_stays_when_the_source_breaks(tmp_path: Path) -> None:
+    camera = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=1000)
+    frame = RGBDFrame(0, 12.5, torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.ones(1, HEIGHT, WIDTH))
+    with pytest.raises(RuntimeError, match="broke"), TUMWriter(tmp_path / "out", camera) as writer:
+        writer.add(frame)
+        raise RuntimeError("broke")
+    assert load_sequence(str(tmp_path / "out")).stamps.tolist() == [12.5]
+
+
+def test_depth_is_exact_and_what_does_not_fit_is_none(tmp_path: Path) -> None:
+    camera = PinholeCamera(1, 2, 3, 4, 256, 256, depth_scale=1000)
+    units = torch.arange(256 * 256, dtype=torch.float32).reshape(1, 256, 256)
+    image = torch.from_numpy(colour_of(0, 256, 256)).permute(2, 0, 1)
+    for stamp, depth in ((1.0, units / 1000), (2.0, units / 1000 + 30)):
+        with TUMWriter(tmp_path / str(stamp), camera) as writer:
+            writer.add(RGBDFrame(0, stamp, image, depth))
+    frame = load_sequence(str(tmp_path / "1.0"))[0]
+    assert np.array_equal(as_rgb(frame.image), colour_of(0, 256, 256))
+    assert torch.equal(frame.depth, torch.where(units < 65535, units / 1000, 0))
+    far = load_sequence(str(tmp_path / "2.0"))[0].depth
+    assert torch.equal(far == 0, units >= 35535)
+
+
+def test_a_file_where_the_folder_belongs(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    for folder in (tmp_path / "taken", tmp_path / "taken" / "below"):
+        with pytest.raises(OutputError, match="taken"):
+            TUMWriter(folder, PinholeCamera(1, 2, 3, 4))
+
+
+def test_help_is_instant_and_names_every_option() -> None:
+    done = subprocess.run(command("--help"), capture_output=True, text=True, check=True)  # noqa: S603
+    for option in ("seq", "out", "data-root", "camera", "rgb-topic", "depth-topic", "info-topic", "fps"):
+        assert f"--{option}" in done.stdout
+    probe = "import sys, v3d_torch.cli.record; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
+    assert done.stdout.strip() == "False"

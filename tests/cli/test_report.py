@@ -1,0 +1,303 @@
+"""``python -m v3d_torch report`` as a user calls it: one page with everything in it, whatever the run left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+import torch
+from helpers.squares import squares
+from helpers.wall_run import FRAMES, Wall, square
+from torch import Tensor
+from typer.testing import CliRunner, Result
+
+from v3d_torch.cli.report import app
+from v3d_torch.config.loading import load_config
+from v3d_torch.errors import InputError
+from v3d_torch.io.files import write_text
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.results import write_results
+from v3d_torch.runs.stored_run import read_run
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import Instances, RGBDFrame
+from v3d_torch.viz.report_page import render_page
+
+VOID = {"meta", "link", "img", "br", "hr", "input"}
+OPTIONAL = {"tr", "td", "th", "p", "li"}  # HTML closes them itself
+
+
+class Page(HTMLParser):
+    """What is in a page: its words, its addresses, and whether it is well formed."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.words = ""
+        self.addresses: list[str] = []
+        self.images = 0
+        self._open: list[str] = []
+        self.feed(html)
+        assert [tag for tag in self._open if tag not in OPTIONAL] == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "xlink:href")]
+        self.images += tag == "img"
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self._open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._open[-1] in OPTIONAL and self._open[-1] != tag:
+            self._open.pop()
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self._open and self._open[-1] not in ("style", "script"):
+            self.words += data + " "
+
+
+def run_into(folder: Path, sequence: Wall, segment: Callable[[RGBDFrame], Instances], *overrides: str) -> None:
+    config = load_config(overrides=["mapping.max_keyframe_interval=5", *overrides])
+    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), folder / "masks")
+    pipeline()
+    write_results(folder, pipeline)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a run by the paper's literal rules over three things, with masks saved."""
+    folder = tmp_path_factory.mktemp("results")
+    run_into(folder, Wall(), squares, "objects.free_space.enabled=false")
+    return folder
+
+
+@pytest.fixture
+def copy(results: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(results, tmp_path / "copy <b>&")
+
+
+def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "v3d_torch", "report", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)  # noqa: S603
+
+
+def call_here(*arguments: str | Path) -> Result:
+    """In this process, which has loaded everything already."""
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def page_of(folder: Path, groundtruth: Path | None = None) -> Page:
+    return Page(render_page(read_run(folder, groundtruth)))
+
+
+# --- a page
+
+
+def test_the_command_makes_one_page_with_everything_in_it(copy: Path) -> None:
+    done = call(copy)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"report: {copy / 'report.html'}\n"
+    html = (copy / "report.html").read_text(encoding="utf-8")
+    page = Page(html)
+    assert html.startswith("<!doctype html>")
+    assert all(address.startswith(("data:image/", "#")) for address in page.addresses), page.addresses
+    assert "<script" not in html and "@import" not in html and "<link" not in html
+    assert not re.search(r"url\((?!#)", html)
+    assert page.images == 3  # masks, votes, clusters
+    assert "copy <b>& " in page.words  # not markup
+    metrics = json.loads((copy / "metrics.json").read_text())
+    for number in (f"{metrics['ate']['rmse']:.4f} m", f"{metrics['rpe']['trans']['rmse']:.4f} m/s", f"{FRAMES} of"):
+        assert number in page.words
+    for words in ("person 1", "chair 2", "tv 3", "segmentation", "objects.free_space.enabled", "left out", "torch"):
+        assert words in page.words
+    assert (
+        "mapping.max_keyframe_interval" in page.words and "features.count" not in page.words
+    )  # only what is not the default
+    assert "prefers-color-scheme: dark" in html and "@media print" in html
+
+
+def test_the_page_names_the_folder_itself(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "latest").symlink_to(copy.name)
+    monkeypatch.chdir(copy)
+    for folder in (Path(), tmp_path / "latest"):
+        assert "A run of V3D-SLAM, copy <b>&" in page_of(folder).words
+
+
+def test_plots_are_drawings_and_the_same_again(results: Path) -> None:
+    html = render_page(read_run(results))
+    drawings = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)
+    assert len(drawings) == 8  # way, axes, errors, statuses, masks, objects, bars, stages over time
+    for drawing in drawings:
+        ET.fromstring(drawing)  # noqa: S314
+    references, ids = set(re.findall(r'href="#([^"]+)"', html)), set(re.findall(r' id="([^"]+)"', html))
+    assert references <= ids
+    assert render_page(read_run(results)) == html
+
+
+def test_the_scores_are_those_of_the_run(results: Path) -> None:
+    evaluation = read_run(results).evaluation
+    metrics = json.loads((results / "metrics.json").read_text())
+    assert evaluation is not None and evaluation.rpe is not None
+    assert evaluation.ate.rmse == pytest.approx(metrics["ate"]["rmse"], abs=1e-7)
+    assert evaluation.rpe.rot.rmse == pytest.approx(metrics["rpe"]["rot"]["rmse"], abs=1e-5)
+    assert evaluation.coverage == 1.0
+
+
+def test_help_is_instant() -> None:
+    before = os.times()
+    assert "--groundtruth" in call("--help").stdout
+    assert os.times().children_user - before.children_user < 3  # of the processor, which others may use too
+
+
+# --- results that are not whole
+
+
+def test_a_run_that_ended_early_says_so(tmp_path: Path) -> None:
+    for broken, poses in ((0, 0), (1, 1), (6, 6)):
+        run_into(tmp_path / str(broken), Wall(broken=broken), square)
+        page = page_of(tmp_path / str(broken))
+        assert f"ended early, after {poses} of {FRAMES} frames: rgb/x.png: is truncated" in " ".join(page.words.split())
+        assert ("There are no poses" in page.words) == (poses == 0)
+        assert ("ATE RMSE" in page.words) == (poses >= 3)
+
+
+@pytest.mark.parametrize(
+    ("missing", "said", "images"),
+    [
+        (["dynamics.parquet", "groundtruth.txt"], ["There is no dynamics.parquet", "There is no ground truth"], 3),
+        (["frames.parquet", "config.yaml", "keyframes.txt"], ["There is no config.yaml", "0 keyframes"], 3),
+        (["trajectory.txt", "figures"], ["trajectory.txt is missing", "person 1"], 0),
+    ],
+)
+def test_a_file_that_is_not_there_leaves_a_gap_and_the_rest(
+    copy: Path, missing: list[str], said: list[str], images: int
+) -> None:
+    for name in missing:
+        (shutil.rmtree if (copy / name).is_dir() else os.unlink)(copy / name)
+    page = page_of(copy)
+    assert all(words in page.words for words in [*said, "Who moves", "Mean time of each stage", "Versions"])
+    assert page.images == images
+
+
+@pytest.mark.parametrize(
+    ("moving", "static", "said"),
+    [
+        (0.5, 0.25, "50.0 % of the moving and 25.0 % of the static pixels"),
+        (None, 0.25, "25.0 % of the static pixels"),
+        (0.5, None, "50.0 % of the moving pixels"),
+    ],
+)
+def test_what_the_true_masks_say(copy: Path, moving: float | None, static: float | None, said: str) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics["masks"] = {"moving_left_out": moving, "static_left_out": static}
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    assert f"Against the true masks: {said} were left out of tracking." in page_of(copy).words
+
+
+def test_without_objects(tmp_path: Path) -> None:
+    run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
+    page = page_of(tmp_path)
+    assert "No object was found in any frame" in page.words
+    assert page.images == 1
+
+
+def test_ground_truth_from_elsewhere(copy: Path, tmp_path: Path) -> None:
+    (copy / "groundtruth.txt").rename(tmp_path / "truth.txt")
+    assert read_run(copy).evaluation is None
+    assert "ATE RMSE" in page_of(copy, tmp_path / "truth.txt").words
+
+
+# --- what is wrong is said in a sentence
+
+
+def test_no_results_and_broken_ones_are_a_sentence_each(copy: Path, tmp_path: Path) -> None:
+    write_text(tmp_path / "late.txt", "9000.0 0 0 0 0 0 0 1\n9000.1 0 0 0 0 0 0 1\n")
+    for arguments, words in (
+        ([tmp_path / "nowhere"], "nowhere: holds no results of a run"),
+        ([tmp_path / (300 * "x")], "cannot be used (File name too long); check the path"),
+        ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 poses"),
+    ):
+        done = call_here(*arguments)
+        assert done.exit_code == 2 and done.stdout == ""
+        assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1 and words in done.stderr
+    assert not (copy / "report.html").exists()
+
+
+def without(path: Path, key: str) -> None:
+    metrics = json.loads(path.read_text())
+    del metrics[key]
+    path.write_text(json.dumps(metrics))
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_the_folder_above_runs_names_the_newest(tmp_path: Path) -> None:
+    names = ("demo/2026-01-01", "demo/2026-01-02", "study/desk/full/seed0")
+    for age, name in enumerate(names):
+        write_text(tmp_path / name / "metrics.json", "{}")
+        os.utime(tmp_path / name / "metrics.json", ns=(0, 10**9 * (10 - age)))
+    for above, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
+        with pytest.raises(InputError, match=re.escape(f"; give the newest of the runs in it, {tmp_path / newest}")):
+            read_run(tmp_path / above)
+    (tmp_path / "demo/latest").symlink_to("2026-01-01")
+    with pytest.raises(InputError, match=r"in it, .*latest$"):
+        read_run(tmp_path / "demo")
+
+
+def test_a_file_of_a_run_names_its_folder(copy: Path) -> None:
+    with pytest.raises(InputError, match=re.escape(f"; give the folder that map.ply is in, {copy}")):
+        read_run(copy / "map.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "message"),
+    [
+        ("metrics.json", halve, r"metrics\.json: is no JSON"),
+        ("metrics.json", lambda path: without(path, "status"), r"metrics\.json: status: field required"),
+        ("metrics.json", lambda path: path.write_text("[]"), r"metrics\.json: the whole: input should be"),
+        ("trajectory.txt", lambda path: path.write_text("1 2 3\n"), r"trajectory\.txt: line 1"),
+        ("trajectory.txt", lambda path: path.write_text("1 0 0 0 0 0 0 1\n"), "not of the same run"),
+        ("dynamics.parquet", halve, r"dynamics\.parquet: is no parquet table"),
+        (
+            "frames.parquet",
+            lambda path: pq.write_table(pq.read_table(path).drop(["stamp"]), path),
+            "lacks the columns stamp",
+        ),
+        ("figures/masks.png", halve, r"masks\.png: is truncated"),
+        ("masks/0.100000.png", lambda path: path.write_bytes(b"x"), r"0\.100000\.png: is truncated"),
+    ],
+)
+def test_a_broken_file_is_named(copy: Path, name: str, spoil: Callable[[Path], object], message: str) -> None:
+    spoil(copy / name)
+    with pytest.raises(InputError, match=message):
+        render_page(read_run(copy))
+
+
+def test_a_configuration_of_another_version_is_shown_but_not_compared(copy: Path) -> None:
+    write_text(copy / "config.yaml", "seed: 3\nno_longer_there: true\n")
+    page = page_of(copy)
+    assert "cannot be compared" in page.words and "no_longer_there: true" in page.words
+
+
+def test_other_stamps_in_the_tables_do_no_harm(copy: Path) -> None:
+    """Tables of two runs in one folder: rows are drawn at the times that they say."""
+    table = pq.read_table(copy / "dynamics.parquet")
+    stamps: Tensor = torch.tensor(table.column("stamp").to_pylist(), dtype=torch.float64) + 0.05
+    late = table.set_column(1, "stamp", [stamps.tolist()])
+    assert "person 1" in Page(render_page(replace(read_run(copy), dynamics=late))).words

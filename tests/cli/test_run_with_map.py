@@ -1,0 +1,116 @@
+"""Maps on the command line: ``--mesh``, ``--save-map``, ``--load-map`` and ``--localise`` as a user calls them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import pytest
+import torch
+from helpers.commands import assert_one_sentence, call, files_in
+from helpers.walls import CAMERA, Slide
+
+from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.datasets.tum_writer import TUMWriter
+from v3d_torch.evaluation import evaluate
+from v3d_torch.types import Trajectory
+
+OPTIONS = ("--segmenter", "none", "--set", "features.count=800")
+
+
+def written(folder: Path, slide: Slide) -> Path:
+    with TUMWriter(folder, CAMERA, slide.groundtruth) as writer:
+        for frame in slide:
+            writer.add(frame)
+    return folder
+
+
+def joined(*paths: Path) -> Trajectory:
+    parts = [read_trajectory(path) for path in paths]
+    return Trajectory(torch.cat([part.stamps for part in parts]), torch.cat([part.T_wc for part in parts]))
+
+
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two recordings of a wall; the second goes on from within the first, a minute later."""
+    folder = tmp_path_factory.mktemp("halves")
+    later = Slide(700, 940, step=12)
+    later.stamps += 60
+    assert later.groundtruth is not None
+    later.groundtruth.stamps[:] = later.stamps
+    return written(folder / "first", Slide(600, 800, step=12)), written(folder / "second", later)
+
+
+@pytest.fixture(scope="module")
+def first(halves: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Results and map of the first recording, with a mesh."""
+    out = tmp_path_factory.mktemp("first")
+    room = out / "maps" / "room.map"
+    done = call("--seq", halves[0], *OPTIONS, "--mesh", "--save-map", room, "--out", out / "results", cwd=out)
+    assert done.returncode == 0, done.stderr
+    return out / "results", room
+
+
+def test_the_mesh_and_the_map_are_written(first: tuple[Path, Path]) -> None:
+    results, room = first
+    assert {"map.ply", "mesh.ply", "trajectory.ply"} <= files_in(results)
+    mesh = plyfile.PlyData.read(results / "mesh.ply")
+    assert mesh["face"].count > 1000 and np.abs(np.asarray(mesh["vertex"]["z"]) - 2.0).max() < 0.02
+    assert files_in(room.parent) == {"room.map"}
+    assert "enabled: true" in (results / "config.yaml").read_text().split("mesh:")[1]
+
+
+@pytest.mark.parametrize("localise", [False, True])
+def test_the_second_half_is_tracked_in_the_map_of_the_first(
+    localise: bool, halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path
+) -> None:
+    results, room = first
+    before = room.read_bytes()
+    more = ("--localise",) if localise else ("--save-map", tmp_path / "grown.map")
+    done = call("--seq", halves[1], *OPTIONS, "--load-map", room, *more, "--out", tmp_path / "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert room.read_bytes() == before
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    known = json.loads((results / "metrics.json").read_text())["keyframes"]
+    assert (metrics["tracked"], metrics["known_keyframes"]) == (metrics["frames"], known)
+    assert f"{known} keyframes" in done.stdout
+    keyframes = (tmp_path / "out" / "keyframes.txt").read_text().splitlines()
+    assert len(keyframes) == metrics["keyframes"] and (metrics["keyframes"] == 0) == localise
+    # The trajectory is in the world of the first half: one alignment serves both.
+    estimate = joined(results / "trajectory.txt", tmp_path / "out" / "trajectory.txt")
+    truth = joined(*(folder / "groundtruth.txt" for folder in halves))
+    assert evaluate(truth, estimate, frames=len(estimate)).ate.rmse < 0.02
+    # The coloured map is that of both.
+    extent = [np.ptp(plyfile.PlyData.read(folder / "map.ply")["vertex"]["x"]) for folder in (results, tmp_path / "out")]
+    assert (extent[1] > extent[0] + 0.5) != localise
+
+
+# --- what users get wrong
+
+
+def test_localise_without_a_map(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    assert_one_sentence(call("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_no_map(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "half.map").write_bytes(first[1].read_bytes()[:5000])
+    done = call("--seq", halves[1], *OPTIONS, "--load-map", "half.map", cwd=tmp_path)
+    assert_one_sentence(done, "half.map", "--save-map")
+    assert files_in(tmp_path) == {"half.map"}
+
+
+def test_a_map_of_another_room(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """The results are written all the same: they say that every frame is lost."""
+    other = written(tmp_path / "other", Slide(0, 60, step=12, seed=3))
+    done = call("--seq", other, *OPTIONS, "--load-map", first[1], "--out", tmp_path / "out", cwd=tmp_path)
+    assert_one_sentence(done, str(first[1]), str(tmp_path / "out"))
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["lost"] == 6
+
+
+def test_a_map_that_could_not_be_written_is_told_before_the_run(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    done = call("--seq", halves[0], *OPTIONS, "--save-map", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
+    assert_one_sentence(done, f"{tmp_path}: cannot be written")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,109 @@
+"""The configuration: layers, refusals, round trip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import v3d_torch
+from v3d_torch.config import Config
+from v3d_torch.config.loading import CONFIGS, dump_config, find_config, load_config
+from v3d_torch.errors import ConfigError
+
+
+def test_the_command_line_goes_over_the_file_over_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("seed: 3\nobjects:\n  voting:\n    vote_threshold: 4\n    distance_threshold: 0.1\n")
+    config = load_config(file, ["objects.voting.distance_threshold=0.05"])
+    assert (config.seed, config.objects.voting.vote_threshold) == (3, 4)
+    assert config.objects.voting.distance_threshold == 0.05
+    assert config.objects.clouds == Config().objects.clouds
+
+
+def test_one_value_needs_no_list() -> None:
+    assert load_config("paper", "seed=3") == load_config("paper", ["seed=3"])
+
+
+def test_a_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
+    config = load_config(None, ["objects.voting.baselines=[0.0, 0.5]", "loop.enabled=false"])
+    file = tmp_path / "config.yaml"
+    file.write_text(dump_config(config))
+    assert load_config(file) == config
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("objects.votng.vote_threshold=2", "did you mean objects.voting?"),
+        ("objects.voting.votes=2", "did you mean objects.voting.vote_threshold?"),
+        ("sed=2", "did you mean seed?"),
+        ("seed", "write section.key=value"),
+        ("seed=-1", "greater than or equal to 0"),
+        ("seed=abc", "valid integer"),
+        ("objects=3", "valid dictionary"),
+        ("seed=[", "not valid YAML"),
+        ("segmentation.height=481", "multiple of 32"),
+    ],
+)
+def test_what_is_wrong_is_refused_with_the_cure(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match="--set") as raised:
+        load_config(None, [override])
+    assert message in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("!!python/object/apply:os.system ['true']", "not valid YAML"),
+        ("- 1\n- 2\n", "holds a list"),
+        ("seeed: 1\n", "did you mean seed?"),
+    ],
+)
+def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "bad.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=r"bad\.yaml") as raised:
+        load_config(file)
+    assert message in str(raised.value)
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml: is neither a configuration nor a YAML file"):
+        load_config(tmp_path / "none.yaml")
+
+
+def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
+    file = tmp_path / "empty.yaml"
+    file.write_text("# nothing\n")
+    assert load_config(file) == Config()
+
+
+def test_every_configuration_of_the_package_loads_by_its_name() -> None:
+    assert {"full", "default", "paper", "baseline", "no_voting"} <= set(CONFIGS)
+    for name, file in CONFIGS.items():
+        assert file.is_relative_to(Path(v3d_torch.__file__).parent)  # so that a wheel has it
+        assert find_config(name) == file
+        load_config(file)
+    assert load_config(find_config("full")) == Config()
+    assert load_config(find_config("baseline")).segmentation.source == "none"
+
+
+def test_a_configuration_is_found_by_path_and_an_unknown_one_is_answered_with_the_names(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("seed: 3\n")
+    assert load_config(find_config(mine)).seed == 3
+    with pytest.raises(ConfigError, match=r"papper: is neither.*paper") as raised:
+        find_config("papper")
+    assert "no_voting" in str(raised.value)
+
+
+def test_a_mistake_is_laid_to_whom_it_belongs(tmp_path: Path) -> None:
+    file = tmp_path / "good.yaml"
+    file.write_text("seed: 3\n")
+    for override in ("sed=2", "seed=-1"):
+        with pytest.raises(ConfigError, match=r"^--set"):
+            load_config(file, [override])
+    file.write_text("seed: -1\n")
+    with pytest.raises(ConfigError, match=r"good\.yaml: seed"):
+        load_config(file, ["threads=2"])

@@ -1,0 +1,79 @@
+"""Camera files and presets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from v3d_torch.datasets.cameras import PRESETS, load_camera
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+
+CAMERA_YAML = "fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
+
+
+def test_presets() -> None:
+    assert PRESETS == ("d435i", "tum_fr1", "tum_fr2", "tum_fr3")
+    assert load_camera("tum_fr1") == PinholeCamera(
+        517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    )
+    assert load_camera("tum_fr2") == PinholeCamera(
+        520.9, 521.0, 325.1, 249.7, distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
+    )
+    assert load_camera("tum_fr3") == PinholeCamera(535.4, 539.2, 320.1, 247.6)
+    assert load_camera("d435i").depth_scale == 1000
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        (
+            "camera.yaml",
+            "fx: 1\nfy: 2\ncx: 3\ncy: 4\nwidth: 5\nheight: 6\ndepth_scale: 7\ndistortion: [1, 2, 3, 4, 5]\n",
+        ),
+        ("K.txt", "# fx fy cx cy depth_scale w h\n1 2 3 4 7 5 6\n"),
+        ("K.txt", "\ufeff1 2 3 4\r\n7 5, 6\r\n"),
+        ("K.txt", "1 0 3\n0 2 4\n0 0 1\n"),
+    ],
+)
+def test_camera_files(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    camera = load_camera(tmp_path / name)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1, 2, 3, 4)
+    matrix = len(text.split()) == 9
+    assert (camera.width, camera.height, camera.depth_scale) == ((640, 480, 5000) if matrix else (5, 6, 7))
+    assert camera.distortion == ((1, 2, 3, 4, 5) if name == "camera.yaml" else (0, 0, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("c.yaml", CAMERA_YAML.replace("fx: 30.0\n", ""), "fx: field required"),
+        ("c.yaml", CAMERA_YAML.replace("30.0", "wide"), "fx: .*got 'wide'"),
+        ("c.yaml", CAMERA_YAML.replace("30.0", "-30"), "fx: .*greater than or equal to 1.*got -30"),
+        ("c.yaml", CAMERA_YAML.replace("15.5", ".nan"), "cx: .*finite.*got nan"),
+        ("c.yaml", CAMERA_YAML + "distortion: [1, 2]\n", "distortion.*field required"),
+        ("c.yaml", CAMERA_YAML + "focal: 3\n", "focal: extra"),
+        ("c.yaml", CAMERA_YAML + "1: 3\n", "c.yaml: "),
+        ("c.yaml", "{fx", "not valid YAML"),
+        ("c.yaml", "!!python/object/apply:os.getcwd []", "not valid YAML"),
+        ("c.yaml", "30", "holds no camera"),
+        ("K.txt", "1 2 3", "holds 3 numbers"),
+        ("K.txt", "1 9 3 0 2 4 0 0 1", "3x3 camera matrix without skew"),
+        ("K.txt", "1 2 3 4 5000 640.5 480", "width: .*got 640.5"),
+        ("K.txt", "one two", "not a number"),
+        ("K.txt", "\udcff", "not a text file"),
+    ],
+)
+def test_camera_files_that_are_wrong(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_bytes(text.encode("utf-8", errors="surrogateescape"))
+    with pytest.raises(InputError, match=message) as caught:
+        load_camera(tmp_path / name)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_preset_offers_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean tum_fr3"):
+        load_camera("tum-fr3")

@@ -1,0 +1,354 @@
+"""Folders in TUM layout, everything that can be wrong with them, and where sequences are looked for."""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
+from v3d_torch.datasets.cameras import load_camera
+from v3d_torch.datasets.images import read_colour, read_depth
+from v3d_torch.datasets.names import download_url
+from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
+from v3d_torch.geometry.camera import PinholeCamera
+
+WALKING_XYZ = "rgbd_dataset_freiburg3_walking_xyz"
+WIDTH, HEIGHT = 32, 24
+CAMERA_YAML = f"fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: 1000\n"
+
+
+@pytest.fixture(autouse=True)
+def own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test looks into, or writes to, the user's own data and cache."""
+    monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("V3D_DATA", raising=False)
+
+
+def colour_of(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+def depth_of(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed + 100).integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three pairs of small images; the depth stamps are 5 ms later, and there is one more depth image."""
+    root = tmp_path / "sequence"
+    for name in ("rgb", "depth"):
+        (root / name).mkdir(parents=True)
+    for i in range(3):
+        Image.fromarray(colour_of(i)).save(root / "rgb" / f"{i}.png")
+    for i in range(4):
+        Image.fromarray(depth_of(i)).save(root / "depth" / f"{i}.png")
+    (root / "rgb.txt").write_text("# color images\n" + "".join(f"{10 + i}.0 rgb/{i}.png\n" for i in range(3)))
+    (root / "depth.txt").write_text("# depth maps\n" + "".join(f"{10 + i}.005 depth/{i}.png\n" for i in range(4)))
+    (root / "camera.yaml").write_text(CAMERA_YAML)
+    return root
+
+
+def test_frames(folder: Path) -> None:
+    sequence = load_sequence(str(folder))
+    assert isinstance(sequence, RGBDSequence)
+    assert (sequence.name, len(sequence), sequence.groundtruth) == ("sequence", 3, None)
+    assert sequence.camera == PinholeCamera(30, 31, 15.5, 11.5, WIDTH, HEIGHT, depth_scale=1000)
+    assert sequence.stamps.dtype == torch.float64
+    assert sequence.stamps.tolist() == [10.0, 11.0, 12.0]
+    for i, frame in enumerate(sequence):
+        assert (frame.index, frame.stamp) == (i, 10.0 + i)
+        assert frame.image.dtype == torch.uint8
+        assert np.array_equal(frame.image.permute(1, 2, 0).numpy(), colour_of(i))
+        assert frame.depth.dtype == torch.float32
+        assert frame.depth.shape == (1, HEIGHT, WIDTH)
+        np.testing.assert_allclose(frame.depth[0].numpy(), depth_of(i) / 1000.0, rtol=1e-6)
+
+
+def test_convention_depth_is_metres_and_zero_and_the_most_are_none(folder: Path) -> None:
+    units = np.array([[0, 1, 5000, 65535]], dtype=np.uint16)
+    Image.fromarray(units).save(folder / "depth.png")
+    assert read_depth(folder / "depth.png", 5000).tolist() == [[pytest.approx([0.0, 0.0002, 1.0, 0.0])]]
+
+
+def test_convention_images_are_rgb(folder: Path) -> None:
+    Image.new("RGB", (16, 16), (250, 120, 10)).save(folder / "a.png")
+    Image.new("RGB", (16, 16), (250, 120, 10)).save(folder / "a.jpg", quality=100)
+    assert read_colour(folder / "a.png")[:, 0, 0].tolist() == [250, 120, 10]
+    assert (read_colour(folder / "a.jpg")[:, 8, 8].int() - torch.tensor([250, 120, 10])).abs().max() <= 2
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "RGBA", "LA", "1", "CMYK", "L jpeg"])
+def test_colour_of_every_kind_equals_pillow(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / ("a.jpg" if mode in ("CMYK", "L jpeg") else "a.png")
+    Image.fromarray(colour_of(0)).convert(mode.split()[0]).save(path)
+    assert np.array_equal(read_colour(path).permute(1, 2, 0).numpy(), np.asarray(Image.open(path).convert("RGB")))
+
+
+def test_images_of_a_real_sequence_equal_opencv(v3d_data: Path) -> None:
+    sequence = load_sequence("fr1/rpy", data_root=v3d_data)
+    colour, depth = (sorted((v3d_data / "fr1_rpy" / name).iterdir()) for name in ("rgb", "depth"))
+    frame = sequence[100]
+    assert np.array_equal(frame.image.permute(1, 2, 0).numpy(), cv2.imread(str(colour[100]), cv2.IMREAD_COLOR_RGB))
+    expected = cv2.imread(str(depth[100]), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000
+    assert np.array_equal(frame.depth[0].numpy(), expected)
+
+
+@pytest.mark.parametrize("swapped", [False, True], ids=["colour first", "depth first"])
+def test_associations_in_either_order(folder: Path, swapped: bool) -> None:
+    sides = [[f"{10 + i}.0 rgb/{i}.png", f"{10 + i}.5 depth/{i}.png"] for i in (2, 0)]
+    lines = [" ".join(reversed(pair) if swapped else pair) for pair in sides]
+    (folder / "associations.txt").write_text("\n".join(lines))
+    sequence = load_sequence(str(folder))
+    assert sequence.stamps.tolist() == [10.0, 12.0]
+    assert np.array_equal(sequence[1].image.permute(1, 2, 0).numpy(), colour_of(2))
+
+
+def test_duplicate_and_backward_stamps(folder: Path) -> None:
+    (folder / "rgb.txt").write_text("12 rgb/2.png\n10 rgb/0.png\n10 rgb/1.png\n")
+    sequence = load_sequence(str(folder))
+    assert sequence.stamps.tolist() == [10.0, 12.0]
+    assert np.array_equal(sequence[0].image.permute(1, 2, 0).numpy(), colour_of(0))
+
+
+def test_groundtruth_is_read(folder: Path) -> None:
+    (folder / "groundtruth.txt").write_text("# truth\n10 1 2 3 0 0 0 1\n11 4 5 6 0 0 1 0\n")
+    groundtruth = load_sequence(str(folder)).groundtruth
+    assert groundtruth is not None
+    assert groundtruth.T_wc[:, :3, 3].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_index_behind_the_end(folder: Path) -> None:
+    with pytest.raises(IndexError, match="has 3 frames"):
+        load_sequence(str(folder))[3]
+
+
+def test_frames_have_numbers(folder: Path) -> None:
+    sequence = load_sequence(str(folder))
+    frame = sequence[np.int64(1)]
+    assert (frame.index, type(frame.index)) == (1, int)
+    for wrong in (slice(0, 2), "1", 1.0, None):
+        with pytest.raises(InputError, match=r"by their numbers, and not by .*; take several with itertools\.islice"):
+            sequence[wrong]
+
+
+def test_a_camera_of_another_kind(folder: Path) -> None:
+    for wrong, kind in ((np.eye(3), "ndarray"), ({"fx": 500}, "dict")):
+        with pytest.raises(InputError, match=f"^the camera is a {kind}; give a PinholeCamera, a preset's name or a"):
+            load_sequence(str(folder), camera=wrong)
+
+
+def camera_after(change: Callable[[Path], object], folder: Path, **arguments: str) -> PinholeCamera:
+    change(folder)
+    return tum.TUMSequence(folder, **arguments).camera  # whatever the size of its images
+
+
+def test_camera_comes_from_the_best_source(folder: Path) -> None:
+    own = load_camera(folder / "camera.yaml")
+    assert camera_after(lambda f: (f / "K.txt").write_text("1 2 3 4 5000 640 480"), folder) == own
+    assert camera_after(lambda f: None, folder, camera="tum_fr2") == load_camera("tum_fr2")
+    assert load_sequence(str(folder), camera=own).camera is own
+    assert camera_after(lambda f: (f / "camera.yaml").unlink(), folder).fx == 1
+    (folder / "K.txt").unlink()
+    for name, preset in [("rgbd_dataset_freiburg2_desk", "tum_fr2"), ("my_fr1_copy", "tum_fr1")]:
+        folder = folder.rename(folder.with_name(name))
+        assert tum.TUMSequence(folder).camera == load_camera(preset)
+    with pytest.raises(InputError, match=r"says nothing about its camera.*--camera"):
+        load_sequence(str(folder.rename(folder.with_name("unknown"))))
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def as_jpeg(folder: Path) -> None:
+    Image.fromarray(colour_of(0)).save(folder / "rgb" / "0.jpg")
+    truncate(folder / "rgb" / "0.jpg")
+    (folder / "rgb.txt").write_text("10 rgb/0.jpg\n")
+
+
+def swap_lists(folder: Path) -> None:
+    colour, depth = (folder / "rgb.txt").read_text(), (folder / "depth.txt").read_text()
+    (folder / "rgb.txt").write_text(depth)
+    (folder / "depth.txt").write_text(colour)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda f: (f / "rgb.txt").unlink(), "has no rgb.txt"),
+        (lambda f: (f / "depth.txt").unlink(), "has no depth.txt"),
+        (lambda f: (f / "rgb.txt").write_text("# nothing\n"), "rgb.txt: lists no images"),
+        (lambda f: (f / "associations.txt").write_text(""), "associations.txt: lists no images"),
+        (lambda f: (f / "rgb.txt").write_text("10 rgb/0.png\nnow rgb/1.png"), "line 2 has 'now' where a stamp"),
+        (lambda f: (f / "rgb.txt").write_text("nan rgb/1.png"), "line 1 has 'nan' where a stamp"),
+        (lambda f: (f / "rgb.txt").write_text("rgb/1.png"), "line 1 is 'rgb/1.png' where a stamp and a file"),
+        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe1\x000"), "not a text file"),
+        (lambda f: (f / "associations.txt").write_text("10 rgb/0.png depth/0.png"), "stamp, file, stamp, file"),
+        (lambda f: (f / "depth.txt").write_text("10.5 depth/0.png"), "no stamp in rgb.txt lies within 0.02 s"),
+        (lambda f: (f / "rgb" / "0.png").unlink(), "rgb/0.png: is listed but not there .1 such"),
+        (lambda f: truncate(f / "rgb" / "0.png"), "rgb/0.png: is truncated"),
+        (lambda f: truncate(f / "depth" / "0.png"), "depth/0.png: is truncated"),
+        (lambda f: (f / "depth" / "0.png").write_bytes(b""), "depth/0.png: is (no image|truncated)"),
+        (as_jpeg, "rgb/0.jpg: is truncated"),
+        (
+            lambda f: Image.fromarray(depth_of(0).astype(np.uint8)).save(f / "depth" / "0.png"),
+            "depth/0.png: is 8-bit, a depth image has 16 bits",
+        ),
+        (swap_lists, "depth image where colour belongs; are colour and depth swapped"),
+        (lambda f: Image.fromarray(colour_of(0)).save(f / "depth" / "0.png"), "colour image where depth belongs"),
+        (
+            lambda f: Image.new("RGB", (8, 8)).save(f / "rgb" / "0.png"),
+            "depth/0.png: has 32x24 pixels, its colour image 8x8",
+        ),
+        (lambda f: Image.new("I;16", (9, 8)).save(f / "depth" / "0.png"), "depth/0.png: has 9x8 pixels"),
+    ],
+)
+def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path], object], message: str) -> None:
+    damage(folder)
+    with pytest.raises(InputError, match=message) as caught:
+        load_sequence(str(folder))[0]
+    assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_broken_ground_truth_costs_no_frame(folder: Path) -> None:
+    (folder / "groundtruth.txt").write_text("a b c")
+    with pytest.warns(GroundTruthWarning, match="line 1 is 'a b c'.*no true poses") as told:
+        sequence = load_sequence(str(folder))
+    assert [Path(warning.filename) for warning in told] == [Path(__file__)]  # at the line that asked for it
+    assert len(list(sequence)) == len(sequence) and sequence.groundtruth is None
+    assert isinstance(sequence, tum.TUMSequence)
+    assert str(sequence.groundtruth_error).startswith(f"{folder / 'groundtruth.txt'}: line 1 is 'a b c'")
+
+
+def test_the_folder_around_sequences_is_answered_with_one_of_them(folder: Path) -> None:
+    message = rf"^{folder.parent}: is no sequence itself but holds 1, such as {folder.name}; give {folder}$"
+    with pytest.raises(InputError, match=message):
+        load_sequence(str(folder.parent))
+
+
+def test_a_file_is_no_sequence(folder: Path) -> None:
+    with pytest.raises(InputError, match="is a file"):
+        tum.TUMSequence(folder / "rgb.txt")
+    with pytest.raises(InputError, match="is not there"):
+        tum.TUMSequence(folder / "nowhere")
+
+
+# Where sequences are
+
+
+@pytest.mark.parametrize("called", [WALKING_XYZ, "fr3_walking_xyz", "freiburg3_walking_xyz", "fr3_w_xyz"])
+def test_found_by_name_in_root_environment_and_cache(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, called: str
+) -> None:
+    root = tmp_path / "cache"
+    root.mkdir()
+    folder.rename(root / called)
+    assert load_sequence("fr3/w/xyz").name == "fr3/w/xyz"
+    data = root.rename(tmp_path / "data")
+    assert len(load_sequence("fr3/w/xyz", data_root=data, download=False)) == 3
+    monkeypatch.setenv("V3D_DATA", str(data))
+    assert len(load_sequence("fr3/walking_xyz", download=False)) == 3
+
+
+def test_any_folder_in_the_root_by_its_name(folder: Path) -> None:
+    assert load_sequence("sequence", data_root=folder.parent).name == "sequence"
+
+
+def test_the_demo_is_made_in_the_cache(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Path] = []
+
+    def ensure(cache: Path, progress: object) -> Path:
+        asked.append(cache)
+        return folder
+
+    monkeypatch.setattr("v3d_torch.datasets.demo.ensure_demo", ensure)
+    assert load_sequence("demo").name == "demo"
+    assert asked == [tmp_path / "cache"]
+
+
+def test_unknown_name_offers_the_nearest() -> None:
+    with pytest.raises(InputError, match=r"fr3/w/xzy: is neither .* did you mean fr3/w/xyz or"):
+        load_sequence("fr3/w/xzy")
+
+
+def test_without_network_the_error_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(url: str, *_: object, **__: object) -> None:
+        raise DownloadError(f"{url}: cannot be reached")
+
+    monkeypatch.setattr(locate, "fetch", refuse)
+    with pytest.raises(DownloadError) as caught:
+        load_sequence("fr3/w/xyz", data_root=tmp_path / "data")
+    for part in (
+        "fr3/w/xyz is not in",
+        download_url(WALKING_XYZ),
+        f"the folder {WALKING_XYZ} into {tmp_path / 'data'}",
+    ):
+        assert part in str(caught.value)
+    with pytest.raises(InputError, match=f"get {download_url(WALKING_XYZ)} by hand"):
+        load_sequence("fr3/w/xyz", download=False)
+
+
+@pytest.mark.parametrize("given_root", [True, False], ids=["into data_root", "into the cache"])
+def test_downloads_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given_root: bool) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    monkeypatch.setenv("V3D_DATA", str(shared))
+    fetched: list[str] = []
+
+    def serve(url: str, target: Path, **_: object) -> Path:
+        fetched.append(url)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tarfile.open(target, "w:gz") as tar:
+            tar.add(folder, WALKING_XYZ)
+        return target
+
+    monkeypatch.setattr(locate, "fetch", serve)
+    root = tmp_path / "data" if given_root else tmp_path / "cache"
+    for _ in range(2):
+        sequence = load_sequence("fr3/w/xyz", data_root=root if given_root else None)
+        assert (sequence.name, len(sequence)) == ("fr3/w/xyz", 3)
+    assert fetched == [download_url(WALKING_XYZ)]
+    assert [path.name for path in root.iterdir() if not path.name.startswith(".")] == [WALKING_XYZ]
+    assert list(shared.iterdir()) == []
+
+
+def test_a_broken_archive_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def serve(url: str, target: Path, **_: object) -> Path:
+        target.write_bytes(b"no archive")
+        return target
+
+    monkeypatch.setattr(locate, "fetch", serve)
+    with pytest.raises(InputError, match="not a whole tar archive"):
+        load_sequence("fr3/w/xyz")
+    assert [path.name for path in (tmp_path / "cache").iterdir() if not path.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "poses"),
+    [("fr1_rpy", 694, 2742), ("walkers_desk", 200, 200), ("crowd_rpy", 180, 180), ("walkers_room", 160, 160)],
+)
+def test_real_sequences(v3d_data: Path, name: str, frames: int, poses: int) -> None:
+    sequence = load_sequence(name, data_root=v3d_data)
+    assert len(sequence) == frames
+    assert sequence.groundtruth is not None
+    assert len(sequence.groundtruth) == poses
+    assert bool((sequence.stamps.diff() > 0).all())
+    frame = sequence[frames - 1]
+    assert (frame.image.shape, frame.depth.shape) == ((3, 480, 640), (1, 480, 640))
+    assert 0.3 < float(frame.depth[frame.depth > 0].median()) < 6
+
+
+def test_the_lists_of_fr1_rpy_pair_as_its_associations(v3d_data: Path, tmp_path: Path) -> None:
+    source, copy = v3d_data / "fr1_rpy", tmp_path / "fr1_rpy"
+    copy.mkdir()
+    for name in ("rgb", "depth", "rgb.txt", "depth.txt"):
+        (copy / name).symlink_to(source / name)
+    assert load_sequence(str(copy)).stamps.tolist() == load_sequence(str(source)).stamps.tolist()
+    assert [pair.depth for pair in tum._read_pairs(copy)] == [pair.depth for pair in tum._read_pairs(source)]

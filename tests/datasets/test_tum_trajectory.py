@@ -1,0 +1,185 @@
+"""Trajectory files against evo's reader and writer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from evo.core.trajectory import PoseTrajectory3D
+from evo.tools import file_interface
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3d_torch.datasets.tum_trajectory import read_trajectory, write_trajectory
+from v3d_torch.errors import InputError, OutputError
+from v3d_torch.evaluation import evaluate
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.types import Trajectory
+
+
+def random_trajectory(poses: int, seed: int) -> Trajectory:
+    generator = torch.Generator().manual_seed(seed)
+    xi = torch.randn(poses, 6, dtype=torch.float64, generator=generator)
+    stamps = 1305031098.665862 + 0.033 * torch.arange(poses, dtype=torch.float64)
+    return Trajectory((stamps * 1e6).round() / 1e6, se3_exp(2 * xi))
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "trajectory.txt"
+    path.write_bytes(text.encode())
+    return path
+
+
+def test_convention_camera_to_world_scalar_last(tmp_path: Path) -> None:
+    """A camera at (1, 2, 3), turned by a quarter about world z, sees along its x axis what lies along world y."""
+    trajectory = read_trajectory(write(tmp_path, f"7.5 1 2 3 0 0 {0.5**0.5} {0.5**0.5}\n"))
+    assert trajectory.stamps.tolist() == [7.5]
+    p_w = trajectory.T_wc[0] @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    assert p_w.tolist() == pytest.approx([1, 3, 3, 1])
+    assert trajectory.T_wc.dtype == trajectory.stamps.dtype == torch.float64
+
+
+@given(seed=st.integers(0, 10_000), poses=st.integers(1, 20))
+def test_round_trip(seed: int, poses: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("round") / "trajectory.txt"
+    trajectory = random_trajectory(poses, seed)
+    write_trajectory(path, trajectory)
+    back = read_trajectory(path)
+    assert torch.equal(back.stamps, trajectory.stamps)
+    assert torch.allclose(back.T_wc, trajectory.T_wc, rtol=0, atol=5e-9)
+
+
+def test_evo_reads_what_is_written(tmp_path: Path) -> None:
+    trajectory = random_trajectory(50, seed=1)
+    write_trajectory(tmp_path / "trajectory.txt", trajectory)
+    theirs = file_interface.read_tum_trajectory_file(tmp_path / "trajectory.txt")
+    np.testing.assert_array_equal(theirs.timestamps, trajectory.stamps.numpy())
+    np.testing.assert_allclose(np.stack(theirs.poses_se3), trajectory.T_wc.numpy(), rtol=0, atol=5e-9)
+
+
+def test_what_evo_writes_is_read(tmp_path: Path) -> None:
+    trajectory = random_trajectory(50, seed=2)
+    theirs = PoseTrajectory3D(poses_se3=list(trajectory.T_wc.numpy()), timestamps=trajectory.stamps.numpy())
+    file_interface.write_tum_trajectory_file(tmp_path / "evo.txt", theirs)
+    back = read_trajectory(tmp_path / "evo.txt")
+    assert torch.allclose(back.T_wc, trajectory.T_wc, rtol=0, atol=1e-12)
+
+
+def test_layout_of_a_line(tmp_path: Path) -> None:
+    """Six decimals, then nine; no negative zeros."""
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(1, 1, 1)
+    T_wc[0, 0, 3] = -1e-12
+    write_trajectory(
+        tmp_path / "new" / "trajectory.txt", Trajectory(torch.tensor([0.1234567], dtype=torch.float64), T_wc)
+    )
+    zero = "0.000000000"
+    assert (tmp_path / "new" / "trajectory.txt").read_text() == f"0.123457 {' '.join([zero] * 6)} 1.000000000\n"
+
+
+def test_convention_quaternions_are_written_with_qw_positive(tmp_path: Path) -> None:
+    """q and -q are one rotation: of the two always the same is written."""
+    write_trajectory(tmp_path / "trajectory.txt", random_trajectory(200, seed=3))
+    assert np.loadtxt(tmp_path / "trajectory.txt")[:, 7].min() >= 0
+
+
+def test_comments_blank_lines_and_line_endings(tmp_path: Path) -> None:
+    text = "\ufeff# stamp tx ty tz\r\n\r\n  # more\r\n1.0 1 0 0 0 0 0 2\r\n2.0\t2,0,0,0,0,0,1 \r\n"
+    trajectory = read_trajectory(write(tmp_path, text))
+    assert trajectory.stamps.tolist() == [1.0, 2.0]
+    assert trajectory.T_wc[:, 0, 3].tolist() == [1.0, 2.0]
+    assert torch.equal(trajectory.T_wc[0, :3, :3], torch.eye(3, dtype=torch.float64))  # the quaternion had length 2
+
+
+def test_stamps_come_out_increasing_and_the_first_of_equal_ones_counts(tmp_path: Path) -> None:
+    lines = [f"{stamp} {x} 0 0 0 0 0 1" for stamp, x in ((3, 30), (1, 10), (2, 20), (1, 11), (3, 31))]
+    trajectory = read_trajectory(write(tmp_path, "\n".join(lines)))
+    assert trajectory.stamps.tolist() == [1, 2, 3]
+    assert trajectory.T_wc[:, 0, 3].tolist() == [10, 20, 30]
+
+
+GOOD = "# header\n1 0 0 0 0 0 0 1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no pose"),
+        ("# only a comment\n\n", "no pose"),
+        (GOOD + "2 0 0 0 0 0 0\n", "line 3"),
+        (GOOD + "2 0 0 0 0 0 0 1 9\n", "line 3"),
+        (GOOD + "2 0 0 zero 0 0 0 1\n", "line 3"),
+        (GOOD + "\n2 0 0 nan 0 0 0 1\n", "line 4 has a number that is not finite"),
+        (GOOD + "inf 0 0 0 0 0 0 1\n", "line 3 has a number that is not finite"),
+        (GOOD + "2 0 0 0 0 0 0 0\n3 0 0 0 0 0 0 0\n", "line 3 has a quaternion of zeros"),
+        ("timestamp,tx,ty,tz,qx,qy,qz,qw\n" + GOOD, "line 1"),
+    ],
+)
+def test_wrong_files_are_refused_by_name_and_line(tmp_path: Path, text: str, said: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(InputError) as error:
+        read_trajectory(path)
+    assert str(path) in str(error.value) and said in str(error.value)
+
+
+def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\xff\xfe\x00")
+    for path in (tmp_path / "none.txt", tmp_path, tmp_path / "picture.png"):
+        with pytest.raises(InputError, match=path.name):
+            read_trajectory(path)
+
+
+def test_no_poses_make_an_empty_file(tmp_path: Path) -> None:
+    nothing = Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
+    write_trajectory(tmp_path / "trajectory.txt", nothing)
+    assert (tmp_path / "trajectory.txt").read_bytes() == b""
+
+
+def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+    (tmp_path / "trajectory.txt").mkdir()
+    with pytest.raises(OutputError, match=r"trajectory\.txt"):
+        write_trajectory(tmp_path / "trajectory.txt", random_trajectory(2, seed=0))
+
+
+def test_arrays_and_lists_make_a_trajectory(tmp_path: Path) -> None:
+    expected = random_trajectory(3, 0)
+    stamps, T_wc = expected.stamps.numpy(), expected.T_wc.numpy()
+    write_trajectory(tmp_path / "expected.txt", expected)
+    for made in (
+        Trajectory(stamps, T_wc),
+        Trajectory(stamps.tolist(), list(T_wc)),
+        Trajectory(stamps[::-1][::-1], T_wc[::-1][::-1]),
+    ):
+        write_trajectory(tmp_path / "made.txt", made)
+        assert (tmp_path / "made.txt").read_bytes() == (tmp_path / "expected.txt").read_bytes()
+        assert evaluate(expected, made).ate.rmse < 1e-9
+    single = Trajectory(expected.stamps, expected.T_wc.float())
+    assert single.T_wc.dtype == torch.float64 and evaluate(expected, single).ate.rmse < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("stamps", "T_wc", "message"),
+    [
+        (np.zeros(2), np.zeros((3, 4, 4)), r"T_wc of a trajectory have the shape \(3, 4, 4\); give"),
+        (np.zeros(2), np.zeros((2, 7)), r"T_wc of a trajectory have the shape \(2, 7\); give"),
+        (np.zeros((2, 1)), np.zeros((2, 4, 4)), r"stamps of a trajectory have the shape \(2, 1\); give"),
+        (["then", "now"], np.zeros((2, 4, 4)), "stamps of a trajectory are no numbers"),
+        (None, None, "stamps of a trajectory"),
+    ],
+)
+def test_what_is_no_trajectory_is_said(stamps: object, T_wc: object, message: str) -> None:
+    with pytest.raises(InputError, match=f"^{message}"):
+        Trajectory(stamps, T_wc)
+
+
+def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
+    path, good = tmp_path / "out.txt", random_trajectory(2, 0)
+    with pytest.raises(InputError, match=r"takes a path and a Trajectory, this is a .*Path"):
+        write_trajectory(good, path)
+    for wrong in (torch.nan, torch.inf, 0.0):
+        T_wc = good.T_wc.clone()
+        T_wc[1] *= wrong
+        with pytest.raises(InputError, match=r"out\.txt: pose 1 has no rotation or no finite position"):
+            write_trajectory(path, Trajectory(good.stamps, T_wc))
+    assert not path.exists()

@@ -1,0 +1,324 @@
+"""Masks and ids against truth: numbers against plain loops, properties, true masks from files, a run that is scored."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.base import HasMotionMasks
+from v3d_torch.datasets.tum import TUMSequence
+from v3d_torch.errors import InputError
+from v3d_torch.evaluation.masks import MaskEvaluation, count_changes, covering_ids, people_in_view, tally
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.results import write_results
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import Instances, RGBDFrame
+
+H, W = 9, 11
+VALUES = [0, 0, 0, 1, 2, 7, 254, 255]
+"""Of true masks: much is static, some is nobody's."""
+
+
+def random_truth(seed: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).choice(np.array(VALUES, dtype=np.uint8), (H, W)))
+
+
+def random_mask(seed: int, share: float = 0.5) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).random((H, W)) < share)
+
+
+def everybody(truth: Tensor) -> Tensor:
+    return people_in_view(truth, torch.ones_like(truth, dtype=torch.bool), 1)
+
+
+# --- what is left out
+
+
+@given(st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
+@settings(max_examples=40, deadline=None)
+def test_shares_equal_a_loop_over_pixels(seeds: list[int]) -> None:
+    evaluation = MaskEvaluation()
+    counts = {"moving": [0, 0], "static": [0, 0], "anywhere": [0, 0]}
+    for stamp, seed in enumerate(seeds):
+        truth, left_out, measured = random_truth(seed), random_mask(seed + 1), random_mask(seed + 2, 0.7)
+        evaluation.add(float(stamp), truth, measured.float()[None], left_out, {})
+        for v in range(H):
+            for u in range(W):
+                kinds = []
+                if 0 < truth[v, u] < 255 and measured[v, u]:
+                    kinds = ["moving"]
+                elif truth[v, u] == 0:
+                    kinds = ["anywhere", "static"] if measured[v, u] else ["anywhere"]
+                for kind in kinds:
+                    counts[kind][0] += int(left_out[v, u])
+                    counts[kind][1] += 1
+    scores = evaluation.scores()
+    assert scores is not None and scores.frames == len(seeds)
+    for kind, score in zip(
+        counts, (scores.moving_left_out, scores.static_left_out, scores.static_left_out_anywhere), strict=True
+    ):
+        assert score == (counts[kind][0] / counts[kind][1] if counts[kind][1] else None)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_counts_over_a_batch_are_those_of_its_images(seed: int) -> None:
+    left_out = torch.stack([random_mask(seed + k) for k in range(6)]).reshape(2, 3, H, W)
+    among = torch.stack([random_mask(seed + 6 + k) for k in range(6)]).reshape(2, 3, H, W)
+    batch = tally(left_out, among)
+    assert batch.shape == (2, 3, 2) and batch.dtype == torch.int64
+    for i in range(2):
+        for j in range(3):
+            assert torch.equal(batch[i, j], tally(left_out[i, j], among[i, j]))
+
+
+def test_convention_the_share_is_of_pixels_not_of_frames() -> None:
+    """A frame full of people weighs more than one with a sleeve."""
+    evaluation = MaskEvaluation()
+    depth = torch.ones(1, 10, 10)
+    everywhere, corner = torch.ones(10, 10, dtype=torch.uint8), torch.zeros(10, 10, dtype=torch.uint8)
+    corner[0, 0] = 1
+    evaluation.add(0.0, everywhere, depth, torch.ones(10, 10, dtype=torch.bool), {})
+    evaluation.add(1.0, corner, depth, torch.zeros(10, 10, dtype=torch.bool), {})
+    scores = evaluation.scores()
+    assert scores is not None
+    assert scores.moving_left_out == 100 / 101
+    assert scores.static_left_out == 0.0
+
+
+def test_who_is_only_about_there_is_neither_moving_nor_static() -> None:
+    evaluation = MaskEvaluation()
+    truth = torch.full((10, 10), 255, dtype=torch.uint8)
+    evaluation.add(0.0, truth, torch.ones(1, 10, 10), torch.ones(10, 10, dtype=torch.bool), {})
+    scores = evaluation.scores()
+    assert scores is not None
+    assert scores.moving_left_out is scores.static_left_out is scores.static_left_out_anywhere is None
+    assert scores.people == () and scores.id_changes_per_60_frames is None
+
+
+def test_without_a_true_mask_there_are_no_scores() -> None:
+    assert MaskEvaluation().scores() is None
+
+
+# --- who is in view, and which object covers whom
+
+
+def test_in_view_is_who_has_enough_pixels_with_depth() -> None:
+    truth = torch.zeros(4, 10, dtype=torch.uint8)
+    truth[0], truth[1, :5], truth[2], truth[3] = 3, 4, 5, 255
+    measured = torch.ones(4, 10, dtype=torch.bool)
+    measured[2, :6] = False
+    assert people_in_view(truth, measured, 5).tolist() == [3, 4]
+    assert people_in_view(truth, measured, 4).tolist() == [3, 4, 5]
+    assert people_in_view(truth, measured, 0).tolist() == [3, 4, 5]  # nobody who is not there
+
+
+@given(st.integers(0, 10_000), st.lists(st.integers(1, 40), unique=True, max_size=6))
+@settings(max_examples=80, deadline=None)
+def test_covering_objects_equal_sets_of_pixels(seed: int, ids: list[int]) -> None:
+    truth = random_truth(seed)
+    people = everybody(truth)
+    objects = {}
+    for k, id_ in enumerate(ids):  # each a person's mask with some noise, so that overlaps lie around a half
+        person = int(np.random.default_rng(seed + k).choice(VALUES[3:7]))
+        objects[id_] = (truth == person) ^ random_mask(seed + k, 0.08)
+    expected = []
+    for person in people.tolist():
+        own = {tuple(p) for p in (truth == person).nonzero().tolist()}
+        best, best_overlap = 0, 0.5
+        for id_, mask in objects.items():
+            seen = {tuple(p) for p in mask.nonzero().tolist()}
+            if (overlap := len(own & seen) / len(own | seen)) > best_overlap:
+                best, best_overlap = id_, overlap
+        expected.append(best)
+    assert covering_ids(truth, people, objects).tolist() == expected
+
+
+def test_an_object_over_two_people_is_the_larger_ones() -> None:
+    truth = torch.zeros(10, 10, dtype=torch.uint8)
+    truth[:, :6], truth[:, 6:8] = 1, 2
+    assert covering_ids(truth, everybody(truth), {5: truth > 0}).tolist() == [5, 0]
+    half = truth == 1
+    half[:, :3] = False  # exactly a half is not enough
+    assert covering_ids(truth, everybody(truth), {5: half}).tolist() == [0, 0]
+    half[0, 0] = True
+    assert covering_ids(truth, everybody(truth), {5: half}).tolist() == [5, 0]
+
+
+# --- changes of ids
+
+STAYS = st.lists(st.tuples(st.sampled_from([0.1, 0.4, 0.7]), st.integers(0, 3)), max_size=25)
+"""Seconds since the frame before, and the id."""
+
+
+def as_tensors(stays: list[tuple[float, int]]) -> tuple[Tensor, Tensor]:
+    stamps = torch.tensor([gap for gap, _ in stays], dtype=torch.float64).cumsum(0)
+    return stamps, torch.tensor([id_ for _, id_ in stays], dtype=torch.int64)
+
+
+@given(STAYS)
+@settings(max_examples=200, deadline=None)
+def test_changes_equal_a_loop_over_frames(stays: list[tuple[float, int]]) -> None:
+    last, changes = 0, 0
+    for gap, id_ in stays:
+        if gap > 0.5:
+            last = 0
+        if id_:
+            changes += last not in (0, id_)
+            last = id_
+    assert count_changes(*as_tensors(stays), absence=0.5) == changes
+
+
+@given(STAYS)
+@settings(max_examples=50, deadline=None)
+def test_names_of_ids_do_not_matter_nor_does_a_longer_memory_forgive(stays: list[tuple[float, int]]) -> None:
+    stamps, ids = as_tensors(stays)
+    renamed = torch.tensor([0, 17, 4, 9])[ids]
+    changes = count_changes(stamps, ids, absence=0.5)
+    assert count_changes(stamps, renamed, absence=0.5) == changes
+    assert count_changes(stamps, ids, absence=10.0) >= changes >= count_changes(stamps, ids, absence=0.05) == 0
+
+
+def person_at(column: int, value: int = 1) -> Tensor:
+    truth = torch.zeros(48, 64, dtype=torch.uint8)
+    truth[:, column : column + 10] = value
+    return truth
+
+
+def test_a_story_of_two_people() -> None:
+    """One keeps an id but for a slip, is missed for a while and has another one then; the other leaves for long."""
+    evaluation = MaskEvaluation()
+    depth, nothing = torch.ones(1, 48, 64), torch.zeros(48, 64, dtype=torch.bool)
+    first = [3, 3, 8, 3, 0, 0, 9, 9]  # 3 changes: to 8, back, and to 9 over the gap
+    second = [5, 5, None, None, None, None, None, 6]  # 0.6 s out of view: 6 may be somebody else
+    for frame, (a, b) in enumerate(zip(first, second, strict=True)):
+        truth = person_at(2) + (person_at(40, 2) if b is not None else 0)
+        objects = {id_: mask for id_, mask in ((a, person_at(2) > 0), (b, person_at(41) > 0)) if id_}
+        evaluation.add(frame / 10, truth, depth, nothing, objects)
+    scores = evaluation.scores()
+    assert scores is not None
+    assert [(p.id, p.in_view, p.found, p.id_changes) for p in scores.people] == [(1, 8, 6, 3), (2, 3, 3, 0)]
+    assert scores.id_changes_per_60_frames == pytest.approx(60 * 3 / 11)
+    assert scores.people_found == 9 / 11
+    assert json.loads(json.dumps(scores.to_dict()))["people"][0]["id_changes"] == 3
+
+
+def test_a_sliver_is_not_in_view() -> None:
+    """0.3 % of 48 x 64 pixels are 9, and they need depth."""
+    for pixels, without_depth, in_view in ((8, 0, []), (9, 0, [7]), (9, 1, [])):
+        truth, depth = torch.zeros(48, 64, dtype=torch.uint8), torch.ones(1, 48, 64)
+        truth[0, :pixels] = 7
+        depth[0, 0, :without_depth] = 0
+        evaluation = MaskEvaluation()
+        evaluation.add(0.0, truth, depth, truth > 0, {})
+        scores = evaluation.scores()
+        assert scores is not None
+        assert [person.id for person in scores.people] == in_view
+
+
+# --- true masks from files
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Five frames of a noisy wall that a camera slides along, their depth 4 ms after the colour."""
+    root = tmp_path / "wall"
+    noise = np.random.default_rng(0).integers(0, 256, (60, 120, 3), dtype=np.uint8)
+    wall = cv2.resize(noise, (480, 240), interpolation=cv2.INTER_CUBIC)
+    lines = []
+    for k in range(5):
+        colour, depth = f"{1 + k / 10:.6f}", f"{1.004 + k / 10:.6f}"
+        write_png(root / "rgb" / f"{colour}.png", wall[:, 4 * k : 4 * k + 320])
+        write_png(root / "depth" / f"{depth}.png", np.full((240, 320), 10_000, np.uint16))
+        mask = np.zeros((240, 320), np.uint8)
+        mask[90:150, 130:190] = 7 + k
+        write_png(root / "masks" / f"{depth}.png", mask)
+        lines.append(f"{colour} rgb/{colour}.png {depth} depth/{depth}.png")
+    (root / "associations.txt").write_text("\n".join(lines) + "\n")
+    (root / "camera.yaml").write_text(
+        "width: 320\nheight: 240\nfx: 260.0\nfy: 260.0\ncx: 159.5\ncy: 119.5\ndepth_scale: 5000\n"
+    )
+    return root
+
+
+def test_convention_true_masks_are_named_by_the_depth(folder: Path) -> None:
+    sequence = TUMSequence(folder)
+    assert isinstance(sequence, HasMotionMasks)
+    for index in range(5):
+        truth = sequence.motion_mask(index)
+        assert truth is not None
+        assert truth.dtype == torch.uint8 and truth.shape == (240, 320)
+        assert truth.unique().tolist() == [0, 7 + index] and int((truth > 0).sum()) == 60 * 60
+
+
+def test_a_frame_may_have_none(folder: Path) -> None:
+    (folder / "masks" / "1.204000.png").unlink()
+    sequence = TUMSequence(folder)
+    assert [sequence.motion_mask(index) is None for index in range(5)] == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize("case", ["colour", "16 bit", "truncated", "size"])
+def test_a_true_mask_that_is_none_is_named(case: str, folder: Path) -> None:
+    path = folder / "masks" / "1.004000.png"
+    images = {"colour": np.zeros((240, 320, 3), np.uint8), "16 bit": np.zeros((240, 320), np.uint16)}
+    if case == "truncated":
+        path.write_bytes(path.read_bytes()[:100])
+    else:
+        write_png(path, images.get(case, np.zeros((100, 100), np.uint8)))
+    with pytest.raises(InputError, match=r"masks/1\.004000\.png: (is truncated or not 8-bit|has 100x100)"):
+        TUMSequence(folder).motion_mask(0)
+
+
+# --- what a run makes of it
+
+
+def square(frame: RGBDFrame) -> Instances:
+    """The person, three columns too far left."""
+    mask = torch.zeros(1, 240, 320, dtype=torch.bool)
+    mask[:, 90:150, 127:187] = True
+    return Instances(mask, torch.zeros(1, dtype=torch.int64), torch.ones(1), torch.tensor([[127.0, 90, 187, 150]]))
+
+
+def run(folder: Path, out: Path) -> dict[str, object]:
+    """Metrics of a run over the wall, in which the network finds the square."""
+    sequence = TUMSequence(folder)
+    exact = [f"objects.static_mask.{growth}=0" for growth in ("depth_margin", "surface_margin", "dilation")]
+    config = load_config(overrides=[*exact, "objects.clouds.stride=1"])
+    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, square, config), out / "masks")
+    pipeline()
+    write_results(out, pipeline)
+    return json.loads((out / "metrics.json").read_text())
+
+
+def test_a_run_is_scored_and_does_not_see_the_truth(folder: Path, tmp_path: Path) -> None:
+    for path in (folder / "masks").iterdir():  # the same person all the time
+        write_png(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED).clip(0, 1))
+    metrics = run(folder, tmp_path / "known")
+    assert metrics["failure"] is None
+    masks = metrics["masks"]
+    assert isinstance(masks, dict)
+    assert masks["frames"] == 5
+    assert masks["moving_left_out"] == 57 / 60
+    assert masks["static_left_out"] == masks["static_left_out_anywhere"] == 3 * 60 / (240 * 320 - 60 * 60)
+    assert masks["id_changes_per_60_frames"] == 0.0 and masks["people_found"] == 1.0
+    assert masks["people"] == [{"id": 1, "in_view": 5, "found": 5, "id_changes": 0}]
+
+    shutil.rmtree(folder / "masks")
+    assert run(folder, tmp_path / "unknown")["masks"] is None
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply", "dynamics.parquet", "masks/1.000000.png"):
+        assert (tmp_path / "known" / name).read_bytes() == (tmp_path / "unknown" / name).read_bytes(), name

@@ -1,0 +1,114 @@
+"""The pinhole camera against OpenCV, and the conventions that everything else rests on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import BackProjector, PinholeCamera
+
+FR1 = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+FR3 = PinholeCamera(535.4, 539.2, 320.1, 247.6)
+
+
+def test_convention_axes() -> None:
+    """A point to the right and below the optical axis has larger u and v: x right, y down, z forward."""
+    centre = FR3.project(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
+    assert centre.tolist() == pytest.approx([320.1, 247.6])
+    u, v = FR3.project(torch.tensor([0.5, 0.25, 2.0], dtype=torch.float64)).tolist()
+    assert (u, v) == pytest.approx((320.1 + 535.4 * 0.25, 247.6 + 539.2 * 0.125))
+
+
+def test_convention_pixel_centres_are_integers() -> None:
+    """The ray of pixel (row 10, column 20) passes through (u, v) = (20, 10)."""
+    assert FR3.project(FR3.rays[10, 20].double()).tolist() == pytest.approx([20.0, 10.0], abs=1e-3)
+
+
+@given(u=st.floats(0, 639), v=st.floats(0, 479), z=st.floats(0.1, 10))
+def test_lift_and_project_are_inverse(u: float, v: float, z: float) -> None:
+    uv = torch.tensor([u, v], dtype=torch.float64)
+    assert torch.allclose(FR3.project(FR3.back_project(uv, torch.tensor(z, dtype=torch.float64))), uv, atol=1e-9)
+
+
+def test_undistortion_inverts_opencvs_distortion() -> None:
+    """Ideal pixels, bent by OpenCV's lens model, come back, to 1e-5 pixels over the whole of fr1's strong lens."""
+    v, u = np.mgrid[20:460:20.0, 20:620:20.0]
+    ideal = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays = np.concatenate([(ideal - [FR1.cx, FR1.cy]) / [FR1.fx, FR1.fy], np.ones((len(ideal), 1))], axis=1)
+    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
+    assert np.abs(FR1.undistort(torch.from_numpy(bent)).numpy() - ideal).max() < 1e-5
+
+
+def test_distortion_is_opencvs() -> None:
+    ideal = torch.rand(200, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 480
+    rays = FR1.back_project(ideal, torch.ones(200, dtype=torch.float64)).numpy()
+    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
+    torch.testing.assert_close(FR1.distort(ideal), torch.from_numpy(bent), rtol=0, atol=1e-9)
+
+
+def test_undistortion_of_nothing_is_nothing() -> None:
+    assert FR1.undistort(torch.zeros(0, 2)).shape == (0, 2)
+
+
+def test_distort_inverts_undistort() -> None:
+    uv = torch.rand(500, 2, dtype=torch.float64) * torch.tensor([600.0, 440.0]) + 20
+    assert torch.allclose(FR1.distort(FR1.undistort(uv)), uv, atol=1e-5)
+
+
+@pytest.mark.parametrize("camera", [FR1, FR3])
+def test_back_projection_agrees_with_the_formula(camera: PinholeCamera) -> None:
+    depth = torch.rand(2, 1, 480, 640) * 4
+    depth[:, :, 100:200, 100:200] = 0
+    points = BackProjector(camera)(depth)
+    assert points.shape == (2, 480, 640, 3)
+    assert (points[:, 100:200, 100:200] == 0).all()
+    pixel = camera.undistort(torch.tensor([[400.0, 300.0]]))
+    expected = camera.back_project(pixel[0], depth[1, 0, 300, 400].double())
+    assert torch.allclose(points[1, 300, 400].double(), expected, atol=1e-5)
+
+
+def test_back_projection_has_gradients() -> None:
+    camera = PinholeCamera(5.0, 5.0, 3.5, 2.5, width=8, height=6)
+    depth = (torch.rand(1, 1, 6, 8, dtype=torch.float64) + 0.5).requires_grad_()
+    assert torch.autograd.gradcheck(BackProjector(camera), (depth,))
+
+
+def test_numbers_of_any_kind_make_a_camera() -> None:
+    K = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
+    lens = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera gives it
+    camera = PinholeCamera(K[0, 0], torch.tensor(516.5).double(), K[0, 2], K[1, 2], np.int64(640), 480.0, lens)
+    assert camera == FR1 and hash(camera) == hash(FR1) and torch.equal(camera.rays, FR1.rays)
+    rolling = replace(camera, readout=np.float32(0.03125))
+    assert camera.readout is None and rolling.readout == 0.03125
+    assert all(type(value) in (int, float, tuple) for value in astuple(rolling))
+    assert PinholeCamera(535.4, 539.2, 320.1, 247.6, distortion=(0.1, 0.2, 0, 0)).distortion == (0.1, 0.2, 0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": 0}, "fx is 0; give a finite number above 0"),
+        ({"fy": -480.0}, "fy is -480.0; give a finite number above 0"),
+        ({"fx": np.eye(3)}, "fx is array"),
+        ({"cx": math.nan}, "cx is nan; give a finite number$"),
+        ({"cy": None}, "cy is None; give"),
+        ({"width": 0}, "width is 0; give"),
+        ({"height": 479.5}, "height is 479.5; give whole pixels"),
+        ({"depth_scale": 0}, "depth_scale is 0; give"),
+        ({"distortion": "barrel"}, "distortion is 'barrel'; give the numbers k1, k2, p1, p2, k3"),
+        ({"distortion": None}, "distortion is None; give"),
+        ({"readout": 33.0}, r"readout is 33.0; give seconds, at most 0.05"),
+        ({"readout": "rolling"}, "readout is 'rolling'; give seconds"),
+    ],
+)
+def test_what_is_no_camera_is_said(change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=f"^the camera's {message}"):
+        PinholeCamera(**{"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0} | change)

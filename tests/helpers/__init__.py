@@ -1,0 +1,1 @@
+"""Scenes, sequences and inputs that several test files share."""

@@ -1,0 +1,30 @@
+"""Sequences and jobs for the tests of batches."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from v3d_torch.batch.job import Job
+from v3d_torch.batch.plan import plan, read_configs
+from v3d_torch.datasets import load_sequence
+
+
+def repeated(moment: Path, folder: Path, frames: int) -> Path:
+    """The moment over and over again, for as many frames as wanted; without ground truth."""
+    folder.mkdir(exist_ok=True)
+    for name in ("rgb", "depth", "camera.yaml"):
+        if not (folder / name).exists():
+            (folder / name).symlink_to(moment / name)
+    pairs = [line.split() for line in (moment / "associations.txt").read_text().splitlines()]
+    back_and_forth = [*pairs, *reversed(pairs)]
+    rows = [(k / 30, *back_and_forth[k % len(back_and_forth)]) for k in range(frames)]
+    lines = [f"{stamp:.6f} {colour} {stamp:.6f} {depth}" for stamp, _, colour, _, depth in rows]
+    (folder / "associations.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def jobs(sequence: Path, out: Path, seeds: int) -> list[Job]:
+    """Runs of a sequence without masks."""
+    opened = load_sequence(str(sequence))
+    configs = read_configs(["baseline"], one_thread=True)
+    return plan({opened.name: (str(sequence), opened)}, configs, seeds=seeds, data_root=None, folder=out)

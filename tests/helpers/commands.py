@@ -1,0 +1,38 @@
+"""Commands as a user calls them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from typer.testing import Result
+
+
+def command(*arguments: str | Path) -> list[str]:
+    # One thread: two of them spin for each other where cores are shared, and the results are the same (tested below).
+    return [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"]
+
+
+def environment(**changes: str) -> dict[str, str]:
+    own = {key: value for key, value in os.environ.items() if key != "V3D_DATA"}
+    return own | {"COLUMNS": "120", "NO_COLOR": "1"} | changes
+
+
+def call(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(  # noqa: S603
+        command(*arguments), cwd=cwd, env=environment(**variables), capture_output=True, text=True, timeout=500
+    )
+
+
+def assert_one_sentence(done: subprocess.CompletedProcess[str] | Result, *words: str) -> None:
+    assert (done.exit_code if isinstance(done, Result) else done.returncode) == 2, done.stderr
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    for word in words:
+        assert word in done.stderr
+
+
+def files_in(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}

@@ -1,0 +1,14 @@
+"""``python -m corpus`` in ``tests``: how many cases there are, and how they end, as a table for the README."""
+
+from __future__ import annotations
+
+from helpers.corpus import CATEGORIES
+from helpers.corpus.case import Right, Says
+
+print("| | cases | right result | one sentence | with what was computed |")
+print("|---|---:|---:|---:|---:|")
+rows = [(name, [case.ends for case in cases]) for name, cases in CATEGORIES.items()]
+for name, ends in [*rows, ("all", [end for _, each in rows for end in each])]:
+    right = sum(isinstance(end, Right) for end in ends)
+    kept = sum(isinstance(end, Says) and end.kept is not None for end in ends)
+    print(f"| {name} | {len(ends)} | {right} | {len(ends) - right} | {kept} |")

@@ -1,0 +1,127 @@
+"""What is given as ``--seq``."""
+
+from __future__ import annotations
+
+from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, options, seq
+from helpers.corpus.recordings import noise
+
+
+def folder(name: str | bytes, *files: str) -> Make:
+    """Another folder with these files of text, given as the sequence."""
+
+    def make(place: Place) -> None:
+        path = place.root / name
+        path.mkdir()
+        for file in files:
+            (path / file).write_text("text")
+        place.seq = str(path)
+
+    return make
+
+
+def called(name: str) -> Make:
+    """The sequence's folder under another name."""
+
+    def make(place: Place) -> None:
+        place.seq = str(place.folder.rename(place.root / name))
+
+    return make
+
+
+def loop(place: Place) -> None:
+    (place.root / "loop").symlink_to("loop")
+
+
+CASES = [
+    Case("a folder with a line break in its name", called("two\nlines"), Right()),
+    Case("a folder with what rich and matplotlib obey in its name", called("[red] $x^{$"), Right()),
+    Case("a folder whose name is no UTF-8", called("caf\udce9"), Right()),
+    Case("nothing", seq(""), Says("the name of the sequence is empty; give a name, a folder or a file")),
+    Case(
+        "an empty folder",
+        folder("none"),
+        Says(
+            "{root}/none: is no sequence of a known kind; the README lists them, the simplest is a folder"
+            " with a folder rgb of colour and a folder depth of depth images"
+        ),
+    ),
+    Case(
+        "a folder of texts",
+        folder("none", "a.txt", "b.txt"),
+        Says(
+            "{root}/none: is no sequence of a known kind; the README lists them, the simplest is a folder"
+            " with a folder rgb of colour and a folder depth of depth images"
+        ),
+    ),
+    Case(
+        "a text file",
+        seq("{seq}/rgb.txt"),
+        Says(
+            "{seq}/rgb.txt: is no sequence of a known kind; the README lists them, the simplest is a folder"
+            " with a folder rgb of colour and a folder depth of depth images"
+        ),
+    ),
+    Case(
+        "an image",
+        seq("{seq}/rgb/1305031102.000000.png"),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: is no sequence of a known kind; the README lists them, the"
+            " simplest is a folder with a folder rgb of colour and a folder depth of depth images"
+        ),
+    ),
+    Case(
+        "an archive",
+        noise("rgbd_dataset_freiburg3_walking_xyz.tgz"),
+        Says("{root}/rgbd_dataset_freiburg3_walking_xyz.tgz: is an archive; unpack it and give the folder"),
+    ),
+    Case(
+        "a recording of ScanNet's",
+        noise("scene0000_00.sens"),
+        Says(
+            "{root}/scene0000_00.sens: is a recording of ScanNet's; export it with ScanNet's SensReader and"
+            " give that folder"
+        ),
+    ),
+    Case(
+        "a loop of links",
+        all_of(loop, seq("{root}/loop")),
+        Says("{root}/loop: is neither a file, a folder nor the name of a sequence; did you mean demo or fr3/w/xyz?"),
+    ),
+    Case(
+        "a name that is nearly right",
+        seq("fr3/w/xzy"),
+        Says(
+            "fr3/w/xzy: is neither a file, a folder nor the name of a sequence; did you mean fr3/w/xyz or"
+            " fr3/w/rpy or fr3/s/xyz?"
+        ),
+    ),
+    Case(
+        "a path that is not there",
+        seq("{root}/none"),
+        Says("{root}/none: is neither a file, a folder nor the name of a sequence; did you mean demo or fr3/w/xyz?"),
+    ),
+    Case(
+        "a path of 5000 letters",
+        seq(5000 * "x"),
+        Says("...: cannot be read (File name too long); check its name and who may read it"),
+    ),
+    Case(
+        "the home of nobody",
+        seq("~nobody-of-this-name/take"),
+        Says(
+            "~nobody-of-this-name/take: is neither a file, a folder nor the name of a sequence; did you"
+            " mean demo or fr3/w/xyz?"
+        ),
+    ),
+    Case("a camera that is not plugged in", seq("realsense:"), Says("realsense: ...")),
+    Case(
+        "--rgb-topic for a folder",
+        options("--rgb-topic", "/rgb"),
+        Says("{seq}: is a folder in TUM layout, --rgb-topic means nothing to it; leave it out"),
+    ),
+    Case(
+        "--fps for a folder with lists",
+        options("--fps", "30"),
+        Says("{seq}: is a folder in TUM layout, --fps means nothing to it; leave it out"),
+    ),
+]

@@ -1,0 +1,257 @@
+"""Where results are written, and what may happen there."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from unittest.mock import patch
+
+from helpers.corpus.base import STAMPS
+from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, options, write
+from helpers.corpus.privileges import without_root_rights
+from v3d_torch.datasets.tum import TUMSequence
+
+
+@contextmanager
+def no_file_larger_than(size: int) -> Iterator[None]:
+    """What a disk does that is nearly full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextmanager
+def at_frame(index: int, happens: Callable[[], object]) -> Iterator[None]:
+    """Something happens just before a frame is read."""
+    read = TUMSequence.__getitem__
+
+    def reading(self: TUMSequence, i: int) -> object:
+        if i == index:
+            happens()
+        return read(self, i)
+
+    with patch.object(TUMSequence, "__getitem__", reading):
+        yield
+
+
+@contextmanager
+def full_from_frame(index: int) -> Iterator[None]:
+    """A disk on which there is room until this frame."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with no_file_larger_than(soft), at_frame(index, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20, hard))):
+        yield
+
+
+def broke() -> None:
+    raise ZeroDivisionError("an error of the program")
+
+
+def out_is_a_file(place: Place) -> None:
+    place.out.write_text("")
+
+
+def out_below_a_file(place: Place) -> None:
+    (place.root / "file").write_text("")
+    place.options += ["--out", str(place.root / "file" / "out")]
+
+
+def closed(path_of: Callable[[Place], Path]) -> Make:
+    def make(place: Place) -> None:
+        path = path_of(place)
+        path.mkdir(parents=True, exist_ok=True)
+        path.chmod(0o500)
+
+    return make
+
+
+def results_of_an_earlier_run(place: Place) -> None:
+    """With masks of other times and a file of the user's own."""
+    (place.out / "masks").mkdir(parents=True)
+    for name in ("trajectory.txt", "run.log", "masks/1.000000.png", "notes.txt"):
+        (place.out / name).write_text("of an earlier run")
+
+
+def same_as_the_sequence(place: Place) -> None:
+    place.options += ["--out", str(place.folder)]
+
+
+def unreadable(file: str) -> Make:
+    def make(place: Place) -> None:
+        (place.folder / file).chmod(0)
+
+    return make
+
+
+SAVE = options("--save-masks")
+SERIAL = options("--serial")
+"""A frame is read when the one before is done with, so that what happens then happens at the same place each time."""
+
+CASES = [
+    Case("a file", out_is_a_file, Says("{out}: cannot be made (File exists); choose another folder with --out")),
+    Case(
+        "below a file",
+        out_below_a_file,
+        Says("{root}/file/out: cannot be made (Not a directory); choose another folder with --out"),
+    ),
+    Case(
+        "a loop of links",
+        lambda place: place.out.symlink_to(place.out),
+        Says("{out}: cannot be made (File exists); choose another folder with --out"),
+    ),
+    Case(
+        "a name of 5000 letters",
+        options("--out", "{root}/" + 5000 * "x"),
+        Says("{root}/...: cannot be made (File name too long); choose another folder with --out"),
+    ),
+    Case(
+        "the folder of the sequence",
+        same_as_the_sequence,
+        Says("{seq}/groundtruth.txt: is there and was left by no run; choose another folder with --out"),
+    ),
+    Case(
+        "a folder with a map of somebody else's",
+        write("../out/map.ply", "of somebody else"),
+        Says("{out}/map.ply: is there and was left by no run; choose another folder with --out"),
+    ),
+    Case("a folder with something else", write("../out/thesis.tex", ""), Right()),
+    Case(
+        "masks that are read from where they would be written",
+        all_of(write("../out/masks/1.png", ""), options("--segmenter", "masks", "--masks", "{out}/masks")),
+        Says("{out}/masks: would be written to while it is read; choose another folder with --out"),
+    ),
+    Case("an empty folder", lambda place: place.out.mkdir(), Right()),
+    Case("results of an earlier run", all_of(results_of_an_earlier_run, SAVE), Right()),
+    Case(
+        "a folder that may not be written",
+        closed(lambda place: place.out),
+        Says("{out}/run.log: cannot be written (Permission denied); choose another folder with --out"),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "in a folder that may not be written",
+        all_of(closed(lambda place: place.root / "closed"), options("--out", "{root}/closed/out")),
+        Says("{root}/closed/out: cannot be made (Permission denied); choose another folder with --out"),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "the disk is full from the start",
+        lambda place: None,
+        Says("{out}/config.yaml: cannot be written (File too large); free the disk or choose another folder"),
+        lambda place: no_file_larger_than(0),
+    ),
+    Case(
+        "the disk becomes full",
+        lambda place: None,
+        Says("{out}/...: cannot be written (File too large); free the disk or choose another folder", kept=8),
+        lambda place: no_file_larger_than(9000),
+    ),
+    Case(
+        "the disk becomes full while masks are saved",
+        all_of(SAVE, SERIAL),
+        Says("{out}/trajectory.txt: cannot be written (File too large); free the disk or choose another folder"),
+        lambda place: full_from_frame(3),
+    ),
+    Case(
+        "the folder is removed during the run",
+        all_of(SAVE, SERIAL),
+        Right(),
+        lambda place: at_frame(4, lambda: shutil.rmtree(place.out)),
+    ),
+    Case(
+        "the folder becomes a file during the run",
+        all_of(SAVE, SERIAL),
+        Says("{out}/trajectory.txt: cannot be written (File exists); free the disk or choose another folder"),
+        lambda place: at_frame(4, lambda: (shutil.rmtree(place.out), place.out.write_text(""))),
+    ),
+    Case(
+        "the sequence is removed during the run",
+        lambda place: None,
+        Says(
+            "{seq}/rgb/1305031102.400000.png: is listed but not there; copy the sequence again, whole (the"
+            " results of the 4 frames before are in {out}; go on with --resume {out})",
+            kept=4,
+        ),
+        lambda place: at_frame(4, lambda: shutil.rmtree(place.folder)),
+    ),
+    Case(
+        "the program fails at a frame",
+        lambda place: None,
+        Says(
+            "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
+            " (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            kept=4,
+        ),
+        lambda place: at_frame(4, broke),
+    ),
+    Case(
+        "Ctrl-C",
+        SERIAL,
+        Says(
+            "interrupted after 5 of 8 frames (the results of the 5 frames before are in {out}; go on with --resume"
+            " {out})",
+            kept=5,
+        ),
+        lambda place: at_frame(4, lambda: os.kill(os.getpid(), signal.SIGINT)),
+    ),
+    Case(
+        "a list that may not be read",
+        unreadable("rgb.txt"),
+        Says("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and who may read it"),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "an image that may not be read",
+        unreadable(f"rgb/{STAMPS[4]}.png"),
+        Says(
+            "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check who may read it"
+            " (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            kept=4,
+        ),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "a folder of images that may not be read",
+        unreadable("rgb"),
+        Says("{seq}/rgb/1305031102.000000.png: cannot be read (Permission denied); check its name and who may read it"),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "a sequence that may not be read",
+        unreadable("."),
+        Says("{seq}/metadata.yaml: cannot be read (Permission denied); check its name and who may read it"),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "a camera that may not be read",
+        unreadable("camera.yaml"),
+        Says("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and who may read it"),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "a ground truth that may not be read",
+        unreadable("groundtruth.txt"),
+        Says(
+            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and who may"
+            " read it (the results are in {out})",
+            kept=8,
+        ),
+        lambda place: without_root_rights(),
+    ),
+    Case(
+        "true masks of another size",
+        write(f"masks/{STAMPS[3]}.png", b"\x89PNG\r\n\x1a\n"),
+        Says(
+            "{seq}/masks/1305031102.300000.png: is no image, or none of PNG, JPEG or TIFF; copy or export"
+            " it again (the results are in {out})",
+            kept=8,
+        ),
+    ),
+]

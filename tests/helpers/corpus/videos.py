@@ -1,0 +1,132 @@
+"""Pairs of videos."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from helpers.corpus.base import CAMERA, FRAMES, NOISE, colour, depth, way
+from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, half, options
+
+
+def save(path: Path, images: list[NDArray[np.generic]]) -> None:
+    """Without loss, at 10 frames a second, in 16 bits where the images have so many."""
+    first = images[0]
+    bits = cv2.CV_16U if first.dtype == np.uint16 else cv2.CV_8U
+    kind = [cv2.VIDEOWRITER_PROP_DEPTH, bits, cv2.VIDEOWRITER_PROP_IS_COLOR, int(first.ndim == 3)]
+    size = (first.shape[1], first.shape[0])
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size, kind)
+    for image in images:
+        writer.write(image)
+    writer.release()
+
+
+def videos(place: Place) -> None:
+    """The sequence as a pair of videos."""
+    folder = place.root / "take"
+    folder.mkdir()
+    (folder / "camera.yaml").write_text(CAMERA)
+    save(folder / "colour.mkv", [colour(*way(i)) for i in range(FRAMES)])
+    save(folder / "depth.mkv", [depth() for _ in range(FRAMES)])
+    place.seq = str(folder)
+
+
+def changed(file: str, change: Callable[[bytes], bytes]) -> Make:
+    def make(place: Place) -> None:
+        videos(place)
+        path = place.root / "take" / file
+        path.write_bytes(change(path.read_bytes()))
+
+    return make
+
+
+def with_video(file: str, image: NDArray[np.generic]) -> Make:
+    return all_of(videos, lambda place: save(place.root / "take" / file, FRAMES * [image]))
+
+
+CASES = [
+    Case("colour and depth", videos, Right(ate=None)),
+    Case(
+        "colour breaks off",
+        changed("colour.mkv", half),
+        Says(
+            "{root}/take/colour.mkv: breaks off at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
+            " before are in {out}; go on with --resume {out})",
+            kept=3,
+        ),
+    ),
+    Case(
+        "depth breaks off",
+        changed("depth.mkv", half),
+        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+    ),
+    Case(
+        "depth breaks off at once",
+        changed("depth.mkv", lambda content: content[:300]),
+        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+    ),
+    Case(
+        "noise",
+        changed("colour.mkv", lambda content: NOISE),
+        Says("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+    ),
+    Case(
+        "empty",
+        changed("depth.mkv", lambda content: b""),
+        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+    ),
+    Case(
+        "text",
+        changed("colour.mkv", lambda content: b"the video\n" * 100),
+        Says("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+    ),
+    Case(
+        "depth of 8 bits",
+        with_video("depth.mkv", colour(0)),
+        Says(
+            "{root}/take/depth.mkv: has not 16 bits of grey a pixel, as depth has; export it again with"
+            " ffmpeg -c:v ffv1 -pix_fmt gray16le"
+        ),
+    ),
+    Case(
+        "depth of another size",
+        with_video("depth.mkv", depth()[::2, ::2].copy()),
+        Says(
+            "{root}/take/depth.mkv: has 40x30 pixels, its colour image 80x60; export the depth that is"
+            " registered to colour, pixel by pixel"
+        ),
+    ),
+    Case(
+        "two of colour",
+        with_video("other.mkv", colour(0)),
+        Says(
+            "{root}/take: a colour and a depth video belong together, here are colour.mkv, other.mkv,"
+            " depth.mkv; name them such as take.mp4 and take_depth.mkv and give the first"
+        ),
+    ),
+    Case(
+        "no camera",
+        all_of(videos, lambda place: (place.root / "take" / "camera.yaml").unlink()),
+        Says(
+            "{root}/take: says nothing about its camera; put a camera.yaml there (fx, fy, cx, cy, width,"
+            " height, depth_scale) or give --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
+        ),
+    ),
+    Case(
+        "--fps 0", all_of(videos, options("--fps", "0")), Says("--fps 0: give frames a second, between 0.01 and 10000")
+    ),
+    Case(
+        "--fps that is no number",
+        all_of(videos, options("--fps", "nan")),
+        Says("--fps nan: give frames a second, between 0.01 and 10000"),
+    ),
+    Case(
+        "--fps without end",
+        all_of(videos, options("--fps", "inf")),
+        Says("--fps inf: give frames a second, between 0.01 and 10000"),
+    ),
+]

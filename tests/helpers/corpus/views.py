@@ -1,0 +1,115 @@
+"""Images that are whole and show nothing to go by."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from helpers.corpus.base import HEIGHT, WIDTH, colour, depth, png, way
+from helpers.corpus.case import Case, Place, Right, Says, all_of, edit, replaced, write
+from helpers.corpus.images import DEPTH, RGB, every
+from helpers.corpus.lists import lines
+
+
+def plain(value: int) -> bytes:
+    return png(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
+
+
+def still(listed: list[str]) -> list[str]:
+    """Every pose that of the first line."""
+    return [f"{line.split()[0]} {listed[0].split(maxsplit=1)[1]}" for line in listed]
+
+
+def covered(place: Place) -> None:
+    """30 frames, of which the middle 20 show a hand before the lens."""
+    for kind in ("rgb", "depth"):
+        lines = []
+        for i in range(30):
+            stamp = f"{1305031102 + i / 10:.6f}"
+            x, y = way(min(i, 4)) if i < 25 else way(min(i - 20, 7))
+            seen = {
+                "rgb": plain(0) if 5 <= i < 25 else png(colour(x, y)),
+                "depth": png(depth(0.0 if 5 <= i < 25 else 1.0)),
+            }
+            (place.folder / kind / f"{stamp}.png").write_bytes(seen[kind])
+            lines.append(f"{stamp} {kind}/{stamp}.png\n")
+        (place.folder / f"{kind}.txt").write_text("".join(lines))
+    (place.folder / "groundtruth.txt").unlink()
+
+
+CASES = [
+    Case(
+        "all black",
+        every(RGB, lambda i: plain(0)),
+        Says(
+            "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
+            " it again, with light and an open lens (the results are in {out})",
+            kept=8,
+        ),
+    ),
+    Case(
+        "all white",
+        every(RGB, lambda i: plain(255)),
+        Says(
+            "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
+            " it again, with light and an open lens (the results are in {out})",
+            kept=8,
+        ),
+    ),
+    Case(
+        "no depth",
+        every(DEPTH, lambda i: png(depth(0.0))),
+        Says(
+            "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
+            " depth images again (the results are in {out})",
+            kept=8,
+        ),
+    ),
+    Case(
+        "depth all 65535",
+        every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 65535, np.uint16))),
+        Says(
+            "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
+            " depth images again (the results are in {out})",
+            kept=8,
+        ),
+    ),
+    Case(
+        "black, without depth",
+        all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
+        Says(
+            "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
+            " it again, with light and an open lens (the results are in {out})",
+            kept=8,
+        ),
+    ),
+    Case(
+        "depth in metres",
+        every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1, np.uint16))),
+        Says(
+            "{seq}: the depth of its first frame is 0.0002 m in the middle, at 5000 units per metre;"
+            " correct the camera's depth_scale (1000 where depth is in millimetres), or the images"
+        ),
+    ),
+    Case(
+        "depth in millimetres",
+        every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1000, np.uint16))),
+        Right(ate=0.1, note="the ground truth is 5 times as large as the estimate: is depth_scale right?"),
+    ),
+    Case(
+        "depth of a camera that counts metres",
+        edit("camera.yaml", replaced("5000", "1")),
+        Says(
+            "{seq}: the depth of its first frame is 5e+03 m in the middle, at 1 units per metre; correct"
+            " the camera's depth_scale (1000 where depth is in millimetres), or the images"
+        ),
+    ),
+    Case(
+        "the same image all the time",
+        all_of(every(RGB, lambda i: png(colour(*way(0)))), lines("groundtruth.txt", still)),
+        Right(),
+    ),
+    Case("one black frame", write(RGB[4], plain(0)), Right(lost=1, ate=0.03)),
+    Case("one frame without depth", write(DEPTH[4], png(depth(0.0))), Right()),
+    Case("the first frame is black", write(RGB[0], plain(0)), Right(lost=1, ate=0.03)),
+    Case("the camera is covered for two seconds", covered, Right(30, lost=20, ate=None)),
+]

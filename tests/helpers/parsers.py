@@ -1,0 +1,145 @@
+"""The doors at which bytes come in, for tests that push any bytes through them: parsed, or refused as `V3DError`."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from v3d_torch.config import Config
+from v3d_torch.config.loading import load_config
+from v3d_torch.datasets import openloris
+from v3d_torch.datasets.bag import BagSequence
+from v3d_torch.datasets.bag_images import colour_from, depth_from
+from v3d_torch.datasets.cameras import load_camera
+from v3d_torch.datasets.encodings import COLOURS
+from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour, read_depth
+from v3d_torch.datasets.lists import read_associations, read_image_list
+from v3d_torch.datasets.matrices import read_matrix, read_poses
+from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.errors import V3DError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.extract import extract_tar
+from v3d_torch.mapping.map_io import load_map
+from v3d_torch.runs import stored_run
+from v3d_torch.types import Trajectory
+
+Parser = Callable[[bytes, Path], object]
+"""Parses bytes, in a folder for files that it needs."""
+
+
+def from_file(name: str, read: Callable[[Path], object]) -> Parser:
+    """A parser that reads a file of this name."""
+
+    def parse(content: bytes, folder: Path) -> object:
+        path = folder / name
+        path.write_bytes(content)
+        return read(path)
+
+    return parse
+
+
+def as_overrides(content: bytes, folder: Path) -> object:
+    """A line for each ``--set``."""
+    return load_config(None, content.decode("utf-8", "surrogateescape").splitlines())
+
+
+def message(content: bytes) -> SimpleNamespace:
+    """A ROS image whose first bytes say its encoding and its size, and the rest of which are its pixels."""
+    head = content[:8].ljust(8, b"\0")
+    encodings = [*COLOURS, "16UC1", "mono16", "32FC1", "", "8UC4"]
+    return SimpleNamespace(
+        encoding=encodings[head[0] % len(encodings)],
+        is_bigendian=head[1] & 1,
+        width=int.from_bytes(head[2:4], "little"),
+        height=int.from_bytes(head[4:6], "little"),
+        step=int.from_bytes(head[6:8], "little"),
+        data=np.frombuffer(content[8:], np.uint8),
+    )
+
+
+def compressed(content: bytes) -> SimpleNamespace:
+    forms = ["jpeg", "png", "16UC1; compressedDepth", "32FC1; compressedDepth", "16UC1; compressedDepth rvl", ""]
+    form = forms[content[0] % len(forms)] if content else ""
+    return SimpleNamespace(format=form, data=np.frombuffer(content[1:], np.uint8))
+
+
+def frames_of(bag: Path) -> object:
+    """Every frame of a bag, of which the index or a message may be broken."""
+    return list(BagSequence(bag))
+
+
+def unpack(path: Path) -> object:
+    folder = path.with_name("unpacked")
+    try:
+        return extract_tar(path, folder, max_bytes=1 << 20)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)  # what is there is not unpacked again
+
+
+CAMERA = PinholeCamera(fx=8.0, fy=8.0, cx=3.5, cy=2.5, width=8, height=6)
+
+PARSERS: dict[str, Parser] = {
+    "image list": from_file("rgb.txt", read_image_list),
+    "associations": from_file("associations.txt", read_associations),
+    "trajectory": from_file("groundtruth.txt", read_trajectory),
+    "matrix": from_file("pose.txt", read_matrix),
+    "pose": from_file("pose.txt", lambda path: read_poses({0.0: path})),
+    "camera.yaml": from_file("camera.yaml", load_camera),
+    "K.txt": from_file("K.txt", load_camera),
+    "configuration": from_file("config.yaml", load_config),
+    "--set": as_overrides,
+    "colour file": from_file("image.png", read_colour),
+    "JPEG file": from_file("image.jpg", read_colour),
+    "depth file": from_file("image.png", lambda path: read_depth(path, 5000.0)),
+    "colour in a message": lambda content, folder: decode_colour(content, "topic"),
+    "depth in a message": lambda content, folder: decode_depth(content, "topic"),
+    "colour message": lambda content, folder: colour_from(message(content), "topic"),
+    "depth message": lambda content, folder: depth_from(message(content), 1000.0, "topic"),
+    "compressed colour message": lambda content, folder: colour_from(compressed(content), "topic"),
+    "compressed depth message": lambda content, folder: depth_from(compressed(content), 1000.0, "topic"),
+    "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
+    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
+    "ROS 1 bag": from_file("take.bag", frames_of),
+    "ROS 2 bag": from_file("take.db3", frames_of),
+    "mcap": from_file("take.mcap", frames_of),
+    "archive": from_file("archive.tgz", unpack),
+    "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
+    "metrics.json": from_file("metrics.json", stored_run.read_metrics),
+    "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
+}
+
+
+def outcome(parser: str, content: bytes, folder: Path) -> object | V3DError:
+    """What a parser makes of bytes, or how it refuses them.
+
+    Raises:
+        AssertionError: the refusal is no sentence.
+        Exception: anything else, which is what the tests look for.
+    """
+    try:
+        return PARSERS[parser](content, folder)
+    except V3DError as error:
+        assert str(error)
+        return error
+
+
+def assert_sound(result: object) -> None:
+    """What has been taken for an input makes sense."""
+    if isinstance(result, V3DError):
+        assert str(result).strip()
+    elif isinstance(result, Trajectory):
+        assert torch.isfinite(result.T_wc).all() and torch.isfinite(result.stamps).all()
+        assert (result.stamps.diff() > 0).all()
+        R = result.T_wc[:, :3, :3]
+        torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), rtol=0, atol=0.02)
+    elif isinstance(result, PinholeCamera):
+        assert math.isfinite(result.cx + result.cy + sum(result.distortion))
+        assert min(result.fx, result.fy, result.depth_scale, result.width, result.height) >= 1
+    elif isinstance(result, torch.Tensor):
+        assert result.ndim == 3 and (result.dtype == torch.uint8 or bool((result >= 0).all()))

@@ -1,0 +1,61 @@
+"""A room that is a box, with a box in it, as depth images without error: surfaces are known to the last digit."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from v3d_torch.features.orb import Features
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.mapping.keyframe import Keyframe
+
+CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
+ROOM = torch.tensor([[-1.53, -1.11, -1.47], [1.49, 1.17, 1.83]])
+"""Lower and upper corner, metres, not on the faces of any voxels."""
+CRATE = torch.tensor([[-0.33, 0.41, 0.55], [0.37, 1.17, 1.21]])
+"""Stands on the floor; y is down."""
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+def keyframe(T_cw: Tensor = EYE, frame: int = 0) -> Keyframe:
+    """A keyframe at a pose, without features."""
+    none = torch.zeros(0, dtype=torch.int64)
+    empty = Features(torch.zeros(0, 2), torch.zeros(0, 2).long(), none.double(), none, torch.zeros(0, 32).byte())
+    return Keyframe(frame, frame, frame / 30, T_cw, empty, none)
+
+
+def looking_around(count: int, seed: int = 0) -> Tensor:
+    """Poses ``T_wc`` near the room's middle that turn once around, float64, (count, 4, 4)."""
+    generator = torch.Generator().manual_seed(seed)
+    twists = 0.15 * (torch.rand(count, 6, generator=generator, dtype=torch.float64) - 0.5)
+    turns = torch.zeros(count, 6, dtype=torch.float64)
+    turns[:, 4] = 2 * torch.pi * torch.arange(count) / count
+    return se3_exp(turns) @ se3_exp(twists)
+
+
+def render(T_wc: Tensor, *boxes: Tensor, camera: PinholeCamera = CAMERA) -> Tensor:
+    """Depth of the room, and of boxes in it, from inside, metres, float32, (1, H, W)."""
+    origin = T_wc[:3, 3]
+    direction = camera.rays.to(torch.float64) @ T_wc[:3, :3].T  # of unit depth
+    _, depth = _hits(ROOM, origin, direction)
+    for box in boxes:
+        enter, leave = _hits(box, origin, direction)
+        depth = torch.where((enter < leave) & (enter > 0) & (enter < depth), enter, depth)
+    return depth[None].to(torch.float32)
+
+
+def distance_to(points: Tensor, *boxes: Tensor) -> Tensor:
+    """Distance of points to the nearest surface of the room and of boxes in it, metres, (N,)."""
+    distances = []
+    for low, high in (ROOM, *boxes):
+        outside = torch.stack([low - points, points - high]).amax(dim=0)  # per axis, negative inside
+        beyond = outside.clamp(min=0).norm(dim=1)
+        distances.append(torch.where(beyond > 0, beyond, -outside.amax(dim=1)))
+    return torch.stack(distances).amin(dim=0)
+
+
+def _hits(box: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths at which rays enter and leave a box, (H, W) each; they miss it where they enter after they leave."""
+    sides = (box.to(torch.float64)[:, None, None] - origin) / direction
+    return sides.amin(dim=0).amax(dim=-1), sides.amax(dim=0).amin(dim=-1)

@@ -1,0 +1,62 @@
+"""A short run before a wall, and its frames."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.types import Instances, RGBDFrame, Trajectory
+
+CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
+
+
+WALL = 2.0
+"""Distance of the wall, metres."""
+
+
+STEP = 4
+"""Pixels by which the image moves from frame to frame: the camera goes 4 * 2 / 260 m."""
+
+
+FRAMES = 14
+
+
+class Wall:
+    """A camera that slides along a wall covered with noise; a square in the image's middle is called a person."""
+
+    name = "wall"
+    camera = CAMERA
+
+    def __init__(self, broken: int | None = None, interrupted: int | None = None) -> None:
+        noise = np.random.default_rng(0).integers(0, 256, (240 // 4, 480 // 4, 3), dtype=np.uint8)
+        self._wall = cv2.resize(noise, (480, 240), interpolation=cv2.INTER_CUBIC)
+        self._broken, self._interrupted = broken, interrupted
+        self.stamps = torch.arange(FRAMES, dtype=torch.float64) / 10
+        # Turned by next to nothing: orientations that never change are taken for placeholders.
+        T_wc = se3_exp(torch.zeros(FRAMES, 6, dtype=torch.float64).index_fill_(1, torch.tensor(3), 1e-6))
+        T_wc[0] = torch.eye(4)
+        T_wc[:, 0, 3] = torch.arange(FRAMES) * STEP * WALL / CAMERA.fx
+        self.groundtruth: Trajectory | None = Trajectory(self.stamps, T_wc)
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        if index == self._broken:
+            raise InputError("rgb/x.png: is truncated or no image; copy or download it again")
+        if index == self._interrupted:
+            raise KeyboardInterrupt
+        image = torch.from_numpy(self._wall[:, STEP * index : STEP * index + 320].copy()).permute(2, 0, 1)
+        return RGBDFrame(index, float(self.stamps[index]), image, torch.full((1, 240, 320), WALL))
+
+
+def square(frame: RGBDFrame) -> Instances:
+    """A person in the middle of the image."""
+    mask = torch.zeros(1, 240, 320, dtype=torch.bool)
+    mask[:, 90:150, 130:190] = True
+    box = torch.tensor([[130.0, 90, 190, 150]])
+    return Instances(mask, torch.zeros(1, dtype=torch.int64), torch.ones(1), box)

@@ -1,0 +1,62 @@
+"""``~`` in paths, also where no shell has put the home folder in its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from helpers.tiny_images import colour_of, depth_of, save
+from typer.testing import CliRunner
+
+from v3d_torch.__main__ import COMMANDS
+from v3d_torch.datasets import load_sequence
+from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import expand_user
+
+CAMERA = "fx: 30\nfy: 30\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 5000\n"
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """With a folder ``desk`` of three images and a camera beside it."""
+    for name in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(tmp_path))
+    for i in range(3):
+        save(tmp_path / "desk" / "rgb" / f"{10 + i}.500000.png", colour_of(i, 32, 24))
+        save(tmp_path / "desk" / "depth" / f"{10 + i}.500000.png", depth_of(i, 32, 24))
+    (tmp_path / "camera.yaml").write_text(CAMERA)
+    return tmp_path
+
+
+@pytest.mark.parametrize("variable", [None, "V3D_DATA"])
+def test_sequences_and_cameras(home: Path, monkeypatch: pytest.MonkeyPatch, variable: str | None) -> None:
+    if variable is not None:
+        monkeypatch.setenv(variable, "~")
+    root = "~" if variable is None else None
+    assert len(load_sequence("desk", data_root=root, camera="~/camera.yaml")) == 3
+    assert len(load_sequence("~/desk", camera=Path("~/camera.yaml"))) == 3
+
+
+def test_the_cache(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("V3D_CACHE", "~/cache")
+    assert cache_dir() == home / "cache"
+
+
+def test_a_command_writes_there(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(home / "desk")
+    (record,) = (module for module in COMMANDS if module.__name__.endswith("record"))
+    asked = ["--seq=~/desk", "--camera=~/camera.yaml", "--out=~/copy"]
+    done = CliRunner().invoke(record.app, asked)
+    assert done.exit_code == 0, done.stderr
+    assert len(load_sequence(home / "copy")) == 3 and not (home / "desk" / "~").exists()
+
+
+@pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__)
+def test_so_do_all(module: ModuleType) -> None:
+    (command,) = module.app.registered_commands
+    assert command.callback.__wrapped__.__module__ == module.__name__
+
+
+def test_somebody_who_is_not_known_here_is_a_name() -> None:
+    assert expand_user("~nobody-of-that-name/x") == Path("~nobody-of-that-name/x")

@@ -1,0 +1,66 @@
+"""YAML of strangers: the values of `yaml.safe_load`, and none of its dangers."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3d_torch.io.safe_yaml import parse_yaml
+
+LINE_BREAKS = set("\x85\u2028\u2029")
+SCALARS = st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(allow_nan=False) | st.text(max_size=12)
+TREES = st.recursive(
+    SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+class Unaliased(yaml.SafeDumper):
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+@given(tree=TREES)
+def test_values_are_those_of_the_usual_loader(tree: object) -> None:
+    for allow_unicode in (False, True):
+        text = yaml.dump(tree, Dumper=Unaliased, allow_unicode=allow_unicode)
+        assert parse_yaml(text) == yaml.safe_load(text)
+        if not LINE_BREAKS & set(text):  # which PyYAML writes as they are, and reads as a space
+            assert parse_yaml(text) == tree
+
+
+def test_a_byte_order_mark_and_infinity() -> None:
+    assert parse_yaml("\ufefflimit: .inf\r\n") == {"limit": math.inf}
+    assert parse_yaml("") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("a: &x 1\nb: *x\n", r"line 2: write \*x out"),
+        ("a: &x [*x]\n", r"line 1: write \*x out"),
+        ("a: 1\nb:\n  c: 1\n  c: 2\n", "line 3: 'c' is given twice"),
+        ("a: [1\n", "line 2: expected"),
+        ("\ta: 1\n", "line 1: found character"),
+        ("!!python/object/apply:os.system ['true']", "line 1: could not determine a constructor"),
+        ("!!bool perhaps", "perhaps"),
+        ("!!timestamp now", "NoneType"),
+        ("2024-13-01", "month"),
+        (5000 * "1", "5000 digits"),
+        ("? [a]\n: 1\n", "unhashable"),
+        (2000 * "[" + 2000 * "]", "nested too deeply"),
+        (200_000 * "a", "200000 letters"),
+    ],
+)
+def test_what_is_refused(text: str, why: str) -> None:
+    start = time.process_time()
+    with pytest.raises(ValueError, match=why) as caught:
+        parse_yaml(text)
+    assert "\n" not in str(caught.value)
+    assert time.process_time() - start < 5

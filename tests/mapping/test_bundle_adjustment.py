@@ -1,0 +1,268 @@
+"""Bundle adjustment against dense algebra, SciPy and gtsam; gauge, outliers, degenerate landmarks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.mapping.bundle_adjustment import (
+    Bundle,
+    Observations,
+    bundle_adjust,
+)
+from v3d_torch.optim.levenberg_marquardt import huber
+from v3d_torch.optim.reprojection import reprojection
+from v3d_torch.optim.schur import solve_normal_equations
+
+CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
+DEPTH_SIGMA = 0.0025
+
+
+class Scene:
+    """True poses and points, their noisy observations, and a wrong start."""
+
+    def __init__(self, poses: int, points: int, seen_by: int, noise: float = 1.0, seed: int = 0) -> None:
+        generator = torch.Generator().manual_seed(seed)
+
+        def normal(*shape: int) -> Tensor:
+            return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+        spread = torch.tensor([0.3, 0.2, 0.1, 0.05, 0.08, 0.05], dtype=torch.float64)
+        self.T_cw = se3_exp(normal(poses, 6) * spread)
+        uv = uniform(points, 2) * torch.tensor([640.0, 480.0], dtype=torch.float64)
+        self.points = CAMERA.back_project(uv, 1 + 3 * uniform(points))
+        pose = torch.stack([torch.randperm(poses, generator=generator)[:seen_by] for _ in range(points)]).flatten()
+        point = torch.arange(points).repeat_interleave(seen_by)
+        count = pose.shape[0]
+        T = self.T_cw[pose]
+        in_camera = (T[:, :3, :3] @ self.points[point, :, None])[..., 0] + T[:, :3, 3]
+        sigma = 1.2 ** torch.randint(0, 8, (count,), generator=generator).to(torch.float64)
+        inverse_depth = 1 / in_camera[:, 2] + noise * DEPTH_SIGMA * normal(count)
+        inverse_depth[uniform(count) < 0.3] = 0.0
+        self.observations = Observations(
+            pose=pose,
+            point=point,
+            uv=CAMERA.project(in_camera) + noise * sigma[:, None] * normal(count, 2),
+            inverse_depth=inverse_depth,
+            pixel_sigma=sigma,
+            inverse_depth_sigma=DEPTH_SIGMA,
+        )
+        self.fixed = torch.arange(poses) == 0
+        wrong = 0.02 * normal(poses, 6)
+        self.start = torch.where(self.fixed[:, None, None], self.T_cw, se3_exp(wrong) @ self.T_cw)
+        self.start_points = self.points + 0.02 * normal(points, 3)
+
+
+def residuals(T_cw: Tensor, points: Tensor, observations: Observations) -> Tensor:
+    T = T_cw[observations.pose]
+    in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
+    return reprojection(in_camera, observations, CAMERA)
+
+
+def test_step_equals_dense_solution() -> None:
+    scene = Scene(poses=4, points=12, seen_by=3)
+    free = torch.tensor([1, 3])
+    damping = 1e-3
+
+    def moved(xi: Tensor, shift: Tensor) -> Tensor:
+        T_cw = scene.start.index_copy(0, free, se3_exp(xi) @ scene.start[free])
+        return residuals(T_cw, scene.start_points + shift, scene.observations)
+
+    zeros = torch.zeros(2, 6, dtype=torch.float64), torch.zeros(12, 3, dtype=torch.float64)
+    by_pose, by_point = torch.autograd.functional.jacobian(moved, zeros)
+    r = moved(*zeros)
+    J = torch.cat([by_pose.reshape(-1, 12), by_point.reshape(-1, 36)], dim=1)
+    _, weights = huber((r * r).sum(dim=-1), scene.observations.limit)
+    weighted = (J * weights.repeat_interleave(3)[:, None]).T
+    H = weighted @ J
+    expected = torch.linalg.solve(H + damping * H.diagonal().diag(), -weighted @ r.flatten())
+
+    state = scene.start, scene.start_points
+    bundle = Bundle(scene.observations, CAMERA, ~torch.isin(torch.arange(4), free), points=12)
+    _, errors = bundle.errors_at(state)
+    xi, shift = solve_normal_equations(errors.normal_equations, damping)
+    torch.testing.assert_close(torch.cat([xi.flatten(), shift.flatten()]), expected, rtol=1e-7, atol=1e-9)
+
+
+def test_profile_is_that_of_the_cost_adjusted_anew() -> None:
+    """Its derivatives are those of the least costs when all is seen a little to one side and to the other."""
+    scene = Scene(poses=4, points=40, seen_by=3)
+    drift = 5.0 * torch.randn(len(scene.observations.uv), 2, generator=torch.Generator().manual_seed(5)).double()
+    here = bundle_adjust(
+        scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
+    )
+
+    def cost(step: float) -> float:
+        seen = replace(scene.observations, uv=scene.observations.uv + step * drift)
+        return bundle_adjust(
+            here.T_cw, here.points, seen, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
+        ).cost_after
+
+    step = 1e-3
+    less, same, more = cost(-step), cost(0.0), cost(step)
+    first, second = here.errors.profile(drift)
+    assert first == pytest.approx((more - less) / (2 * step), rel=1e-3)
+    assert second == pytest.approx((more - 2 * same + less) / step**2, rel=0.05)
+
+
+def test_same_optimum_as_scipy() -> None:
+    scene = Scene(poses=3, points=12, seen_by=3)
+    limit = scene.observations.limit
+
+    def unpack(x: np.ndarray) -> tuple[Tensor, Tensor]:
+        numbers = torch.from_numpy(x)
+        T_cw = torch.cat([scene.start[:1], se3_exp(numbers[:12].reshape(2, 6)) @ scene.start[1:]])
+        return T_cw, scene.start_points + numbers[12:].reshape(-1, 3)
+
+    def robust_residuals(x: np.ndarray) -> np.ndarray:
+        r = residuals(*unpack(x), scene.observations)
+        squared = (r * r).sum(dim=-1)
+        costs, _ = huber(squared, limit)
+        return (r * (costs / squared).sqrt()[:, None]).flatten().numpy()
+
+    best = scipy.optimize.least_squares(robust_residuals, np.zeros(12 + 36), x_scale="jac", xtol=1e-12, ftol=1e-12)
+    T_cw, points = unpack(best.x)
+    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=30)
+    assert result.cost_after == pytest.approx(2 * best.cost, rel=1e-5)
+    assert se3_log(result.T_cw @ invert(T_cw)).abs().max() < 1e-4
+    assert (result.points - points).norm(dim=1).max() < 1e-3
+
+
+def test_same_optimum_as_gtsam() -> None:
+    scene = Scene(poses=5, points=60, seen_by=4)
+    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k, T_wc in enumerate(invert(scene.start)):
+        start.insert(k, gtsam.Pose3(T_wc.numpy()))
+    for k, point in enumerate(scene.start_points):
+        start.insert(1000 + k, gtsam.Point3(point.numpy()))
+    graph.add(gtsam.NonlinearEqualityPose3(0, gtsam.Pose3(invert(scene.start[0]).numpy())))
+    # A stereo camera with a baseline of one unit of inverse depth measures (u, u - w, v) for (u, v, w = 1/z).
+    stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, 1 / CAMERA.fx)
+    mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
+    A = np.array([[1.0, 0, 0], [1, 0, -1], [0, 1, 0]])
+    seen = scene.observations
+    for m in range(seen.pose.shape[0]):
+        (u, v), w, sigma = seen.uv[m].tolist(), float(seen.inverse_depth[m]), float(seen.pixel_sigma[m])
+        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(seen.limit[m].sqrt()))
+        keys = int(seen.pose[m]), 1000 + int(seen.point[m])
+        if w > 0:
+            noise = gtsam.noiseModel.Gaussian.Covariance(A @ np.diag([sigma**2, sigma**2, DEPTH_SIGMA**2]) @ A.T)
+            noise = gtsam.noiseModel.Robust.Create(kernel, noise)
+            graph.add(gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, u - w, v), noise, *keys, stereo))
+        else:
+            noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(gtsam.Point2(u, v), noise, *keys, mono))
+    best = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+    result = bundle_adjust(scene.start, scene.start_points, seen, CAMERA, scene.fixed, iterations=30)
+    assert result.cost_before == pytest.approx(2 * graph.error(start), rel=1e-6)
+    assert result.cost_after == pytest.approx(2 * graph.error(best), rel=1e-5)
+    expected = torch.stack([torch.from_numpy(best.atPose3(k).matrix()) for k in range(5)])
+    assert se3_log(result.T_cw @ expected).abs().max() < 1e-4
+    points = torch.stack([torch.from_numpy(best.atPoint3(1000 + k)) for k in range(60)])
+    assert (result.points - points).norm(dim=1).max() < 1e-3
+
+
+def test_recovers_an_exact_scene() -> None:
+    scene = Scene(poses=6, points=100, seen_by=4, noise=0.0)
+    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=20)
+    torch.testing.assert_close(result.T_cw, scene.T_cw, rtol=0, atol=1e-7)
+    torch.testing.assert_close(result.points, scene.points, rtol=0, atol=1e-6)
+    assert result.cost_after < 1e-6 < result.cost_before
+
+
+def test_chi2_follows_its_distribution() -> None:
+    scene = Scene(poses=6, points=400, seen_by=5)
+    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
+    degrees = (2 + (scene.observations.inverse_depth > 0)).sum() - 5 * 6 - 400 * 3
+    assert float(result.chi2.sum() / degrees) == pytest.approx(1.0, abs=0.05)
+
+
+def test_outliers_do_not_matter_and_are_found() -> None:
+    scene = Scene(poses=6, points=300, seen_by=5)
+    wrong = torch.arange(scene.observations.pose.shape[0]) % 10 == 0
+    uv = torch.where(wrong[:, None], scene.observations.uv + 40.0, scene.observations.uv)
+    observations = replace(scene.observations, uv=uv)
+    result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed)
+    clean = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
+    assert se3_log(result.T_cw @ invert(clean.T_cw)).abs().max() < 0.005
+    outlier = result.chi2 > observations.limit
+    assert outlier[wrong].double().mean() > 0.99
+    assert outlier[~wrong].double().mean() < 0.15
+
+
+def test_fixed_poses_stay_to_the_bit() -> None:
+    scene = Scene(poses=5, points=50, seen_by=4)
+    fixed = torch.tensor([True, False, True, False, True])
+    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, fixed)
+    assert torch.equal(result.T_cw[fixed], scene.start[fixed])
+    assert not torch.equal(result.T_cw[1], scene.start[1])
+    everything = torch.ones(5, dtype=torch.bool)
+    only_points = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, everything)
+    assert torch.equal(only_points.T_cw, scene.start)
+    assert only_points.cost_after < only_points.cost_before
+
+
+def test_inputs_are_not_changed() -> None:
+    scene = Scene(poses=3, points=20, seen_by=3)
+    before = scene.start.clone(), scene.start_points.clone()
+    bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
+    assert torch.equal(scene.start, before[0])
+    assert torch.equal(scene.start_points, before[1])
+
+
+def test_weak_points_do_not_blow_up() -> None:
+    scene = Scene(poses=5, points=40, seen_by=4)
+    seen = scene.observations
+    # Point 0 is seen once without depth, 1 once with depth, 2 never, 3 is behind its cameras.
+    rank = torch.arange(seen.pose.shape[0]) % 4
+    keep = ~((seen.point <= 1) & (rank > 0)) & (seen.point != 2)
+    inverse_depth = torch.where(seen.point == 0, 0.0, torch.where(seen.point == 1, 0.4, seen.inverse_depth))
+    observations = Observations(
+        pose=seen.pose[keep],
+        point=seen.point[keep],
+        uv=seen.uv[keep],
+        inverse_depth=inverse_depth[keep],
+        pixel_sigma=seen.pixel_sigma[keep],
+        inverse_depth_sigma=DEPTH_SIGMA,
+    )
+    points = scene.start_points.clone()
+    points[3] = -points[3]
+    result = bundle_adjust(scene.start, points, observations, CAMERA, scene.fixed)
+    assert torch.isfinite(result.points).all()
+    assert (result.points[:2] - points[:2]).norm(dim=1).max() < 1.0
+    assert torch.equal(result.points[2], points[2])
+    once = bundle_adjust(scene.T_cw, points, observations, CAMERA, torch.ones(5, dtype=torch.bool))
+    assert 1 / float(
+        (scene.T_cw[observations.pose[1]] @ torch.cat([once.points[1], torch.ones(1)]))[2]
+    ) == pytest.approx(0.4, abs=1e-4)
+    good = torch.arange(40) > 3
+    assert (result.points - scene.points)[good].norm(dim=1).median() < 0.02
+
+
+def test_without_a_fixed_pose_the_cost_still_falls() -> None:
+    scene = Scene(poses=4, points=50, seen_by=4)
+    free = torch.zeros(4, dtype=torch.bool)
+    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, free, iterations=20)
+    tied = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=20)
+    assert result.cost_after == pytest.approx(tied.cost_after, rel=1e-3)
+    assert (result.T_cw - scene.start).abs().max() < 0.3
+
+
+def test_deterministic() -> None:
+    scene = Scene(poses=6, points=200, seen_by=4)
+    first, second = (
+        bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed) for _ in range(2)
+    )
+    assert torch.equal(first.T_cw, second.T_cw)
+    assert torch.equal(first.points, second.points)

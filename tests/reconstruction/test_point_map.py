@@ -1,0 +1,262 @@
+"""The coloured map against plain voxel means, normals against known surfaces, free space against ghosts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from helpers.rooms import CAMERA, CRATE, EYE, ROOM, distance_to, keyframe, looking_around, render
+from scipy.ndimage import binary_erosion, generate_binary_structure
+from torch import Tensor
+
+from v3d_torch.config import Config
+from v3d_torch.config.loading import load_config
+from v3d_torch.geometry.camera import PinholeCamera, back_project
+from v3d_torch.geometry.depth_smoother import smooth_depth
+from v3d_torch.geometry.normals import surface_normals
+from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.reconstruction import point_map as dense
+from v3d_torch.reconstruction.point_map import PointMap, fuse_points
+
+ALL = torch.ones(240, 320, dtype=torch.bool)
+GREY = torch.full((3, 240, 320), 128, dtype=torch.uint8)
+
+
+def config(**settings: float) -> Config:
+    return load_config(overrides=[f"dense_map.{name}={value}" for name, value in settings.items()])
+
+
+def views_of(*seen: tuple[Tensor, Tensor], stride: int = 1) -> StaticViews:
+    """Views of depth images, all of it static, from poses T_cw."""
+    views = StaticViews(CAMERA, stride)
+    for T_cw, depth in seen:
+        views.add(keyframe(T_cw), GREY, depth, ALL)
+    return views
+
+
+def wall(z: float) -> Tensor:
+    return torch.full((1, 240, 320), z)
+
+
+# --- fusion
+
+
+def test_the_map_equals_plain_voxel_means() -> None:
+    generator = torch.Generator().manual_seed(3)
+    views = StaticViews(CAMERA, 4)
+    voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for T_wc in looking_around(2) @ se3_exp(torch.tensor([0.0, 0, 0, 0, 0.2, 0], dtype=torch.float64)):
+        depth = (render(T_wc) / views.UNIT).round() * views.UNIT
+        depth[0, :20] = 0.0
+        image = torch.randint(0, 256, (3, 240, 320), generator=generator, dtype=torch.uint8)
+        static = torch.rand(60, 80, generator=generator).repeat_interleave(4, 0).repeat_interleave(4, 1) > 0.1
+        views.add(keyframe(invert(T_wc)), image, depth, static)
+        v, u = np.mgrid[0:240:4, 0:320:4]
+        z = depth[0].numpy()[v, u].astype(np.float64)
+        # On a smooth surface a pixel has a normal where its four neighbours are there.
+        there = static.numpy()[v, u] & (z > 0)
+        keep = binary_erosion(there, generate_binary_structure(2, 1)) & (z <= 1.7)
+        u, v, z = u[keep], v[keep], z[keep]
+        rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(z)], axis=1)
+        points = rays * z[:, None] @ T_wc[:3, :3].numpy().T + T_wc[:3, 3].numpy()
+        for point, colour in zip(points, image.numpy()[:, v, u].T, strict=True):
+            voxels.setdefault(tuple(np.floor(point / 0.05).astype(int)), []).append(np.r_[point, colour])
+    fused = fuse_points(views, config(voxel_size=0.05, max_depth=1.7))
+    # Rounding puts a few points on the other side of a voxel's face.
+    assert len(voxels) > 500 and abs(len(fused) - len(voxels)) <= 3
+    expected = np.array([np.mean(rows, axis=0) for rows in voxels.values()])
+    distance = torch.cdist(fused.points.double(), torch.from_numpy(expected[:, :3]))
+    nearest, row = distance.min(dim=1)
+    assert (nearest < 1e-4).double().mean() > 0.99
+    close = (fused.colours.double() - torch.from_numpy(expected[:, 3:])[row]).abs().max(dim=1).values < 0.51
+    assert close.double().mean() > 0.99
+
+
+def around(count: int) -> StaticViews:
+    return views_of(*((invert(T_wc), render(T_wc, CRATE)) for T_wc in looking_around(count)), stride=2)
+
+
+def test_points_lie_on_the_surfaces_that_were_seen() -> None:
+    fused = fuse_points(around(8), config())
+    assert len(fused) > 50_000
+    error = distance_to(fused.points.double(), CRATE)
+    # The mean over a voxel that holds a corner lies inside of it.
+    assert error.median() < 1e-4 and (error < 1e-3).double().mean() > 0.98 and error.max() < 0.01
+
+
+def test_taken_in_by_parts_the_map_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = fuse_points(around(6), config())
+    monkeypatch.setattr(dense, "_BATCH", 1)
+    parts = fuse_points(around(6), config())
+    assert abs(len(parts) - len(whole)) < 0.001 * len(whole)  # means that lie on the faces of voxels
+    assert torch.cdist(parts.points[:2000].double(), whole.points.double()).amin(dim=1).quantile(0.99) < 1e-5
+
+
+def test_the_map_follows_its_keyframes() -> None:
+    own = keyframe()
+    views = StaticViews(CAMERA, 4)
+    views.add(own, GREY, wall(2.0), ALL)
+    before = fuse_points(views, config(voxel_size=1e-3))
+    torch.testing.assert_close(before.points[:, 2], torch.full((58 * 78,), 2.0))
+    own.T_cw = invert(se3_exp(torch.tensor([0.0, 0, 0.5, 0, 0, 0], dtype=torch.float64)))
+    after = fuse_points(views, config(voxel_size=1e-3))
+    torch.testing.assert_close(after.points[:, 2], torch.full((58 * 78,), 2.5))
+
+
+def test_without_views_or_static_pixels_the_map_is_empty() -> None:
+    views = StaticViews(CAMERA, 2)
+    for _ in range(2):
+        fused = fuse_points(views, config())
+        assert fused.points.shape == fused.colours.shape == fused.normals.shape == (0, 3)
+        views.add(keyframe(), GREY, wall(1.0), ~ALL)
+
+
+def test_the_lens_is_taken_out() -> None:
+    """Points of a bent image are those of `PinholeCamera.rays`, and are found at their pixel by the pinhole alone."""
+    camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+    views = StaticViews(camera, 2)
+    v, u = torch.meshgrid(torch.arange(480), torch.arange(640), indexing="ij")
+    depth = 1 + 0.001 * (u + v)[None].float()
+    views.add(keyframe(), torch.zeros(3, 480, 640, dtype=torch.uint8), depth, torch.ones(480, 640, dtype=torch.bool))
+    (view,) = views
+    seen = view.depth > 0
+    points = back_project(view.depth[None, None], views.rays)[0]
+    pixels = views.camera.project(points[seen].double())
+    row, column = torch.nonzero(seen).double().unbind(dim=1)
+    assert (pixels - torch.stack([column, row], dim=1)).abs().max() < 0.26  # half a pixel of the image
+    true = back_project(depth[None], camera.rays)[0].reshape(-1, 3)
+    row = torch.randint(0, int(seen.sum()), (300,), generator=torch.Generator().manual_seed(0))
+    assert torch.cdist(points[seen][row].double(), true.double()).amin(dim=1).max() < 2e-4
+    assert seen.double().mean() > 0.94  # the image is smaller than the pinhole's: this lens shows less in the corners
+
+
+def test_depth_is_kept_to_a_tenth_of_a_millimetre() -> None:
+    depth = 0.5 + 15 * torch.rand(1, 240, 320, generator=torch.Generator().manual_seed(0))
+    (view,) = views_of((EYE, depth))
+    near = depth[0] < 13
+    assert (view.depth - depth[0])[near].abs().max() < 1.1e-4
+    assert (view.depth[depth[0] > 13.2] == 0).all()
+
+
+# --- normals
+
+
+def slanted(normal: list[float], distance: float) -> tuple[Tensor, Tensor]:
+    """Points of a plane per pixel, (1, H, W, 3), and the unit normal towards the camera."""
+    n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    rays = CAMERA.rays.to(torch.float64)
+    z = -distance / (rays @ n)
+    assert (z > 0).all()
+    return (z[..., None] * rays)[None], n
+
+
+@pytest.mark.parametrize("normal", [[0, 0, -1], [0.6, 0, -1], [-0.5, 0.4, -1], [0.1, -0.9, -1]])
+@pytest.mark.parametrize("radius", [0, 1, 4])
+def test_convention_normals_of_a_plane_point_to_the_camera(normal: list[float], radius: int) -> None:
+    """Up to the border, and beside what is not measured."""
+    points, n = slanted(normal, 2.0)
+    points[:, 100:110, 60:] = 0
+    normals = surface_normals(points, radius)[0]
+    known = torch.zeros(240, 320, dtype=torch.bool)
+    known[1:-1, 1:-1] = True
+    known[99:111, 59:] = False
+    known[99:111, 59] = torch.tensor([True, *10 * [False], True])
+    torch.testing.assert_close(normals, torch.where(known[..., None], n, 0.0), rtol=0, atol=1e-9)
+
+
+def test_normals_are_the_same_alone_and_in_a_batch() -> None:
+    batch = torch.cat([slanted([0, 0, -1], 1.0)[0], slanted([0.5, 0.1, -1], 2.0)[0]])
+    normals = surface_normals(batch)
+    for points, expected in zip(batch, normals, strict=True):
+        assert torch.equal(surface_normals(points[None])[0], expected)
+
+
+def test_edges_and_holes_have_no_normals() -> None:
+    depth = wall(2.0)
+    depth[0, :, 160:] = 3.0
+    depth[0, 50, 50] = 0.0
+    none = (surface_normals(back_project(depth[None], CAMERA.rays))[0] == 0).all(dim=-1)[1:-1, 1:-1]
+    expected = torch.zeros(240, 320, dtype=torch.bool)
+    expected[:, 159:161] = True
+    expected[[50, 49, 51, 50, 50], [50, 50, 50, 49, 51]] = True
+    assert torch.equal(none, expected[1:-1, 1:-1])
+
+
+@pytest.mark.parametrize(("distance", "degrees"), [(1.0, 1.5), (2.0, 3.0), (4.0, 6.0)])
+def test_normals_of_a_wall_seen_by_a_kinect(distance: float, degrees: float) -> None:
+    """Error and steps of disparity as Khoshelham and Elberink measured them (Sensors 2012)."""
+    generator = torch.Generator().manual_seed(0)
+    points, n = slanted([0.5, 0.2, -1], distance)
+    z = points[..., 2]
+    z = z + 0.0014 * z.square() * torch.randn(z.shape, generator=generator)
+    z = 1 / (0.00285 * (1 / (0.00285 * z)).round())
+    smooth = smooth_depth(z[:, None].float())
+    normals = surface_normals(back_project(smooth, CAMERA.rays))[0].double()
+    known = (normals != 0).any(dim=-1)
+    angle = torch.rad2deg(torch.arccos((normals[known] @ n).clamp(max=1)))
+    assert angle.quantile(0.9) < degrees
+    assert known.double().mean() > 0.95
+
+
+def test_the_maps_normals_are_those_of_the_room() -> None:
+    fused = fuse_points(around(8), config())
+    lengths = fused.normals.norm(dim=1)
+    torch.testing.assert_close(lengths, torch.ones_like(lengths))
+    # Seen from inside, the wall to the right is met by its normal from the left, and so on; y is down.
+    for axis, place, sign in ((0, 1.49, -1), (0, -1.53, 1), (2, 1.83, -1), (2, -1.47, 1), (1, 0.41, -1)):
+        on = (fused.points[:, axis] - place).abs() < 1e-3
+        corners = torch.cat([ROOM, CRATE])
+        for other in {0, 1, 2} - {axis}:
+            on &= ((fused.points[:, other, None] - corners[:, other]).abs() > 0.1).all(dim=1)
+        assert on.sum() > 200, (axis, place)
+        along = sign * fused.normals[on, axis]
+        assert along.min() > 0.97 and along.mean() > 0.999
+
+
+# --- free space
+
+
+def square_at(z: float, behind: float = 2.5) -> Tensor:
+    """A wall with something of 0.4 m before it."""
+    depth = wall(behind)
+    half = round(0.2 / z * CAMERA.fx)
+    depth[0, 120 - half : 120 + half, 160 - half : 160 + half] = z
+    return depth
+
+
+def aside(x: float) -> Tensor:
+    """``T_cw`` of a camera x metres to the right that looks ahead."""
+    return se3_exp(torch.tensor([-x, 0, 0, 0, 0, 0], dtype=torch.float64))
+
+
+def before_the_wall(fused: PointMap) -> int:
+    return int((fused.points[:, 2] < 2.3).sum())
+
+
+def test_a_ghost_in_one_view_is_looked_through_by_another() -> None:
+    ghost = (EYE, square_at(1.5))
+    assert before_the_wall(fuse_points(views_of(ghost), config())) > 1000
+    assert before_the_wall(fuse_points(views_of(ghost, (aside(0.1), wall(2.5))), config())) == 0
+    assert before_the_wall(fuse_points(views_of((aside(0.1), wall(2.5)), ghost), config())) == 0
+
+
+def test_what_is_seen_more_often_than_looked_through_stays() -> None:
+    """A chair that somebody takes away in the end, or one of many depth images that is wrong."""
+    there, gone = (EYE, square_at(1.5)), (EYE, wall(2.5))
+    assert before_the_wall(fuse_points(views_of(there, there, gone), config())) > 1000
+    assert before_the_wall(fuse_points(views_of(there, gone, gone), config())) == 0
+
+
+def test_what_is_hidden_or_not_measured_is_not_gone() -> None:
+    there = (EYE, square_at(1.5))
+    for depth in (wall(0.8), wall(0.0)):
+        assert before_the_wall(fuse_points(views_of(there, *3 * [(EYE, depth)]), config())) > 1000
+
+
+def test_nothing_of_a_still_room_is_looked_through() -> None:
+    """Grazing views, corners and all."""
+    views = around(12)
+    kept = fuse_points(views, config())
+    every = fuse_points(views, load_config(overrides=["objects.free_space.min_tolerance=100"]))
+    assert len(kept) > 0.999 * len(every)

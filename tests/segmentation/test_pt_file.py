@@ -1,0 +1,117 @@
+"""Reading of checkpoints: tensors come out, nothing in the file ever runs."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from v3d_torch.errors import WeightsError
+from v3d_torch.segmentation.pt_file import read_checkpoint
+from v3d_torch.segmentation.weights import sha256_of
+
+
+class Malicious:
+    """Runs a command when it is unpickled by a loader that allows it."""
+
+    def __init__(self, victim: Path) -> None:
+        self.victim = victim
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.victim),)
+
+
+@pytest.fixture
+def malicious(tmp_path: Path) -> tuple[Path, Path]:
+    """A checkpoint that makes a folder when it is loaded carelessly, and that folder."""
+    path, victim = tmp_path / "malicious.pt", tmp_path / "victim"
+    torch.save({"model": Malicious(victim)}, path)
+    return path, victim
+
+
+def test_the_malicious_file_would_work_on_a_careless_loader(malicious: tuple[Path, Path]) -> None:
+    path, victim = malicious
+    torch.load(path, weights_only=False)
+    assert victim.is_dir()
+
+
+def test_unknown_names_are_refused_even_with_the_right_checksum(malicious: tuple[Path, Path]) -> None:
+    path, victim = malicious
+    with pytest.raises(WeightsError, match=r"malicious\.pt.*safely"):
+        read_checkpoint(path, sha256_of(path))
+    assert not victim.exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"cbuiltins\neval\n(V__import__('os').mkdir('{victim}')\ntR.",
+        b"cbuiltins\ngetattr\n(cbuiltins\n__import__\nVsystem\ntR.",
+        b"not a pickle at all",
+        b"",
+    ],
+)
+def test_bare_pickles_and_rubbish_are_refused(tmp_path: Path, content: bytes) -> None:
+    path, victim = tmp_path / "rubbish.pt", tmp_path / "victim"
+    path.write_bytes(content.replace(b"{victim}", str(victim).encode()))
+    with pytest.raises(WeightsError, match=r"rubbish\.pt"):
+        read_checkpoint(path, sha256_of(path))
+    assert not victim.exists()
+
+
+def test_the_checksum_is_compared_before_anything_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "other.pt"
+    torch.save({}, path)
+
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("opened before the checksum was known")
+
+    monkeypatch.setattr(torch, "load", never)
+    monkeypatch.setattr(pickle, "Unpickler", never)
+    with pytest.raises(WeightsError, match="checksum"):
+        read_checkpoint(path, "0" * 64)
+
+
+def test_foreign_modules_give_their_tensors_and_stay_inert(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tree of classes that exist only while it is written, as on the machine where a network was trained."""
+    foreign = ModuleType("ultralytics.nn.modules.conv")
+
+    class Conv(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.conv = nn.Conv2d(3, 4, 3, bias=False)
+            self.bn = nn.BatchNorm2d(4)
+
+        def __setstate__(self, state: dict[str, Any]) -> None:
+            raise AssertionError("code of the foreign class ran")
+
+    Conv.__module__, Conv.__qualname__ = foreign.__name__, "Conv"
+    foreign.Conv = Conv  # type: ignore[attr-defined]
+    for package in ("ultralytics", "ultralytics.nn", "ultralytics.nn.modules"):
+        monkeypatch.setitem(sys.modules, package, ModuleType(package))
+    monkeypatch.setitem(sys.modules, foreign.__name__, foreign)
+    network = nn.Sequential(Conv(), nn.Identity(), Conv()).half()
+    path = tmp_path / "foreign.pt"
+    torch.save({"model": network, "epoch": -1}, path)
+    expected = network.state_dict()
+    monkeypatch.undo()
+    assert foreign.__name__ not in sys.modules
+
+    tensors = read_checkpoint(path, sha256_of(path))
+    assert tensors.keys() == expected.keys()
+    assert all(torch.equal(tensors[name], tensor) for name, tensor in expected.items())
+    assert foreign.__name__ not in sys.modules
+
+
+def test_a_file_without_a_model_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "empty.pt"
+    torch.save({"epoch": 3}, path)
+    with pytest.raises(WeightsError, match="safely"):
+        read_checkpoint(path, sha256_of(path))

@@ -1,0 +1,1 @@
+"""Batches of runs on one machine or on a Ray cluster."""

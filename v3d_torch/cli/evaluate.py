@@ -1,0 +1,91 @@
+"""``python -m v3d_torch evaluate GROUNDTRUTH ESTIMATE``: the scores of a trajectory, beside the paper's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from v3d_torch.io.paths import expand_user_paths
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from v3d_torch.evaluation import Evaluation
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+@app.command()
+@expand_user_paths
+def main(
+    groundtruth: Annotated[Path, typer.Argument(help="True poses: stamp tx ty tz qx qy qz qw, camera to world.")],
+    estimate: Annotated[Path, typer.Argument(help="Estimated poses, in the same layout and any world.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
+    max_difference: Annotated[
+        float, typer.Option(min=0.0, help="Stamps farther apart than this are no pair, seconds.")
+    ] = 0.02,
+    delta: Annotated[float, typer.Option(min=1e-3, help="Time over which RPE measures drift, seconds.")] = 1.0,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Colour-depth pairs of the sequence, to say how many have a pose.")
+    ] = None,
+    sequence: Annotated[
+        str | None, typer.Option(help="Sequence of the paper's tables, such as fr3/w/xyz [guessed from the paths].")
+    ] = None,
+) -> None:
+    """Score a trajectory by ATE and RPE, as the TUM benchmark does.
+
+    ATE is the absolute error of the aligned positions, RPE the relative one of the motion over a time.
+    """
+    from rich.console import Console
+
+    from v3d_torch.datasets.tum_trajectory import read_trajectory
+    from v3d_torch.errors import InputError, V3DError
+    from v3d_torch.evaluation import evaluate
+    from v3d_torch.evaluation.tables import paper_sequence, paper_table
+
+    try:
+        truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)
+        if sequence is not None and paper_sequence(sequence) is None:
+            raise InputError(f"--sequence {sequence}: is not in the paper's tables; one is fr3/w/xyz")
+        try:
+            evaluation = evaluate(truth, poses, max_time_difference=max_difference, rpe_delta=delta, frames=frames)
+        except InputError as error:
+            raise InputError(f"{groundtruth}, {estimate}: {error}") from error
+    except V3DError as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(evaluation.to_dict(), indent=2))
+        return
+    console = Console(soft_wrap=True, highlight=False)
+    console.print(_summary(evaluation))
+    for note in evaluation.notes:
+        console.print(f"note: {note}")
+    name = sequence or paper_sequence(groundtruth.as_posix()) or paper_sequence(estimate.as_posix())
+    if name is not None and (table := paper_table(name, evaluation)) is not None:
+        console.print(table)
+
+
+def _summary(evaluation: Evaluation) -> Table:
+    from dataclasses import astuple, fields
+
+    from rich.table import Table
+
+    from v3d_torch.evaluation.statistics import Statistics
+
+    covered = f", {evaluation.coverage:.1%} of the frames" if evaluation.coverage is not None else ""
+    rows = {"ATE, m": evaluation.ate}
+    if (rpe := evaluation.rpe) is not None:
+        over = "s" if rpe.delta == 1 else f"{rpe.delta:g} s"
+        rows |= {f"RPE, m/{over}": rpe.trans, f"RPE, deg/{over}": rpe.rot}
+    table = Table(title=f"{evaluation.pairs} of {evaluation.poses} poses have ground truth{covered}")
+    table.add_column("error")
+    for field in fields(Statistics):
+        table.add_column(field.name, justify="right")
+    for name, statistics in rows.items():
+        table.add_row(name, *(f"{value:.4f}" for value in astuple(statistics)))
+    return table

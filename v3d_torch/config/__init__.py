@@ -1,0 +1,51 @@
+"""Typed configuration of all stages."""
+
+from __future__ import annotations
+
+from v3d_torch.config.schema import (
+    ChamferConfig,
+    CheckpointConfig,
+    CloudConfig,
+    Config,
+    DenseMapConfig,
+    DenseOdometryConfig,
+    DepthConfig,
+    FeaturesConfig,
+    FreeSpaceConfig,
+    LoopConfig,
+    MappingConfig,
+    MeshConfig,
+    ObjectsConfig,
+    OdometryConfig,
+    RollingShutterConfig,
+    Section,
+    SegmentationConfig,
+    StaticMaskConfig,
+    TrackerConfig,
+    TrackingConfig,
+    VotingConfig,
+)
+
+__all__ = [
+    "FreeSpaceConfig",
+    "ChamferConfig",
+    "CheckpointConfig",
+    "CloudConfig",
+    "Config",
+    "DenseOdometryConfig",
+    "DenseMapConfig",
+    "DepthConfig",
+    "FeaturesConfig",
+    "TrackerConfig",
+    "LoopConfig",
+    "MappingConfig",
+    "StaticMaskConfig",
+    "MeshConfig",
+    "OdometryConfig",
+    "ObjectsConfig",
+    "Section",
+    "SegmentationConfig",
+    "RollingShutterConfig",
+    "TrackingConfig",
+    "VotingConfig",
+]

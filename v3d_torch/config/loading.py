@@ -1,0 +1,145 @@
+"""The configuration from files and the command line: defaults, then YAML, then ``section.key=value``."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from v3d_torch.config import Config, Section
+from v3d_torch.config.validation import first_error
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.io.files import StrPath, read_text
+from v3d_torch.io.paths import expand_user
+from v3d_torch.io.safe_yaml import parse_yaml
+
+_NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
+"""Between which a number lies that is neither 0 nor infinite."""
+
+FULL = "full"
+"""The whole system, as it is by default."""
+
+_FOLDER = Path(__file__).parent / "yaml"
+CONFIGS: Mapping[str, Path] = {
+    FULL: _FOLDER / "default.yaml",
+    **{path.stem: path for path in sorted(_FOLDER.rglob("*.yaml"))},
+}
+"""The configurations that come with the package, by name: the default (`FULL`), the paper's and the ablations'."""
+
+
+def find_config(name: StrPath) -> Path:
+    """The file of a configuration.
+
+    Args:
+        name: a key of `CONFIGS`, such as ``paper``, or the path of a YAML file.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    if str(name) in CONFIGS:
+        return CONFIGS[str(name)]
+    with suppress(OSError):  # a name that is too long
+        if (path := expand_user(name)).is_file():
+            return path
+    raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
+
+
+def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> Config:
+    """Defaults, then a YAML file, then ``section.key=value`` overrides.
+
+    Args:
+        name: ``paper`` or another of `CONFIGS`, or a YAML file with any part of the tree; None for the defaults.
+        overrides: texts such as ``objects.voting.distance_threshold=0.05``, or one; values are read as YAML.
+
+    Raises:
+        ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
+    """
+    tree = {} if name is None else _read_yaml(find_config(name))
+    return _overridden(tree, _validated(tree, f"{name}"), overrides)
+
+
+def changed(config: Config, overrides: Iterable[str]) -> Config:
+    """A configuration with other values, given and refused as by `load_config`."""
+    return _overridden(config.model_dump(), config, overrides)
+
+
+def _overridden(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
+    for override in [overrides] if isinstance(overrides, str) else overrides:  # which is an iterable of letters
+        _apply_override(tree, override)
+        config = _validated(tree, "--set")
+    return config
+
+
+def dump_config(config: Config) -> str:
+    """The resolved configuration as YAML that `load_config` reads back."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _validated(tree: Mapping[str, Any], source: str) -> Config:
+    _refuse_unknown_keys(tree, Config, source)
+    try:
+        config = Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {first_error(error)}") from error
+    _refuse_absurd_numbers(config, source)
+    return config
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        tree = parse_yaml(read_text(path, "a configuration is a YAML file"))
+    except InputError as error:
+        raise ConfigError(str(error)) from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: is not valid YAML ({error}); repair it") from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{path}: holds a {type(tree).__name__}; a configuration is a mapping of sections")
+    return tree
+
+
+def _apply_override(tree: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"--set {override!r}: write section.key=value, such as objects.voting.vote_threshold=2")
+    *sections, leaf = key.strip().split(".")
+    for section in sections:
+        tree = tree.setdefault(section, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"--set {override!r}: {section!r} is a value, it has no keys below it")
+    try:
+        tree[leaf] = parse_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"--set {override!r}: the value is not valid YAML ({error})") from error
+
+
+def _refuse_absurd_numbers(section: Section, source: str, prefix: str = "") -> None:
+    """Numbers that a rule of their own lets through, and with which arithmetic or memory overflows."""
+    for name, value in section:
+        if isinstance(value, Section):
+            _refuse_absurd_numbers(value, source, f"{prefix}{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if name == "seed" or type(number) not in _NUMBERS or number == 0 or math.isinf(number):
+                continue
+            least, most = _NUMBERS[type(number)]
+            if not least <= abs(number) <= most:
+                raise ConfigError(
+                    f"{source}: {prefix}{name}: input should lie between {least:g} and {most:g}, got {number!r:.40}"
+                )
+
+
+def _refuse_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
+    for key, value in tree.items():
+        field = section.model_fields.get(str(key))
+        if field is None:
+            near = difflib.get_close_matches(str(key), section.model_fields, n=1, cutoff=0.0)[0]
+            raise ConfigError(f"{source}: there is no {prefix}{key}; did you mean {prefix}{near}?")
+        if isinstance(value, Mapping) and isinstance(field.annotation, type) and issubclass(field.annotation, Section):
+            _refuse_unknown_keys(value, field.annotation, source, f"{prefix}{key}.")

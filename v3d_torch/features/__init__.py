@@ -1,0 +1,1 @@
+"""ORB features: detection, matching, projection search, RANSAC."""

@@ -1,0 +1,1 @@
+"""Camera model, rigid motions and depth images as tensors."""

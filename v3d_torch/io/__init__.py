@@ -1,0 +1,1 @@
+"""Files on disk and on the web: text, PLY, YAML, archives, downloads, timestamps."""

@@ -1,1 +1,0 @@
-"""Batches: many runs, each in a process of its own, on one machine or on a cluster."""

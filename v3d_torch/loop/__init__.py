@@ -1,1 +1,0 @@
-"""Loop closing: places, pose graph (paper, Sec. III-E)."""

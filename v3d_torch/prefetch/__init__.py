@@ -1,0 +1,1 @@
+"""Preprocessing of the next frames in a thread or a second process."""

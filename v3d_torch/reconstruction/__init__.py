@@ -1,0 +1,1 @@
+"""Dense reconstruction of the static scene: point map and triangle mesh."""

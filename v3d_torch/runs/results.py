@@ -1,0 +1,191 @@
+"""The results of a run as files: the contract that other tools read (README, "Results")."""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+import sys
+from collections.abc import Sized
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+
+from v3d_torch.config.loading import dump_config
+from v3d_torch.datasets.tum_trajectory import write_trajectory
+from v3d_torch.errors import InputError
+from v3d_torch.evaluation import Evaluation, evaluate
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.io.ply import write_ply
+from v3d_torch.mapping.keyframe import stack_poses
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.reconstruction.mesh import fuse_mesh
+from v3d_torch.reconstruction.point_map import fuse_points
+from v3d_torch.types import TrackingStatus, Trajectory
+from v3d_torch.viz.frustums import camera_path
+from v3d_torch.viz.run_figures import draw_run
+
+if sys.platform != "win32":
+    import resource
+
+_LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
+
+_DYNAMICS = pa.schema(
+    [
+        ("frame", pa.int64()),
+        ("stamp", pa.float64()),
+        ("id", pa.int64()),
+        ("class", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+        ("votes", pa.int64()),
+        ("chamfer", pa.float64()),
+        ("motion_state", pa.string()),
+        ("missed", pa.bool_()),
+    ]
+)
+
+
+def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
+    """Write everything that a run leaves behind, ``metrics.json`` last: where it is, all the rest is.
+
+    Args:
+        folder: of this run; made when it is not there.
+        pipeline: that has run, to the end or not.
+
+    Returns:
+        The scores where there is ground truth.
+
+    Raises:
+        OutputError: when the folder cannot be written or the disk is full.
+    """
+    trajectory, evaluation = _write_tables(folder, pipeline)
+    _write_maps(folder, pipeline, trajectory)
+    draw_run(folder / "figures", pipeline, trajectory)
+    _write_metrics(folder, pipeline, evaluation, pipeline.record.failure)
+    return evaluation
+
+
+def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
+    """Write what a run that goes on has until now: all but maps and figures, which take seconds.
+
+    Args:
+        folder: of this run; made when it is not there.
+        pipeline: between two frames.
+
+    Raises:
+        OutputError: when the folder cannot be written or the disk is full.
+    """
+    _, evaluation = _write_tables(folder, pipeline)
+    done = len(pipeline.slam.poses.statuses)
+    known = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
+    _write_metrics(folder, pipeline, evaluation, f"killed, or still running, after {done}{known} frames")
+
+
+def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluation | None]:
+    """Poses and rows of all frames so far, and the scores where there is ground truth."""
+    slam, sequence = pipeline.slam, pipeline.sequence
+    trajectory = slam.poses.trajectory()
+    write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
+    write_text(folder / "config.yaml", dump_config(slam.config))
+    own = [keyframe for keyframe in slam.mapper.map.active_keyframes if not keyframe.is_from_earlier_run]
+    stamps = torch.tensor([keyframe.stamp for keyframe in own], dtype=torch.float64)
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(stack_poses(own))))
+    evaluation = None
+    if sequence.groundtruth is not None:
+        write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
+        with suppress(InputError):  # too few poses to score are still worth writing
+            evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
+    _write_table(folder / "frames.parquet", *_frames(pipeline))
+    _write_table(folder / "dynamics.parquet", pipeline.record.dynamics, _DYNAMICS)
+    return trajectory, evaluation
+
+
+def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> None:
+    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation, failure), indent=2) + "\n")
+
+
+def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
+    """How each frame was found, whether the map kept it, and the seconds of each stage; 0 where one did not run."""
+    slam, rows = pipeline.slam, pipeline.record.frames
+    stages = list(slam.timer.seconds)
+    columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
+    kept = {keyframe.frame for keyframe in slam.mapper.map.active_keyframes}
+    table: list[dict[str, object]] = [
+        {
+            **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in kept},
+            **{f"seconds_{stage}": row.get(stage, 0.0) for stage in stages},
+        }
+        for row, status in zip(rows, slam.poses.statuses, strict=False)  # interrupted within a frame: one row less
+    ]
+    return table, pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
+
+
+def _write_table(path: Path, rows: list[dict[str, object]], schema: pa.Schema) -> None:
+    with atomic_write(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
+
+
+def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> dict[str, object]:
+    slam, run = pipeline.slam, pipeline.record
+    statuses = slam.poses.statuses
+    frames = len(statuses)
+    counts = {status.value: statuses.count(status) for status in TrackingStatus}
+    masks = run.mask_evaluation.scores()
+    return {
+        **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
+        "masks": masks.to_dict() if masks is not None else None,
+        "sequence": pipeline.sequence.name,
+        "frames": pipeline.frames,
+        "processed": frames,
+        **counts,
+        "status": [status.value for status in statuses],
+        "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.mapper.map.active_keyframes),
+        "known_keyframes": sum(keyframe.is_from_earlier_run for keyframe in slam.mapper.map.active_keyframes),
+        "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
+        "loops": slam.loop_closer.loop_count,
+        "readout": slam.mapper.map.readout.seconds,
+        "failure": failure,
+        "fps": frames / run.seconds if run.seconds else None,
+        "seconds": run.seconds,
+        "seconds_per_stage": dict(slam.timer.seconds),
+        "peak_memory_mb": _peak_memory_mb(),
+        "seed": slam.config.seed,
+        "versions": {
+            "v3d-torch": version("v3d-torch"),
+            "python": platform.python_version(),
+            **{name: version(name) for name in _LIBRARIES},
+        },
+        "machine": {"processor": platform.machine(), "system": platform.system(), "threads": slam.config.threads},
+    }
+
+
+def _peak_memory_mb() -> float | None:
+    if sys.platform == "win32":
+        return None
+    if (status := Path("/proc/self/status")).is_file():  # Linux: there getrusage counts the parent process in
+        found = re.search(r"^VmHWM:\s*(\d+) kB$", status.read_text(encoding="utf-8"), re.MULTILINE)
+        if found is not None:
+            return int(found[1]) / (1 << 10)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+
+
+def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
+    slam, views = pipeline.slam, pipeline.views
+    cloud = fuse_points(views, slam.config)
+    write_ply(folder / "map.ply", cloud.points, cloud.colours, normals=cloud.normals)
+    if slam.config.dense_map.mesh.enabled:
+        mesh = fuse_mesh(views, slam.config.dense_map)
+        write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    kept = slam.mapper.map.active_keyframes
+    frames = [keyframe.frame for keyframe in kept]
+    statuses = [status.value for status in slam.poses.statuses]
+    path = camera_path(trajectory, statuses, invert(stack_poses(kept)), frames, pipeline.sequence.camera)
+    write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -1,0 +1,1 @@
+"""Threads, memory, timing, and checks of what callers pass in."""
