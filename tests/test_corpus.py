@@ -145,11 +145,11 @@ def test_results_of_an_earlier_run_are_replaced_and_other_files_stay(place: Plac
 
 
 def test_nothing_that_a_run_writes_is_left_for_the_next(place: Place) -> None:
-    """Whoever adds a file to the results adds it to what `prepare_folder` removes."""
-    from v3d_torch.runs.result_folder import prepare_folder
+    """Whoever adds a file to the results adds it to what `clear_earlier_results` removes."""
+    from v3d_torch.runs.result_folder import clear_earlier_results
 
     assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks", "--mesh"]).exit_code == 0
     assert CliRunner().invoke(report.app, [str(place.out)]).exit_code == 0
     assert len(list(place.out.iterdir())) > 10
-    prepare_folder(place.out)
+    clear_earlier_results(place.out)
     assert [path.name for path in place.out.iterdir()] == ["run.log"]

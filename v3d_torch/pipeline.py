@@ -1,14 +1,15 @@
-"""A whole sequence through the system, with everything that the results need noted on the way."""
+"""A whole sequence through the system, with the records that the results need."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.masks import MaskEvaluation
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.motion_classifier import FrameObjects, MotionState, TrackedObject
@@ -24,38 +26,50 @@ from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
 from v3d_torch.runtime.process import trim_memory
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import RGBDFrame, TrackingStatus
+from v3d_torch.types import RGBDFrame
 from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
 
 _LOG = logging.getLogger(__name__)
 
-FrameCallback = Callable[[RGBDFrame, FrameObjects, TrackingStatus], None]
+_SNAPSHOTS = 6
+"""Number of frames in the figure of masks."""
+
+_TRIM_INTERVAL = 200
+"""Frames between two calls of `trim_memory`, which takes some milliseconds."""
+
+FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A frame kept for the figures: its images, its pose as it was then, and what was said of it."""
+    """A frame that is kept for the figures.
+
+    Attributes:
+        frame: Frame.
+        T_cw: World-to-camera pose at that time, float64, shape :math:`(4, 4)`.
+        objects: Objects of the frame.
+    """
 
     frame: RGBDFrame
     T_cw: Tensor
-    scene: FrameObjects
+    objects: FrameObjects
 
 
 @dataclass
 class RunRecord:
-    """What a run leaves behind beside the trajectory.
+    """Records of a run beside the trajectory.
 
     Attributes:
-        frames: a row per frame: its index and stamp, and the seconds of each stage.
-        dynamics: a row per frame and object, as it goes into the table of the results.
-        snapshots: frames for the figure of masks.
-        liveliest: the frame with the most votes for what is dynamic, of those with as many the one with most objects.
-        mask_evaluation: of the frames whose true masks are known.
-        seconds: wall time of the frames.
-        failure: why the run ended before the sequence did; None when it did not.
-        interrupted: whether the user ended it.
-        unscored: why masks were not evaluated although there are true ones.
-        unsaved: why what there was could not be written while the run went on.
+        frames: One row per frame: index, timestamp and seconds of each stage.
+        dynamics: One row per frame and object, as in the table of the results.
+        snapshots: Frames for the figure of masks.
+        most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
+        mask_evaluation: Evaluation of the masks against true masks.
+        seconds: Wall time of all frames, seconds.
+        failure: Reason why the run ended before the sequence; None if it did not.
+        interrupted: True if the user interrupted the run.
+        mask_error: Reason why the masks were not evaluated although there are true masks; None if there is none.
+        save_error: Reason why a checkpoint could not be written; None if there is none.
     """
 
     frames: list[dict[str, float]] = field(default_factory=list)
@@ -74,19 +88,17 @@ class Pipeline:
     """Runs a sequence through the system.
 
     Args:
-        sequence: frames to take in, stored or as they come.
-        slam: the system; of a stored sequence, the frames that it has taken in already are passed over.
-        masks: folder for an image per frame of what was left out of tracking; None for none.
-        viewer: looks on.
-        views: of the keyframes of a known map; None for none.
-        score: whether masks are compared with the true ones, where there are any.
+        sequence: Frames, stored or live.
+        slam: System; frames of a stored sequence that it has processed already are skipped.
+        masks: Folder for an image of the masked pixels per frame; None writes none.
+        viewer: Viewer that is shown each frame.
+        views: Views of the keyframes of a known map; None starts without views.
+        evaluate_masks: False to not compare the masks with true masks.
 
     Attributes:
-        whole: whether no frame is half taken in.
+        record: Records of the run.
+        between_frames: False while a frame is processed, and if the processing of a frame failed.
     """
-
-    _SNAPSHOTS = 6
-    _TIDY = 200  # frames: giving memory back takes some ms
 
     def __init__(
         self,
@@ -96,7 +108,7 @@ class Pipeline:
         viewer: Viewer = NULL_VIEWER,
         views: StaticViews | None = None,
         *,
-        score: bool = True,
+        evaluate_masks: bool = True,
     ) -> None:
         self.sequence = sequence
         self.slam = slam
@@ -105,133 +117,144 @@ class Pipeline:
         self.between_frames = True
         self._masks = masks
         self._viewer = viewer
-        self._score = score
-        self._step = 1
-        self._percepts: FramePrefetcher | None = None
+        self._with_mask_evaluation = evaluate_masks
+        self._snapshot_step = 1
+        self._prefetcher: FramePrefetcher | None = None
 
     @property
     def frames(self) -> int:
-        """Frames that there are to take in; of a stream, which does not know, those taken in."""
+        """Number of frames of the sequence; of a live stream, the number processed so far."""
         return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses.statuses)
 
     def __call__(self, on_frame: FrameCallback | None = None) -> RunRecord:
-        """Process all frames. What was computed is kept when a frame cannot be read or the user interrupts.
+        """Process all frames. If a frame cannot be read or the user interrupts, the results so far are kept.
 
-        An interrupt is how a stream without an end is meant to end, and no failure.
+        Interrupting is the normal way to end a live stream, and is not a failure.
 
         Args:
-            on_frame: called after each frame.
+            on_frame: Called after each frame.
         """
-        self.record.failure, self.record.interrupted = None, False
-        before, start = self.record.seconds, time.perf_counter()
+        record = self.record
+        record.failure, record.interrupted = None, False
+        before, start = record.seconds, time.perf_counter()
         try:
-            # Nobody learns through a run: to keep no gradients in mind saves a tenth of the time.
-            with torch.inference_mode(), closing(self.get_ready()) as percepts:
+            with torch.inference_mode(), closing(self.start_prefetching()) as prefetcher:
                 start = time.perf_counter()
-                for percept in percepts:
+                for preprocessed in prefetcher:
                     self.between_frames = False
-                    frame, scene = percept.frame, self.slam.track(percept)
+                    frame, result = preprocessed.frame, self.slam.track(preprocessed)
                     seconds = self.slam.timer.lap()
-                    self.record.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
-                    self._note(frame, scene)
-                    self._viewer.show(frame, scene, self.slam, seconds)
-                    self.record.seconds, self.between_frames = before + time.perf_counter() - start, True
+                    record.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
+                    self._record(frame, result)
+                    self._viewer.show(frame, result, self.slam, seconds)
+                    record.seconds, self.between_frames = before + time.perf_counter() - start, True
                     if on_frame is not None:
-                        on_frame(frame, scene, self.slam.poses.statuses[-1])
-                    if len(self.record.frames) % self._TIDY == 0:
+                        on_frame(frame, result)
+                    if len(record.frames) % _TRIM_INTERVAL == 0:
                         trim_memory()
         except V3DError as error:
-            self.record.failure = str(error)
-        except Exception as error:  # what was computed is worth keeping when the program is at fault, too
-            _LOG.exception("the run broke")
-            why = (str(error).splitlines() or [""])[0]
-            self.record.failure = f"the program failed with {type(error).__name__}: {why}; report it with the run.log"
+            record.failure = str(error)
+        except Exception as error:  # an error of the program must not cost the results so far
+            _LOG.exception("the run failed")
+            reason = (str(error).splitlines() or [""])[0]
+            record.failure = f"the program failed with {type(error).__name__}: {reason}; report it with the run.log"
         except KeyboardInterrupt:
-            self.record.interrupted = True
+            record.interrupted = True
             if isinstance(self.sequence, Sized):
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
-                self.record.failure = f"interrupted after {done} of {total} frames"
-        self.record.seconds, self._percepts = before + time.perf_counter() - start, None
-        return self.record
+                record.failure = f"interrupted after {done} of {total} frames"
+        record.seconds, self._prefetcher = before + time.perf_counter() - start, None
+        return record
 
-    def get_ready(self) -> FramePrefetcher:
-        """What looks at the frames, begun and up, which may take seconds: a call does it first of all."""
-        if self._percepts is None:
-            self._percepts = FramePrefetcher(self._coming(), self.slam, ahead=self.slam.config.prefetch)
-        return self._percepts
+    def start_prefetching(self) -> FramePrefetcher:
+        """Return the prefetcher of the frames; its start can take seconds, and a call of the pipeline does it first."""
+        if self._prefetcher is None:
+            self._prefetcher = FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
+        return self._prefetcher
 
     @torch.inference_mode()
     def flush(self) -> None:
-        """After the last frame: take in what is still being solved for it, and let the viewer show how all came out."""
+        """After the last frame: apply the pending result of the back end, and show the final state in the viewer."""
         self.slam.flush()
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:
             self.record.failure = self.record.failure or str(error)
 
-    def _coming(self) -> Iterator[RGBDFrame]:
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the run between two frames: system, records and views."""
+        return {"slam": self.slam.state_dict(), "record": self.record, "views": self.views.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self.slam.load_state_dict(state["slam"])
+        self.record = state["record"]
+        self.views.load_state_dict(state["views"])
+
+    def _remaining_frames(self) -> Iterator[RGBDFrame]:
         done = len(self.slam.poses.statuses) if isinstance(self.sequence, RGBDSequence) else 0
         if isinstance(self.sequence, StoredSequence):
             return self.sequence.frames_from(done)
         return islice(iter(self.sequence), done, None)
 
-    def _note(self, frame: RGBDFrame, scene: FrameObjects) -> None:
-        self.record.dynamics.extend(_row(frame, judged) for judged in scene.objects)
-        self._evaluate_masks(frame, scene)
+    def _record(self, frame: RGBDFrame, result: FrameResult) -> None:
+        self.record.dynamics.extend(_dynamics_row(frame, each) for each in result.objects)
+        self._evaluate_masks(frame, result)
         if self._masks is not None:
-            left_out = (~scene.static_mask).to(torch.uint8) * 255
-            write_png(self._masks / f"{frame.stamp:.6f}.png", left_out.numpy())
-        keyframes = self.slam.mapper.map.keyframes
+            masked = (~result.static_mask).to(torch.uint8) * 255
+            write_png(self._masks / f"{frame.stamp:.6f}.png", masked.numpy())
+        keyframes = self.slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.views.add(keyframes[-1], frame.image, frame.depth, scene.static_without_people)
-        self._keep_for_figures(Snapshot(frame, self.slam.poses.T_cw, scene))
+            self.views.add(keyframes[-1], frame.image, frame.depth, result.static_without_people)
+        self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
 
-    def _keep_for_figures(self, shot: Snapshot) -> None:
-        """Keep every so manieth frame; of a stream, whose length is not known, ever fewer. And the liveliest."""
+    def _keep_snapshot(self, snapshot: Snapshot) -> None:
+        """Keep frames at equal distances; the distance grows with a live stream. And keep the most dynamic one."""
         best = self.record.most_dynamic_snapshot
-        if best is None or _liveliness(shot.scene) > _liveliness(best.scene):
-            self.record.most_dynamic_snapshot = shot
+        if best is None or _dynamic_votes(snapshot.objects) > _dynamic_votes(best.objects):
+            self.record.most_dynamic_snapshot = snapshot
         snapshots = self.record.snapshots
         if isinstance(self.sequence, Sized):
-            step = max(len(self.sequence) // self._SNAPSHOTS, 1)
-            wanted = shot.frame.index % step == step // 2 and len(snapshots) < self._SNAPSHOTS
+            step = max(len(self.sequence) // _SNAPSHOTS, 1)
+            wanted = snapshot.frame.index % step == step // 2 and len(snapshots) < _SNAPSHOTS
         else:
-            if len(snapshots) == 2 * self._SNAPSHOTS:
+            if len(snapshots) == 2 * _SNAPSHOTS:
                 del snapshots[1::2]
-                self._step *= 2
-            wanted = shot.frame.index % self._step == 0
+                self._snapshot_step *= 2
+            wanted = snapshot.frame.index % self._snapshot_step == 0
         if wanted:
-            snapshots.append(shot)
+            snapshots.append(snapshot)
 
-    def _evaluate_masks(self, frame: RGBDFrame, scene: FrameObjects) -> None:
+    def _evaluate_masks(self, frame: RGBDFrame, result: FrameResult) -> None:
         truth = None
-        if self._score and isinstance(self.sequence, HasMotionMasks) and self.record.mask_error is None:
+        if self._with_mask_evaluation and isinstance(self.sequence, HasMotionMasks) and self.record.mask_error is None:
             try:
                 truth = self.sequence.motion_mask(frame.index)
-            except InputError as error:  # the truth is for the scores only
+            except InputError as error:  # true masks only serve the evaluation
                 self.record.mask_error = str(error)
         if truth is not None:
-            objects = {judged.id: judged.mask for judged in scene.objects}
-            self.record.mask_evaluation.add(frame.stamp, truth, frame.depth, ~scene.static_mask, objects)
+            masks = {each.id: each.mask for each in result.objects}
+            self.record.mask_evaluation.add(frame.stamp, truth, frame.depth, ~result.static_mask, masks)
 
 
-def _liveliness(scene: FrameObjects) -> tuple[int, int]:
-    dynamic = {judged.id for judged in scene.objects if judged.motion_state is MotionState.DYNAMIC}
-    return sum(elected in dynamic for _, elected in scene.vote_pairs), len(scene.objects)
+def _dynamic_votes(objects: FrameObjects) -> tuple[int, int]:
+    """Return the number of votes for dynamic objects, and the number of objects."""
+    dynamic = {each.id for each in objects.objects if each.motion_state is MotionState.DYNAMIC}
+    return sum(candidate in dynamic for _, candidate in objects.vote_pairs), len(objects.objects)
 
 
-def _row(frame: RGBDFrame, judged: TrackedObject) -> dict[str, object]:
-    x, y, z = judged.centroid.tolist()
+def _dynamics_row(frame: RGBDFrame, tracked: TrackedObject) -> dict[str, object]:
+    x, y, z = tracked.centroid.tolist()
     return {
         "frame": frame.index,
         "stamp": frame.stamp,
-        "id": judged.id,
-        "class": class_name(judged.label),
+        "id": tracked.id,
+        "class": class_name(tracked.label),
         "x": x,
         "y": y,
         "z": z,
-        "votes": judged.votes,
-        "chamfer": judged.chamfer,
-        "motion_state": judged.motion_state.value,
-        "missed": judged.missed,
+        "votes": tracked.votes,
+        "chamfer": tracked.chamfer,
+        "motion_state": tracked.motion_state.value,
+        "missed": tracked.missed,
     }

@@ -43,10 +43,10 @@ class V3DSLAM:
     look at a frame by itself (`perceive`), and may run ahead of those that follow the camera (`take_in`).
 
     Args:
-        camera: intrinsics; None takes those of the first frame.
+        camera: Camera of all frames.
         segment: gives the instances of a frame; None takes what the configuration names.
         config: of all stages.
-        known: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
+        known_map: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
 
     Attributes:
         camera: of all frames; None before the first, where it was not given.
@@ -59,26 +59,17 @@ class V3DSLAM:
 
     def __init__(
         self,
-        camera: PinholeCamera | None = None,
+        camera: PinholeCamera,
         segment: Segmenter | None = None,
         config: Config | None = None,
-        known: SparseMap | None = None,
+        known_map: SparseMap | None = None,
     ) -> None:
         check_parts(camera, config)
-        self.config = config or Config()
-        self.segment = segment or make_segmenter(self.config.segmentation)
-        self.poses = PoseHistory()
+        self.camera = camera
+        self.config = config = config or Config()
         self.timer = StageTimer()
-        self._last: TrackedFrame | None = None
-        self._memory: object = None
-        self._known = known
-        self.outlooks = [self.outlook()] * PREFETCHED_FRAMES
-        self.camera: PinholeCamera | None = None
-        if camera is not None:
-            self._set_up(camera)
-
-    def _set_up(self, camera: PinholeCamera) -> None:
-        config, given = self.config, dict(vars(self))
+        self.poses = PoseHistory()
+        self.segment = segment or make_segmenter(config.segmentation)
         self.smooth_depth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio)
         self.detect_features = ORB(config.features, camera)
         self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
@@ -92,7 +83,7 @@ class V3DSLAM:
         self.compensate_rolling_shutter = RollingShutterCompensation(camera)
         self.compensate_depth_delay = DepthDelayCompensation(config, camera)
         self.map_tracker = MapTracker(config.tracking, config.features, camera)
-        self.mapper = Mapper(config, camera, self._known)
+        self.mapper = Mapper(config, camera, known_map)
         self.loop_closer = LoopCloser(config.loop, self.register, self.map_tracker, config.tracking.local_keyframes)
         for keyframe in self.mapper.map.active_keyframes:
             self.loop_closer.add_keyframe(keyframe)
@@ -100,8 +91,10 @@ class V3DSLAM:
         self.track_camera = CameraTracker(
             self.map_tracker, self.loop_closer, self.mapper.map, config.tracking.local_keyframes
         )
-        vars(self).update(given)  # a stage that the user put in place before the camera was known stays
-        self.camera = camera
+        self._last: TrackedFrame | None = None
+        self._memory: object = None
+        self._known = known_map
+        self.outlooks = [self.outlook()] * PREFETCHED_FRAMES
 
     def __call__(self, frame: RGBDFrame) -> FrameResult:
         """Take in the next frame.
@@ -135,9 +128,7 @@ class V3DSLAM:
             ConfigError: nobody said which camera took the first frame; the segmenter gave no instances.
             InputError: it is no frame, or not of this camera.
         """
-        camera = check_frame(frame, self.camera)
-        if self.camera is None:
-            self._set_up(camera)
+        check_frame(frame, self.camera)
         clock = StageTimer()
         with clock("segmentation"):  # III-A: instances, people among them set aside
             instances = self.segment(replace(frame, T_cw=None if outlook is None else outlook.at(frame.stamp)))
@@ -202,7 +193,7 @@ class V3DSLAM:
 
     def flush(self) -> None:
         """Take in what is being solved for the last keyframe. The next frame does that; after the last one, call it."""
-        if self.camera is None or (solved := self.back_end.result()) is None:
+        if (solved := self.back_end.result()) is None:
             return
         self.timer.add(solved.seconds)
         with self.timer("mapping"):

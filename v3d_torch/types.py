@@ -1,14 +1,14 @@
-"""The data that flows between stages: frozen dataclasses of tensors.
+"""Data that the stages exchange: frozen dataclasses of tensors.
 
-Conventions (see also docs/design.md): ``T_wc`` maps camera to world, ``p_w = T_wc @ p_c``; the camera looks
-along +z with x right and y down; pixel centres lie at integers and (u, v) = (column, row); depth is in metres and 0
-means "no measurement"; stamps are seconds.
+Conventions (see also docs/design.md): ``T_wc`` maps camera to world, ``p_w = T_wc @ p_c``; the camera looks along +z, x
+points right and y down; pixel centres lie at integers and (u, v) = (column, row); depth is in metres, 0 means "no
+measurement"; timestamps are in seconds.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
@@ -23,25 +23,34 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 
+@runtime_checkable
+class Stateful(Protocol):
+    """A component with state that changes from frame to frame, saved and restored as in `torch.nn.Module`."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state: tensors, numbers and data classes of the package."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> Any:
+        """Restore a state that `state_dict` of a component with the same configuration returned."""
+
+
 @dataclass(frozen=True)
 class RGBDFrame:
-    """One colour image and the depth image that belongs to it.
+    """One colour image and its registered depth image.
 
     Attributes:
-        index: position in the sequence, from 0.
-        stamp: time of the colour image, seconds.
-        image: colour, uint8 RGB, shape :math:`(3, H, W)`, as the camera delivers it (distorted).
-        depth: metres, float32, shape :math:`(1, H, W)`, pixel by pixel on the colour image; 0 = no measurement.
-        T_cw: world to camera where the camera is expected to be, float64, shape :math:`(4, 4)`; None before it is.
-        camera: that took both; None where who takes the frame in knows it.
-        delay: of the depth image, seconds after the colour image; less than 0 where it was taken before.
+        index: Position in the sequence, from 0.
+        stamp: Time of the colour image, seconds.
+        image: Colour image with lens distortion, uint8 RGB, shape :math:`(3, H, W)`.
+        depth: Depth registered to the colour image, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+        camera: Camera of both images; None if the receiver knows it.
+        depth_delay: Time of the depth image minus time of the colour image, seconds.
     """
 
     index: int
     stamp: float
     image: Tensor
     depth: Tensor
-    T_cw: Tensor | None = None
     camera: PinholeCamera | None = None
     depth_delay: float = 0.0
 
@@ -54,20 +63,20 @@ class RGBDFrame:
         camera: PinholeCamera | None = None,
         depth_delay: float = 0.0,
     ) -> RGBDFrame:
-        """A frame from images as cameras, simulators and image libraries give them.
+        """Make a frame from images as cameras, simulators and image libraries return them.
 
         Args:
-            index: position in the sequence, from 0.
-            stamp: seconds.
-            image: colour, uint8 RGB, shape :math:`(H, W, 3)`; also a view such as ``bgr[..., ::-1]``, or of PIL.
-            depth: pixel by pixel on it, shape :math:`(H, W)`: metres where it is a floating-point image, else the
-                camera's units; 0 or not a number = no measurement.
-            camera: that took both; gives the units of depth, millimetres where there is none.
-            delay: of the depth image, seconds after the colour image.
+            index: Position in the sequence, from 0.
+            stamp: Time of the colour image, seconds.
+            image: Colour image, uint8 RGB, shape :math:`(H, W, 3)`; views such as ``bgr[..., ::-1]`` and PIL images
+                are accepted.
+            depth: Depth registered to the colour image, shape :math:`(H, W)`: metres if floating point, else in the
+                units of the camera; 0 or NaN = no measurement.
+            camera: Camera of both images, which gives the depth units; without a camera they are millimetres.
+            depth_delay: Time of the depth image minus time of the colour image, seconds.
 
         Raises:
-            InputError: an image has another shape or type, or another size than the camera's; stamp or delay is no
-                number.
+            InputError: If an image has the wrong shape, type or size, or if a time is not a finite number.
         """
         colour, measured = _array(image), _array(depth)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
@@ -106,7 +115,7 @@ class RGBDFrame:
 
 
 def _array(image: object) -> NDArray[Any]:
-    """An image as an array: a tensor may be of a type that NumPy has not, or wait for gradients."""
+    """Return an image as an array; a tensor can have a dtype that NumPy lacks, or require gradients."""
     if isinstance(image, Tensor):
         image = image.detach()
         return (image.to(torch.float32) if image.is_floating_point() else image).numpy()
@@ -115,13 +124,13 @@ def _array(image: object) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Instances:
-    """What the segmentation sees in one image, best score first.
+    """Instances found by the segmentation in one image, sorted by score.
 
     Attributes:
-        masks: bool, shape :math:`(N, H, W)`; masks may overlap.
-        labels: COCO class index (0 = person, 0..79; -1 = unnamed), int64, shape :math:`(N,)`.
-        scores: float32 in [0, 1], shape :math:`(N,)`.
-        boxes: float32, shape :math:`(N, 4)`: left, top, right, bottom in pixels.
+        masks: Pixels of each instance, bool, shape :math:`(N, H, W)`; masks can overlap.
+        labels: COCO class index (0 = person, 0..79; -1 = unlabelled), int64, shape :math:`(N,)`.
+        scores: Confidence in [0, 1], float32, shape :math:`(N,)`.
+        boxes: Left, top, right and bottom edge, pixels, float32, shape :math:`(N, 4)`.
     """
 
     masks: Tensor
@@ -132,14 +141,14 @@ class Instances:
     def __len__(self) -> int:
         return self.labels.shape[0]
 
-    def __getitem__(self, keep: Tensor) -> Instances:
-        """Instances chosen by a boolean mask; all of them are these themselves, as masks take long to copy."""
-        if bool(keep.all()):
+    def __getitem__(self, selected: Tensor) -> Instances:
+        """Select instances by a boolean mask; returns self when everything is selected, to avoid copying masks."""
+        if bool(selected.all()):
             return self
-        return Instances(self.masks[keep], self.labels[keep], self.scores[keep], self.boxes[keep])
+        return Instances(self.masks[selected], self.labels[selected], self.scores[selected], self.boxes[selected])
 
     def concatenate(self, others: Instances) -> Instances:
-        """These instances, then the others; without others, these themselves."""
+        """Return these instances followed by others; returns self if there are no others."""
         if len(others) == 0:
             return self
         return Instances(
@@ -161,54 +170,64 @@ class Instances:
 
 
 Segmenter = Callable[[RGBDFrame], Instances]
-"""Finds the instances in a frame's colour image."""
+"""Finds the instances in the colour image of a frame."""
 
 
 @runtime_checkable
-class Remembering(Protocol):
-    """A segmenter that goes by the frames before.
+class PoseAwareSegmenter(Protocol):
+    """A segmenter that uses the predicted pose of the camera, for example to rotate images upright."""
 
-    Attributes:
-        memory: all that it remembers, of tensors and plain Python values, which it replaces and does not change. Given
-            back to another one made alike, that one goes on in its place.
-    """
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+        """Find the instances in the colour image of a frame.
 
-    memory: object
-
-
-def memory_of(segment: object) -> object:
-    """What a segmenter remembers; None where it does not go by the frames before."""
-    return segment.memory if isinstance(segment, Remembering) else None
+        Args:
+            frame: Frame.
+            T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`; None if it is not known.
+        """
 
 
-def remind(segment: object, memory: object) -> None:
-    """Give a segmenter, where it goes by the frames before, what one made alike remembered of them."""
-    if isinstance(segment, Remembering):
-        segment.memory = memory
+def segmenter_state(segment: object) -> dict[str, Any] | None:
+    """Return the state of a segmenter; None if it has no state."""
+    return segment.state_dict() if isinstance(segment, Stateful) else None
+
+
+def restore_segmenter(segment: object, state: Mapping[str, Any] | None) -> None:
+    """Restore the state of a segmenter, if it has state."""
+    if state is not None and isinstance(segment, Stateful):
+        segment.load_state_dict(state)
 
 
 class TrackingStatus(StrEnum):
-    """How a frame's pose was found."""
+    """Source of the pose of a frame."""
 
-    TRACKED = "tracked"  # in the map
-    ODOMETRY = "odometry"  # by its motion since the frame before, or to the one after
-    DISCONNECTED = "disconnected"  # in a part of the map that only a guess joins to the rest
-    LOST = "lost"  # not at all: predicted, and interpolated once the camera is found again
+    TRACKED = "tracked"
+    """Tracked in the map."""
+    ODOMETRY = "odometry"
+    """Integrated from the motion relative to the previous or the next frame."""
+    DISCONNECTED = "disconnected"
+    """Tracked in a part of the map whose pose relative to the rest is only a guess."""
+    LOST = "lost"
+    """Not found: predicted, and interpolated after the camera is found again."""
 
 
 @dataclass(frozen=True)
 class FramePose:
-    """A frame's pose as it was found.
+    """Estimated pose of a frame.
 
     Attributes:
-        status: how.
-        T_cw: world to camera, float64, shape :math:`(4, 4)`.
-        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
+        status: Source of the pose.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+        landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
     """
 
     status: TrackingStatus
     T_cw: Tensor
     landmarks: Tensor
+
+    @property
+    def landmark_ids(self) -> Tensor:
+        """Ids of the landmarks found, int64, shape :math:`(F,)`."""
+        return self.landmarks[self.landmarks >= 0]
 
     @property
     def count(self) -> int:
@@ -218,14 +237,14 @@ class FramePose:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Camera poses over time. Arrays, and lists of them, become tensors.
+    """Camera poses over time. Arrays and lists are converted to tensors.
 
     Attributes:
-        stamps: seconds, float64, shape :math:`(N,)`, strictly increasing.
-        T_wc: camera-to-world, float64, shape :math:`(N, 4, 4)`.
+        stamps: Timestamps, seconds, float64, shape :math:`(N,)`, strictly increasing.
+        T_wc: Camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
 
     Raises:
-        InputError: they are not numbers of these shapes.
+        InputError: If the values are not numbers of these shapes.
     """
 
     stamps: Tensor
@@ -237,11 +256,13 @@ class Trajectory:
             try:
                 value = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, dtype=np.float64))
             except (TypeError, ValueError) as error:
-                raise InputError(f"{name} of a trajectory are no numbers ({error}); give an array or tensor") from error
+                raise InputError(
+                    f"{name} of a trajectory are not numbers ({error}); give an array or tensor"
+                ) from error
             if value.shape[1:] != shape or value.ndim != 1 + len(shape) or len(value) != len(self.stamps):
                 raise InputError(
-                    f"{name} of a trajectory have the shape {tuple(value.shape)}; give stamps of shape (N,) and as many"
-                    " poses T_wc of shape (N, 4, 4)"
+                    f"{name} of a trajectory have shape {tuple(value.shape)}; give stamps of shape (N,) and poses T_wc of"
+                    " shape (N, 4, 4)"
                 )
             object.__setattr__(self, name, value.to(torch.float64))
 

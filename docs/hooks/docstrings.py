@@ -1,4 +1,4 @@
-"""Docstrings as they are written, in reStructuredText where it matters, to the Markdown that the pages are made of."""
+"""Conversion of docstrings from reStructuredText to the Markdown of the pages."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _ROLE = re.compile(r":(math|func|class):`([^`]+)`")
 
 
 class ReadableDocstrings(griffe.Extension):
-    r"""Formulas and roles: ``:math:`x``` becomes ``\(x\)``, ``.. math::`` a block, ``:func:`f``` the name as code."""
+    r"""Converts formulas and roles: ``:math:`x``` to ``\(x\)``, ``.. math::`` to a block, ``:func:`f``` to code."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Rewrite the docstring of one object."""
+        """Convert the docstring of one object."""
         if obj.docstring is not None:
             obj.docstring.value = readable(obj.docstring.value)
 
 
 def readable(text: str) -> str:
-    """A docstring in Markdown."""
+    """Return a docstring in Markdown."""
     text = _DISPLAYED.sub(lambda found: indent(f"\n$$\n{dedent(found[2]).strip()}\n$$\n\n", found[1]), text)
     return _ROLE.sub(lambda found: rf"\({found[2]}\)" if found[1] == "math" else f"`{found[2]}`", text)

@@ -1,6 +1,6 @@
-"""The page of licences: ``python docs/hooks/licences.py > docs/licences.md``, with all extras installed.
+"""Writes the page of licences: ``python docs/hooks/licences.py > docs/licences.md``, with all extras installed.
 
-What pyproject.toml asks for, and all that this brings, by what the packages say of themselves.
+The page lists the requirements of pyproject.toml and their dependencies, with the licences that the packages state.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 
-SAID_ELSEWHERE = {
-    "apsw": "Zlib",  # "any-OSI"; its LICENSE names this one
-    "atheris": "Apache-2.0",  # its metadata say nothing
+LICENCES_BY_HAND = {
+    "apsw": "Zlib",  # its metadata say "any-OSI", its LICENSE file Zlib
+    "atheris": "Apache-2.0",  # not in its metadata
 }
-"""Licences of packages whose metadata hold none, or a text in its place."""
+"""Licences of packages without a licence name in their metadata."""
 
 CLASSIFIERS = {
     "Apache Software License": "Apache-2.0",
@@ -33,44 +33,44 @@ CLASSIFIERS = {
     "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
     "Python Software Foundation License": "PSF-2.0",
 }
-"""Short names."""
+"""Short names of licences by classifier."""
 
 HEAD = """# Licences
-The code of v3d_torch is under Apache-2.0. Below is what it asks for and what that brings, with the versions of
-`constraints.txt` and the licence that each package states. Made by `python docs/hooks/licences.py > docs/licences.md`.
+The code of v3d_torch is under Apache-2.0. This page lists its requirements and their dependencies, in the versions of
+`constraints.txt`, with the licence that each package states. `python docs/hooks/licences.py > docs/licences.md` writes it.
 
-- **Nothing that a run needs is under a copyleft licence.** `ray`, `docs` and `test` bring some under MPL-2.0.
-- Tests compare with evo and read files with plyfile: both are under the GPL, and are in the extra `test` alone.
-- Wheels hold libraries of others under their own licences, as OpenCV's holds FFmpeg's under the LGPL-2.1: see their
+- **No package that a run needs is under a copyleft licence.** The extras `ray`, `docs` and `test` include some under MPL-2.0.
+- Tests compare with evo and read files with plyfile: both are under the GPL, and only in the extra `test`.
+- Wheels can contain other libraries under their own licences, such as FFmpeg under LGPL-2.1 in OpenCV's: see their
   `*.dist-info` folders.
-- The network's weights are under AGPL-3.0. They are not part of this package; a run with the network downloads them."""
+- The weights of the network are under AGPL-3.0. They are not part of this package; a run with the network downloads them."""
 
 
 def page() -> Iterator[str]:
-    """Lines of the page."""
+    """Yield the lines of the page."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     yield HEAD
-    needed = brought(project["dependencies"])
+    needed = dependencies(project["dependencies"])
     yield from section("To run", project["dependencies"], needed)
     for extra, requirements in project["optional-dependencies"].items():
         requirements = [wanted for wanted in requirements if Requirement(wanted).name != project["name"]]
-        more = brought(requirements) - needed
+        more = dependencies(requirements) - needed
         if more:
             yield from section(f"Extra `{extra}`", requirements, more)
 
 
 def section(title: str, requirements: Iterable[str], names: Iterable[str]) -> Iterator[str]:
-    """A table; what is asked for by name is bold."""
-    asked = {canonicalize_name(Requirement(wanted).name) for wanted in requirements}
+    """Yield a table of packages; direct requirements are bold."""
+    direct = {canonicalize_name(Requirement(each).name) for each in requirements}
     yield from ("", f"## {title}", "| package | licence |", "|---|---|")
     for name in sorted(names):
         found = installed(name)
         licence = "not installed here" if found is None else licence_of(found)
-        yield f"| {f'**{name}**' if name in asked else name} | {licence} |"
+        yield f"| {f'**{name}**' if name in direct else name} | {licence} |"
 
 
-def brought(requirements: Iterable[str]) -> set[str]:
-    """Names of the packages that requirements bring, and those that these bring, on this platform."""
+def dependencies(requirements: Iterable[str]) -> set[str]:
+    """Return the names of required packages and all their dependencies on this platform."""
     found: set[str] = set()
     pending = [(Requirement(wanted), "") for wanted in requirements]
     while pending:
@@ -88,7 +88,7 @@ def brought(requirements: Iterable[str]) -> set[str]:
 
 
 def installed(name: str) -> Distribution | None:
-    """A package that is here."""
+    """Return an installed package; None if it is not installed."""
     try:
         return distribution(name)
     except PackageNotFoundError:
@@ -96,15 +96,15 @@ def installed(name: str) -> Distribution | None:
 
 
 def licence_of(package: Distribution) -> str:
-    """By its expression, its classifiers, or a field of one line."""
+    """Return the licence of a package: its expression, its classifiers, or a field of one line."""
     metadata = package.metadata
     name = canonicalize_name(metadata["Name"])
     classifiers = [line.rpartition(" :: ")[2] for line in metadata.get_all("Classifier") or [] if "License ::" in line]
     short = [CLASSIFIERS[line] for line in classifiers if line in CLASSIFIERS]
     said = (metadata.get("License") or "").strip()
-    stated = metadata.get("License-Expression") or SAID_ELSEWHERE.get(name) or " and ".join(short) or said
+    stated = metadata.get("License-Expression") or LICENCES_BY_HAND.get(name) or " and ".join(short) or said
     if not stated or re.search(r"\n|UNKNOWN", stated):
-        raise SystemExit(f"{name}: says no licence; look it up and add it to SAID_ELSEWHERE")
+        raise SystemExit(f"{name}: states no licence; look it up and add it to LICENCES_BY_HAND")
     return str(stated)
 
 

@@ -1,4 +1,4 @@
-"""Formulas as MathML, which browsers draw by themselves: no script has to be fetched."""
+"""Conversion of formulas to MathML, which browsers draw without a script."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Called by MkDocs with the HTML of each page."""
+    """Convert the formulas of a page; MkDocs calls this with its HTML."""
     return _FORMULA.sub(
         lambda found: convert(html.unescape(found[2]).strip(), display="block" if found[1] == "div" else "inline"),
         content,

@@ -1,4 +1,4 @@
-"""The options of a command, as a table in its page: taken from the command itself, so that they are always right."""
+"""Tables of the options of commands, taken from the commands themselves."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typer.main import get_command
 _WANTED = re.compile(r"^\{\{ options of (\w+) \}\}$", re.MULTILINE)
 
 _SPECIAL = re.compile(r"[\[\]|*_]")
-"""What would be markup in a cell."""
+"""Characters that are markup in a table cell."""
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Called by MkDocs with the text of each page."""
+    """Insert the tables of a page; MkDocs calls this with its text."""
     return _WANTED.sub(lambda found: table(found[1]), markdown)
 
 
 def table(name: str) -> str:
-    """Rows of the parameters of ``v3d_torch.<name>``, as its ``--help`` has them."""
-    command = get_command(import_module(f"v3d_torch.{name}").app)
+    """Return a table of the parameters of a command, as in its ``--help``."""
+    command = get_command(import_module(f"v3d_torch.cli.{name}").app)
     context: Any = command.make_context(name, [], resilient_parsing=True)
     rows = ["| | |", "|---|---|"]
     for parameter in command.params:

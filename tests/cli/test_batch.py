@@ -31,8 +31,8 @@ from v3d_torch.batch.processes import Processes
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.run_table import FIGURES
 from v3d_torch.cli.batch import app
-from v3d_torch.cli.console import progress_bars
 from v3d_torch.config.loading import load_config
+from v3d_torch.runs.console import progress_bars
 
 FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),

@@ -23,11 +23,12 @@ import pytest
 from helpers.commands import assert_one_sentence, call, command, environment, files_in
 from typer.testing import CliRunner, Result
 
-from v3d_torch.cli import console, run
+from v3d_torch.cli import run
 from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAMES, RATE, write_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
+from v3d_torch.runs import console, result_folder
 
 FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),
@@ -174,9 +175,9 @@ def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
         def now(cls, tz: tzinfo | None = None) -> Stopped:
             return cls(2026, 1, 2, 3, 4, 5, tzinfo=tz)
 
-    monkeypatch.setattr(console, "datetime", Stopped)
+    monkeypatch.setattr(result_folder, "datetime", Stopped)
     monkeypatch.chdir(tmp_path)
-    made = [console.result_folder(None, "fr3/w/xyz") for _ in range(3)]
+    made = [result_folder.make_result_folder(None, "fr3/w/xyz") for _ in range(3)]
     assert [folder.name for folder in made] == [f"2026-01-02_03-04-05{end}" for end in ("", "_2", "_3")]
     assert (tmp_path / "results" / "fr3_w_xyz" / "latest").resolve() == made[-1].resolve()
 
@@ -187,7 +188,7 @@ def test_where_there_can_be_no_links_there_is_no_latest(tmp_path: Path, monkeypa
 
     monkeypatch.setattr(Path, "symlink_to", refuse)
     monkeypatch.chdir(tmp_path)
-    folder = console.result_folder(None, "demo")
+    folder = result_folder.make_result_folder(None, "demo")
     assert folder.is_dir() and [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
@@ -195,7 +196,7 @@ def test_where_no_folder_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (tmp_path / "results").symlink_to("nowhere")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(OutputError, match=r"demo: cannot be made \(.*\); choose another folder with --out"):
-        console.result_folder(None, "demo")
+        result_folder.make_result_folder(None, "demo")
 
 
 def test_a_configuration_file_and_the_command_line_over_it(moment: Path, tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def test_what_is_wrong_is_refused_with_the_cure(override: str, message: str) -> 
     ("text", "message"),
     [
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
-        ("- 1\n- 2\n", "holds a list"),
+        ("- 1\n- 2\n", "contains a list"),
         ("seeed: 1\n", "did you mean seed?"),
     ],
 )
@@ -69,7 +69,7 @@ def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, message: str) 
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.yaml: is neither a configuration nor a YAML file"):
+    with pytest.raises(ConfigError, match=r"none\.yaml: is neither the name of a configuration .* nor a YAML file"):
         load_config(tmp_path / "none.yaml")
 
 

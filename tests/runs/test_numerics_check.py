@@ -22,7 +22,6 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import NumericsError
 from v3d_torch.objects.free_space_check import NewlyOccupied
 from v3d_torch.objects.motion_classifier import MotionState, TrackedObject
-from v3d_torch.runs.logged_run import run_logged
 from v3d_torch.runs.numerics_check import STAGES, CheckedSLAM, CheckedStage, check_finite
 from v3d_torch.runs.state import OF_SLAM, gather, put_back, refresh
 from v3d_torch.segmentation.mask_files import MaskFolder
@@ -209,6 +208,7 @@ def test_a_run_that_is_told_to_check_ends_there_and_keeps_what_was_computed(demo
         return replace(Instances.empty(480, 640), boxes=torch.full((frame.index // 2, 4), math.nan))
 
     config = load_config(None, ("segmentation.source=none", "check_numerics=true"))
-    pipeline, _ = run_logged(demo, segment, config, tmp_path, lambda *_: None)
-    assert pipeline.record.failure == "frame 2: segment.boxes is NaN: 4 of 4 numbers, the first at [0, 0]"
+    run = Run(RunRequest("demo", config), demo, segment, tmp_path)
+    run(lambda *_: None)
+    assert run.pipeline.record.failure == "frame 2: segment.boxes is NaN: 4 of 4 numbers, the first at [0, 0]"
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == 2

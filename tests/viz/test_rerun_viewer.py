@@ -326,7 +326,7 @@ def test_a_ground_truth_without_orientations_is_not_laid_anywhere(tmp_path: Path
 
 def test_a_run_without_a_viewer_needs_no_rerun() -> None:
     assert make_viewer(None, None, Wall()) is NULL_VIEWER
-    probe = "import sys, v3d_torch.cli.console; print('rerun' in sys.modules)"
+    probe = "import sys, v3d_torch.runs.console; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "False"
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
-from v3d_torch.runs.logged_run import log_to, run_logged
+from v3d_torch.runs.log import log_to
 from v3d_torch.runs.request import RunRequest
-from v3d_torch.runs.result_folder import prepare_folder
+from v3d_torch.runs.result_folder import clear_earlier_results
+from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_segmenter
-from v3d_torch.types import RGBDFrame, TrackingStatus
+from v3d_torch.types import RGBDFrame
 
 
 def run_job(job: Job, report: Callable[[int], None]) -> str | None:
@@ -29,31 +31,30 @@ def run_job(job: Job, report: Callable[[int], None]) -> str | None:
         The sentence that the run failed with; None where it did not.
     """
 
-    def on_frame(frame: RGBDFrame, scene: FrameObjects, status: TrackingStatus) -> None:
+    def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
         report(frame.index + 1)
 
     try:
         checkpoint = _checkpoint(job)
         if checkpoint is None:
-            prepare_folder(job.folder)
+            clear_earlier_results(job.folder)
         with log_to(job.folder / "run.log", append=checkpoint is not None):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", GroundTruthWarning)  # the run ends with that sentence
                 sequence = load_sequence(job.source, data_root=job.data_root)
             if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
-                prepare_folder(job.folder)
+                clear_earlier_results(job.folder)
                 checkpoint = None
             segment = make_segmenter(job.config.segmentation)
-            pipeline, _ = run_logged(
-                sequence, segment, job.config, job.folder, on_frame, request=_request(job), checkpoint=checkpoint
-            )
+            run = Run(_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
+            run(on_frame)
     except Exception as error:  # a run that breaks must not cost the others; its log has the traceback
         return sentence(error)
-    return pipeline.record.failure
+    return run.pipeline.record.failure
 
 
 def _request(job: Job) -> RunRequest:
-    return RunRequest(job.source, data_root=None if job.data_root is None else str(job.data_root))
+    return RunRequest(job.source, job.config, data_root=None if job.data_root is None else str(job.data_root))
 
 
 def _checkpoint(job: Job) -> Checkpoint | None:
@@ -62,8 +63,9 @@ def _checkpoint(job: Job) -> Checkpoint | None:
         checkpoint = read_checkpoint(job.folder)
     except InputError:
         return None
-    same = checkpoint.request == _request(job).absolute() and single_threaded(checkpoint.config) == single_threaded(
-        job.config
+    request = checkpoint.request
+    same = replace(request, config=single_threaded(request.config)) == replace(
+        _request(job).absolute(), config=single_threaded(job.config)
     )
     return checkpoint if same else None
 

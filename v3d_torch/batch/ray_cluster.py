@@ -13,8 +13,8 @@ from typing import Any
 from v3d_torch.batch.executor import THREADS, Finished, JobProgress
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.job_process import run_job
-from v3d_torch.cli.console import interrupts_between_frames
 from v3d_torch.errors import InputError
+from v3d_torch.runs.console import interrupts_between_frames
 
 _LOOK = 0.2
 """Time between two looks at what the runs have done, seconds."""

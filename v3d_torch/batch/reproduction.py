@@ -13,7 +13,6 @@ from v3d_torch.batch.plan import make_sure_of_networks, plan, read_configs
 from v3d_torch.batch.processes import Processes
 from v3d_torch.batch.records import BatchRecord
 from v3d_torch.batch.runner import complete, refuse_resume_of_nothing
-from v3d_torch.cli.console import open_sequence, result_folder, wide_console
 from v3d_torch.config.loading import FULL
 from v3d_torch.datasets import PAPER_SEQUENCES, RGBDSequence, short_name
 from v3d_torch.datasets.locate import data_folder, stored_path
@@ -24,6 +23,8 @@ from v3d_torch.evaluation.layout import latex_table, markdown_table, screen_tabl
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.evaluation.summary import LEGEND, PACKAGES, csv_text, latex, markdown, screen_tables
 from v3d_torch.io.files import write_text
+from v3d_torch.runs.console import open_sequence, wide_console
+from v3d_torch.runs.result_folder import make_result_folder
 
 CONFIGS = (FULL, "paper", "baseline")
 """Whose scores stand in the paper's tables."""
@@ -58,7 +59,7 @@ def run_reproduction(
             raise InputError(advice)
         console.print(advice, markup=False)
     make_sure_of_networks(configs)
-    folder = result_folder(out, "reproduce")
+    folder = make_result_folder(out, "reproduce")
     sequences = {name: (name, sequence) for name, sequence in opened.items()}
     jobs = plan(sequences, configs, seeds=seeds, data_root=data_root, folder=folder)
     record = Reproduction(jobs, folder.absolute(), list(shown), list(map(short_name, absent)), study=study)

@@ -14,9 +14,10 @@ from v3d_torch.batch.processes import Processes
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_cluster import RayCluster
 from v3d_torch.batch.records import BatchRecord
-from v3d_torch.cli.console import interrupts_between_frames, open_sequences, progress_bars, result_folder, wide_console
 from v3d_torch.datasets.patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
+from v3d_torch.runs.console import interrupts_between_frames, open_sequences, progress_bars, wide_console
+from v3d_torch.runs.result_folder import make_result_folder
 
 
 def run_batch(
@@ -44,7 +45,7 @@ def run_batch(
     opened = open_sequences(names, data_root, console)
     sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
     make_sure_of_networks(configs)
-    folder = result_folder(out, "batch")
+    folder = make_result_folder(out, "batch")
     record = BatchRecord(plan(sequences, configs, seeds=seeds, data_root=data_root, folder=folder), folder.absolute())
     complete(record, executor, console, resume=resume)
 

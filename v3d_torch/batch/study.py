@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from v3d_torch.cli.console import open_sequences, result_folder, track, wide_console
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
@@ -20,6 +19,10 @@ from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, csv_text, markdown, screen_table
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
+from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import keep_upright, make_instance_source
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
@@ -75,7 +78,7 @@ def run_study(
     network = cache(make_instance_source)
     for config in configs.values():
         network(_without_rotation(config))  # what cannot be had is said before the first run, not after hours
-    folder = result_folder(out, "ablation")
+    folder = make_result_folder(out, "ablation")
     outcomes: list[Outcome] = []
     try:
         for name, sequence in sequences.items():
@@ -83,7 +86,7 @@ def run_study(
             for (variant, seed), config in configs.items():
                 source = sources.setdefault(_without_rotation(config), SegmentOnce(network(_without_rotation(config))))
                 segment = keep_upright(source, config.segmentation)
-                place = result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
+                place = make_result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
                 metrics, failure = _run(sequence, segment, config, place, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 console.print(str(outcomes[-1]), markup=False)
@@ -123,7 +126,10 @@ def _run(
         OutputError: when the results cannot be written.
     """
     try:
-        pipeline, _ = track(sequence, segment, config, folder, console)
+        request = RunRequest(sequence.name, config)
+        pipeline, _ = run_with_progress(
+            lambda: Run(request, sequence, segment, folder, save_checkpoints=False), folder, console
+        )
     except OutputError:
         raise
     except Exception as error:  # a variant that breaks must not cost the others; its log has the traceback

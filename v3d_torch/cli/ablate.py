@@ -31,7 +31,7 @@ def main(
 ) -> None:
     """Turn off parts of the system and set the scores side by side."""
     from v3d_torch.batch.study import run_study
-    from v3d_torch.cli.console import exit_on_error
+    from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         names = [name.strip() for name in variants.split(",")]

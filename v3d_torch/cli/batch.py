@@ -76,7 +76,7 @@ def main(
     Each run is a process of its own; tables set the scores of all beside each other.
     """
     from v3d_torch.batch.runner import run_batch
-    from v3d_torch.cli.console import exit_on_error
+    from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         run_batch(

@@ -39,11 +39,11 @@ def main(
     from rich.console import Console
     from rich.progress import track
 
-    from v3d_torch.cli.console import exit_on_error, interrupts_between_frames
     from v3d_torch.datasets import SourceOptions, open_source
     from v3d_torch.datasets.stored import StoredSequence
     from v3d_torch.datasets.tum_writer import TUMWriter
     from v3d_torch.errors import InputError
+    from v3d_torch.runs.console import exit_on_error, interrupts_between_frames
 
     console = Console(soft_wrap=True)
     with exit_on_error():

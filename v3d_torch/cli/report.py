@@ -25,8 +25,8 @@ def main(
 
     It is report.html in their folder: one file with everything in it, for any browser.
     """
-    from v3d_torch.cli.console import exit_on_error
     from v3d_torch.io.files import write_text
+    from v3d_torch.runs.console import exit_on_error
     from v3d_torch.runs.stored_run import read_run
     from v3d_torch.viz.report_page import render_page
 

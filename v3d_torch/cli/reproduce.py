@@ -47,7 +47,7 @@ def main(
     Runs its eight sequences of the TUM RGB-D benchmark, downloaded where they are not here.
     """
     from v3d_torch.batch.reproduction import CONFIGS, run_reproduction
-    from v3d_torch.cli.console import exit_on_error
+    from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         run_reproduction(

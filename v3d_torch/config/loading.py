@@ -1,4 +1,4 @@
-"""The configuration from files and the command line: defaults, then YAML, then ``section.key=value``."""
+"""Loading of the configuration: defaults, then a YAML file, then ``section.key=value`` overrides."""
 
 from __future__ import annotations
 
@@ -20,74 +20,76 @@ from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
-"""Between which a number lies that is neither 0 nor infinite."""
+"""Range of the magnitude of a number that is neither 0 nor infinite."""
 
 FULL = "full"
-"""The whole system, as it is by default."""
+"""Name of the default configuration."""
 
 _FOLDER = Path(__file__).parent / "yaml"
 CONFIGS: Mapping[str, Path] = {
     FULL: _FOLDER / "default.yaml",
     **{path.stem: path for path in sorted(_FOLDER.rglob("*.yaml"))},
 }
-"""The configurations that come with the package, by name: the default (`FULL`), the paper's and the ablations'."""
+"""Configurations of the package by name: the default (`FULL`), that of the paper and those of the ablation study."""
 
 
 def find_config(name: StrPath) -> Path:
-    """The file of a configuration.
+    """Find the file of a configuration.
 
     Args:
-        name: a key of `CONFIGS`, such as ``paper``, or the path of a YAML file.
+        name: Key of `CONFIGS`, such as ``paper``, or path of a YAML file.
 
     Raises:
-        ConfigError: there is neither.
+        ConfigError: If there is neither.
     """
     if str(name) in CONFIGS:
         return CONFIGS[str(name)]
-    with suppress(OSError):  # a name that is too long
+    with suppress(OSError):  # names can be too long for a path
         if (path := expand_user(name)).is_file():
             return path
-    raise ConfigError(f"{name}: is neither a configuration nor a YAML file; there are {', '.join(CONFIGS)}")
+    raise ConfigError(f"{name}: is neither the name of a configuration ({', '.join(CONFIGS)}) nor a YAML file; check name or path")
 
 
 def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Defaults, then a YAML file, then ``section.key=value`` overrides.
+    """Load a configuration: defaults, then a YAML file, then overrides.
 
     Args:
-        name: ``paper`` or another of `CONFIGS`, or a YAML file with any part of the tree; None for the defaults.
-        overrides: texts such as ``objects.voting.distance_threshold=0.05``, or one; values are read as YAML.
+        name: Key of `CONFIGS`, such as ``paper``, or path of a YAML file with any part of the values; None for the
+            defaults.
+        overrides: One or several texts such as ``objects.voting.distance_threshold=0.05``; values are parsed as YAML.
 
     Raises:
-        ConfigError: on a file that cannot be read, an unknown key (with the nearest right name) or a wrong value.
+        ConfigError: If the file cannot be read, a key is unknown (the message names the nearest one) or a value is not
+            valid.
     """
     tree = {} if name is None else _read_yaml(find_config(name))
     return _overridden(tree, _validated(tree, f"{name}"), overrides)
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
-    """A configuration with other values, given and refused as by `load_config`."""
+    """Return a configuration with overrides, which are parsed and checked as in `load_config`."""
     return _overridden(config.model_dump(), config, overrides)
 
 
 def _overridden(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
-    for override in [overrides] if isinstance(overrides, str) else overrides:  # which is an iterable of letters
+    for override in [overrides] if isinstance(overrides, str) else overrides:  # a string is an iterable, too
         _apply_override(tree, override)
         config = _validated(tree, "--set")
     return config
 
 
 def dump_config(config: Config) -> str:
-    """The resolved configuration as YAML that `load_config` reads back."""
+    """Return the whole configuration as YAML, which `load_config` reads."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
 def _validated(tree: Mapping[str, Any], source: str) -> Config:
-    _refuse_unknown_keys(tree, Config, source)
+    _reject_unknown_keys(tree, Config, source)
     try:
         config = Config.model_validate(tree)
     except ValidationError as error:
         raise ConfigError(f"{source}: {first_error(error)}") from error
-    _refuse_absurd_numbers(config, source)
+    _reject_extreme_numbers(config, source)
     return config
 
 
@@ -101,7 +103,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     if tree is None:
         return {}
     if not isinstance(tree, dict):
-        raise ConfigError(f"{path}: holds a {type(tree).__name__}; a configuration is a mapping of sections")
+        raise ConfigError(f"{path}: contains a {type(tree).__name__}; a configuration is a mapping of sections")
     return tree
 
 
@@ -113,33 +115,33 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     for section in sections:
         tree = tree.setdefault(section, {})
         if not isinstance(tree, dict):
-            raise ConfigError(f"--set {override!r}: {section!r} is a value, it has no keys below it")
+            raise ConfigError(f"--set {override!r}: {section!r} is a value and has no keys")
     try:
         tree[leaf] = parse_yaml(text)
     except ValueError as error:
         raise ConfigError(f"--set {override!r}: the value is not valid YAML ({error})") from error
 
 
-def _refuse_absurd_numbers(section: Section, source: str, prefix: str = "") -> None:
-    """Numbers that a rule of their own lets through, and with which arithmetic or memory overflows."""
+def _reject_extreme_numbers(section: Section, source: str, prefix: str = "") -> None:
+    """Reject numbers that no other rule rejects but that overflow arithmetic or memory."""
     for name, value in section:
         if isinstance(value, Section):
-            _refuse_absurd_numbers(value, source, f"{prefix}{name}.")
+            _reject_extreme_numbers(value, source, f"{prefix}{name}.")
         for number in value if isinstance(value, tuple) else (value,):
             if name == "seed" or type(number) not in _NUMBERS or number == 0 or math.isinf(number):
                 continue
-            least, most = _NUMBERS[type(number)]
-            if not least <= abs(number) <= most:
+            minimum, maximum = _NUMBERS[type(number)]
+            if not minimum <= abs(number) <= maximum:
                 raise ConfigError(
-                    f"{source}: {prefix}{name}: input should lie between {least:g} and {most:g}, got {number!r:.40}"
+                    f"{source}: {prefix}{name}: input should be between {minimum:g} and {maximum:g}, got {number!r:.40}"
                 )
 
 
-def _refuse_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
+def _reject_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
     for key, value in tree.items():
         field = section.model_fields.get(str(key))
         if field is None:
             near = difflib.get_close_matches(str(key), section.model_fields, n=1, cutoff=0.0)[0]
-            raise ConfigError(f"{source}: there is no {prefix}{key}; did you mean {prefix}{near}?")
+            raise ConfigError(f"{source}: unknown key {prefix}{key}; did you mean {prefix}{near}?")
         if isinstance(value, Mapping) and isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            _refuse_unknown_keys(value, field.annotation, source, f"{prefix}{key}.")
+            _reject_unknown_keys(value, field.annotation, source, f"{prefix}{key}.")

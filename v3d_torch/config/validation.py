@@ -1,4 +1,4 @@
-"""What is given, and whether it can be taken: numbers, and in words what a model refuses."""
+"""Validation of values given by users: conversion to numbers, and pydantic errors in words."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pydantic import ValidationError
 
 
 def first_error(error: ValidationError) -> str:
-    """The first of the values that a model refuses: its key, the rule and the value, cut where it is long."""
+    """Describe the first error of a validation: key, rule and value, shortened if it is long."""
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"]) or "the whole"
+    key = ".".join(str(part) for part in first["loc"]) or "the document"
     rule = "input should be a valid dictionary of keys" if first["type"] == "model_type" else first["msg"].lower()
     return f"{key}: {rule}, got {reprlib.repr(first['input'])}"
 
 
 def to_float(value: object) -> float:
-    """A number of any kind, or a text or array that holds one; NaN where it is none."""
+    """Convert a number, or a text or array that holds one, to float; return NaN if that is not possible."""
     try:
-        return float(value)  # type: ignore[arg-type]  # that is the question
+        return float(value)  # type: ignore[arg-type]  # any object is tried
     except (TypeError, ValueError):
         return math.nan

@@ -1,4 +1,4 @@
-"""The next frames are looked at while this one is tracked."""
+"""Preprocessing of the next frames while the current one is tracked."""
 
 from __future__ import annotations
 
@@ -20,85 +20,90 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_WORTH = 150
-"""Frames for which a second process is begun: fewer are done soon after it is up, which takes some seconds."""
+_MIN_FRAMES_FOR_WORKER = 150
+"""A second process takes seconds to start, so shorter sequences use a thread."""
 
-Upcoming = Callable[[], PreprocessedFrame | None]
-"""Waits for what a frame shows; None behind the last."""
+PendingFrame = Callable[[], PreprocessedFrame | None]
+"""Waits for a preprocessed frame; returns None after the last one."""
 
 
 class FramePrefetcher:
-    """What the frames show, for `V3DSLAM.track`, one after the other.
+    """Iterator over preprocessed frames for `V3DSLAM.track`.
 
-    Each frame is looked at with what was known of the camera some frames before: so it makes no difference to the
-    results whether that happens when it is its turn, or ahead, in another thread or another process.
+    Each frame is preprocessed with the pose prediction made some frames before. Therefore the results do not depend on
+    whether it is preprocessed in turn, ahead in a thread, or ahead in a second process.
 
     Args:
-        frames: to be read.
-        slam: that looks at them, and takes each in before it asks for the next.
-        ahead: whether the next frames are read and looked at while one is taken in: those of a stored sequence that is
-            long enough by a second process, which is up when this is made, else, or if there is none to be had, by a
-            thread.
+        frames: Frames to read.
+        slam: System that preprocesses the frames, and tracks each before it requests the next.
+        ahead: True to read and preprocess the next frames while one is tracked: in a second process if the frames
+            come from a stored sequence that is long enough, else in a thread. The process is ready when the
+            constructor returns.
     """
 
     def __init__(self, frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> None:
         self._frames = frames
         self._slam = slam
-        self._open = ExitStack()
-        self._second: PreprocessWorker | None = None
-        if ahead and isinstance(frames, FrameIterator) and frames.remaining >= _WORTH and _cores() > 1:
-            second = self._open.enter_context(closing(PreprocessWorker(slam, frames.sequence)))
-            self._second = second if second.is_alive else None
-        self._thread = ThreadPoolExecutor(1, "perception") if ahead and self._second is None else None
+        self._resources = ExitStack()
+        self._worker: PreprocessWorker | None = None
+        if (
+            ahead
+            and isinstance(frames, FrameIterator)
+            and frames.remaining >= _MIN_FRAMES_FOR_WORKER
+            and _available_cores() > 1
+        ):
+            worker = self._resources.enter_context(closing(PreprocessWorker(slam, frames.sequence)))
+            self._worker = worker if worker.is_alive else None
+        self._thread = ThreadPoolExecutor(1, "preprocessing") if ahead and self._worker is None else None
         if self._thread is not None:
-            self._open.callback(self._thread.shutdown, cancel_futures=True)
+            self._resources.callback(self._thread.shutdown, cancel_futures=True)
 
     def __iter__(self) -> Iterator[PreprocessedFrame]:
-        """Go on with the next frame.
+        """Yield the next preprocessed frames.
 
         Raises:
-            V3DError: a frame cannot be read; those before have been given.
+            V3DError: If a frame cannot be read; all frames before it have been yielded.
         """
         slam = self._slam
-        upcoming = deque(map(self._begin, slam.outlooks, range(len(slam.outlooks))))
-        while (percept := upcoming.popleft()()) is not None:
-            upcoming.append(self._begin(slam.look_further(), len(upcoming)))
-            yield percept
+        pending = deque(map(self._submit, slam.predictions, range(len(slam.predictions))))
+        while (preprocessed := pending.popleft()()) is not None:
+            pending.append(self._submit(slam.advance_predictions(), len(pending)))
+            yield preprocessed
 
     def close(self) -> None:
-        """End the thread or the process."""
-        self._open.close()
+        """Stop the thread or the process."""
+        self._resources.close()
 
-    def _begin(self, outlook: PosePrediction | None, waiting: int) -> Upcoming:
-        """Let a frame be looked at, behind those that are waited for already."""
-        look = partial(self._look, torch.is_inference_mode_enabled(), outlook)
-        if self._second is not None and isinstance(self._frames, FrameIterator) and waiting < self._frames.remaining:
-            self._second.submit(self._frames.index + waiting, outlook)
-            return partial(self._look_there, self._second, self._frames, look)
-        return look if self._thread is None else self._thread.submit(look).result
+    def _submit(self, prediction: PosePrediction | None, pending: int) -> PendingFrame:
+        """Start to preprocess the frame that follows the pending ones."""
+        preprocess = partial(self._preprocess, torch.is_inference_mode_enabled(), prediction)
+        if self._worker is not None and isinstance(self._frames, FrameIterator) and pending < self._frames.remaining:
+            self._worker.submit(self._frames.index + pending, prediction)
+            return partial(self._receive, self._worker, self._frames, preprocess)
+        return preprocess if self._thread is None else self._thread.submit(preprocess).result
 
-    def _look(self, inference: bool, outlook: PosePrediction | None) -> PreprocessedFrame | None:
-        """Read the next frame and look at it, here; ``inference`` tells whether without gradients."""
-        clock = StageTimer()
-        with clock("read"):
+    def _preprocess(self, inference: bool, prediction: PosePrediction | None) -> PreprocessedFrame | None:
+        """Read and preprocess the next frame in this process, without gradients if ``inference``."""
+        timer = StageTimer()
+        with timer("read"):
             frame = next(self._frames, None)
         if frame is None:
             return None
         with torch.inference_mode(inference):
-            percept = self._slam.preprocess(frame, outlook)
-        return replace(percept, seconds={**clock.seconds, **percept.seconds})
+            preprocessed = self._slam.preprocess(frame, prediction)
+        return replace(preprocessed, seconds={**timer.seconds, **preprocessed.seconds})
 
-    def _look_there(
-        self, second: PreprocessWorker, frames: FrameIterator, look_here: Upcoming
+    def _receive(
+        self, worker: PreprocessWorker, frames: FrameIterator, preprocess_here: PendingFrame
     ) -> PreprocessedFrame | None:
-        """What the second process saw, as long as it can."""
-        percept = second.result()
-        if percept is None:
-            return look_here()
+        """Return the result of the second process; preprocess the frame here if that has failed."""
+        preprocessed = worker.result()
+        if preprocessed is None:
+            return preprocess_here()
         frames.index += 1
-        return percept
+        return preprocessed
 
 
-def _cores() -> int:
-    """Processors that this process may use."""
+def _available_cores() -> int:
+    """Return the number of processors that this process can use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,8 +1,9 @@
-"""A second process that reads and looks at the frames of a stored sequence.
+"""Second process that reads and preprocesses the frames of a stored sequence.
 
-Two threads of Python wait for each other: a frame is thousands of small operations, and only one thread at a time may
-begin one. Two processes do not, but a new one takes seconds until it is up, and has libraries and network of its own in
-memory. It is asked for some frames ahead, so that neither waits for the other while a frame takes longer than most.
+A frame consists of thousands of small tensor operations, and Python starts only one at a time in all threads together,
+so threads would wait for each other. Two processes do not. The second one takes seconds to start and has its own
+libraries and network in memory. Several frames are requested in advance, so that neither process waits for the other
+when one frame takes longer than the others.
 """
 
 from __future__ import annotations
@@ -19,38 +20,35 @@ from typing import TypeVar
 import torch
 
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.frame_result import PREFETCHED_FRAMES, PreprocessedFrame
+from v3d_torch.frame_result import PreprocessedFrame
 from v3d_torch.prefetch.shared_memory import Channel, new_shared_memory
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.runtime.stage_timer import StageTimer
-from v3d_torch.slam import V3DSLAM
+from v3d_torch.slam import PREFETCHED_FRAMES, V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
-from v3d_torch.types import memory_of, remind
+from v3d_torch.types import restore_segmenter, segmenter_state
 
 _LOG = logging.getLogger(__name__)
 
-_STAGES = "segment", "smooth_depth", "detect_features"
-"""Those that look at a frame by itself, as attributes of `V3DSLAM`."""
-
-_LONGEST = 120.0
-"""Seconds after which a process that is not up is taken to hang."""
+_START_TIMEOUT = 120.0
+"""Seconds after which a process that has not started is regarded as hanging."""
 
 _COMMAND = "from v3d_torch.prefetch.preprocess_worker import serve; serve(*{})"
 
-_Given = TypeVar("_Given")
+_T = TypeVar("_T")
 
 
 class PreprocessWorker:
-    """Looks at frames as `V3DSLAM.preprocess` does, to the bit, in a process of its own, which is up when this is made.
+    """Runs `V3DSLAM.preprocess` in a second process, with the same results to the bit.
 
-    What it cannot do, whatever the reason, it leaves to the one who asks, who then sees the error where it arises.
+    On any failure the caller processes the frame itself and gets the original error.
 
     Args:
-        slam: whose stages are taken along, and what its segmentation remembers.
-        sequence: of the frames.
+        slam: System whose preprocessing stages are copied to the process, with the state of the segmenter.
+        sequence: Sequence of the frames.
 
     Attributes:
-        can: whether it can still look at frames.
+        is_alive: False after the first failure.
     """
 
     def __init__(self, slam: V3DSLAM, sequence: StoredSequence) -> None:
@@ -59,15 +57,15 @@ class PreprocessWorker:
         self.is_alive = True
         self._process: subprocess.Popen[bytes] | None = None
         ours, theirs = socket.socketpair()
-        arena = new_shared_memory(PREFETCHED_FRAMES)
-        self._channel = Channel(ours, arena, PREFETCHED_FRAMES)
-        taken_along = [theirs.fileno()] if arena is None else [theirs.fileno(), arena]
+        memory = new_shared_memory(PREFETCHED_FRAMES)
+        self._channel = Channel(ours, memory, PREFETCHED_FRAMES)
+        descriptors = [theirs.fileno()] if memory is None else [theirs.fileno(), memory]
         with theirs:
             try:
-                # In a session of its own, where a terminal's Ctrl-C does not reach it.
-                self._process = subprocess.Popen(  # noqa: S603 - this program itself
-                    [sys.executable, "-c", _COMMAND.format(taken_along)],
-                    pass_fds=taken_along,
+                # A session of its own, so that Ctrl-C in a terminal does not reach the process.
+                self._process = subprocess.Popen(  # noqa: S603 - runs this package
+                    [sys.executable, "-c", _COMMAND.format(descriptors)],
+                    pass_fds=descriptors,
                     env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
@@ -76,81 +74,81 @@ class PreprocessWorker:
                 )
             except (OSError, ValueError):  # no more processes, or Windows
                 self.is_alive = False
-        if arena is not None:
-            os.close(arena)
+        if memory is not None:
+            os.close(memory)
         try:
-            self._try(self._greet)
+            self._try(self._start)
         except BaseException:
             self.close()
             raise
 
-    def submit(self, index: int, outlook: PosePrediction | None) -> None:
-        """Let it read and look at a frame, behind those that it was asked for and has not answered, fewer than `PREFETCHED_FRAMES`.
+    def submit(self, index: int, prediction: PosePrediction | None) -> None:
+        """Request a frame. At most `PREFETCHED_FRAMES` requests can be open.
 
         Args:
-            index: of the frame; the segmentation goes by those before, so they come in order.
-            outlook: see `V3DSLAM.preprocess`.
+            index: Index of the frame in the sequence; frames are requested in order, as the segmenter has state.
+            prediction: See `V3DSLAM.preprocess`.
         """
-        self._try(lambda: self._channel.send((index, outlook)))
+        self._try(lambda: self._channel.send((index, prediction)))
 
     def result(self) -> PreprocessedFrame | None:
-        """What the next of these frames shows; None when it cannot tell."""
-        percept: PreprocessedFrame | None = self._try(self._channel.receive)
-        if percept is None:
+        """Return the result of the oldest open request; None after a failure."""
+        preprocessed: PreprocessedFrame | None = self._try(self._channel.receive)
+        if preprocessed is None:
             return None
-        remind(self._slam.segment, percept.memory)
-        return replace(percept, frame=replace(percept.frame, camera=self._sequence.camera))
+        restore_segmenter(self._slam.segment, preprocessed.segmenter_state)
+        return replace(preprocessed, frame=replace(preprocessed.frame, camera=self._sequence.camera))
 
     def close(self) -> None:
-        """End the process."""
+        """Kill the process."""
         self._channel.close()
         if self._process is not None:
             self._process.kill()
             self._process.wait()
 
-    def _greet(self) -> None:
-        """Wait until it has begun, tell it what to look with, and wait until it can."""
+    def _start(self) -> None:
+        """Wait for the process to start, send it the preprocessing stages, and wait until it is ready."""
         slam, channel = self._slam, self._channel
-        channel.connection.settimeout(_LONGEST)
+        channel.connection.settimeout(_START_TIMEOUT)
         channel.receive()
-        stages = {name: getattr(slam, name) for name in _STAGES}
-        channel.send((type(slam), slam.camera, slam.config, stages, memory_of(slam.segment), self._sequence))
+        stages = slam.preprocessing_stages()
+        channel.send((type(slam), slam.camera, slam.config, stages, segmenter_state(slam.segment), self._sequence))
         channel.receive()
         channel.connection.settimeout(None)
 
-    def _try(self, step: Callable[[], _Given]) -> _Given | None:
-        """What a step gives; None once one of them failed."""
+    def _try(self, step: Callable[[], _T]) -> _T | None:
+        """Return the result of a step; None after the first failure."""
         if not self.is_alive:
             return None
         try:
             return step()
-        except Exception:  # it has ended, or is to look with what cannot be sent
-            _LOG.debug("the second process looks at no more frames", exc_info=True)
+        except Exception:  # the process has ended, or a stage cannot be pickled
+            _LOG.debug("the second process has stopped", exc_info=True)
             self.is_alive = False
             return None
 
 
 @torch.inference_mode()
-def serve(connection: int, arena: int | None = None) -> None:
-    """The whole life of the process: it ends with the connection, or with the first thing that goes wrong.
+def serve(connection: int, memory: int | None = None) -> None:
+    """Serve the requests of a `PreprocessWorker` until the connection closes or an error occurs.
 
     Args:
-        connection: descriptor of the socket to the one who started it.
-        arena: of the memory that they share.
+        connection: File descriptor of the socket to the first process.
+        memory: File descriptor of the shared memory.
     """
-    channel = Channel(socket.socket(fileno=connection), arena, PREFETCHED_FRAMES)
+    channel = Channel(socket.socket(fileno=connection), memory, PREFETCHED_FRAMES)
     channel.send(None)
-    kind, camera, config, stages, memory, sequence = channel.receive()
+    kind, camera, config, stages, state, sequence = channel.receive()
     set_num_threads(config.threads)
     slam: V3DSLAM = kind(camera, stages["segment"], config)
     vars(slam).update(stages)
-    remind(slam.segment, memory)
+    restore_segmenter(slam.segment, state)
     channel.send(None)
     while True:
-        index, outlook = channel.receive()
-        clock = StageTimer()
-        with clock("read"):
+        index, prediction = channel.receive()
+        timer = StageTimer()
+        with timer("read"):
             frame = sequence[index]
-        percept = slam.preprocess(frame, outlook)
-        seconds = {**clock.seconds, **percept.seconds}
-        channel.send(replace(percept, frame=replace(percept.frame, camera=None), seconds=seconds))
+        preprocessed = slam.preprocess(frame, prediction)
+        seconds = {**timer.seconds, **preprocessed.seconds}
+        channel.send(replace(preprocessed, frame=replace(preprocessed.frame, camera=None), seconds=seconds))

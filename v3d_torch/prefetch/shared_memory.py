@@ -1,4 +1,4 @@
-"""Objects with tensors in them, from one process to another and back."""
+"""Transfer of objects with tensors between two processes, through shared memory."""
 
 from __future__ import annotations
 
@@ -20,28 +20,30 @@ from torch import Tensor
 _NUMBER = struct.Struct("!Q")
 
 SLOT_BYTES = 1 << 26
-"""Bytes of the memory that two processes share, for each value on its way: no more of it is taken than the values need,
-for a frame of 640x480 about 5 MB."""
+"""Size of the shared memory for one value in transit, bytes. Only the pages in use take memory: about 5 MB for a frame of
+640x480 pixels."""
 
 _SMALL = 1 << 14
-"""Bytes up to which a value goes by the connection, which holds them until they are asked for."""
+"""Values up to this size, bytes, are sent through the socket, which buffers them."""
 
-
-_KNOWN = {
+_ALLOWED = {
     ("collections", "OrderedDict"),  # in torch's modules
     ("numpy", "dtype"),
     ("numpy._core.numeric", "_frombuffer"),
     ("numpy.core.numeric", "_frombuffer"),  # before NumPy 2
     ("pathlib", "PosixPath"),
 }
-"""What comes beside this package's own classes and functions."""
+"""Globals that can be unpickled beside those of this package."""
 
 
 def new_shared_memory(values: int) -> int | None:
-    """Descriptor of memory for both ends of a channel; None where the system has none of this kind.
+    """Create shared memory for both ends of a channel.
 
     Args:
-        values: see `Channel`.
+        values: See `Channel`.
+
+    Returns:
+        File descriptor; None if the system has no ``memfd_create``.
     """
     if not hasattr(os, "memfd_create"):
         return None
@@ -51,27 +53,27 @@ def new_shared_memory(values: int) -> int | None:
 
 
 class Channel:
-    """One end of a connection between a process and another that it started.
+    """One end of a connection between a process and its child process.
 
-    What the tensors of large values hold goes through memory that both share, as it lies there, masks as a bit a pixel.
+    The tensors of large values are copied through shared memory, with boolean masks packed to one bit per pixel.
 
     Args:
-        connection: to the other end; is closed with this one.
-        arena: descriptor of the shared memory; None sends all by the connection. It is the caller's to close.
-        values: most large ones that are on their way at a time, all of them from one end.
+        connection: Socket to the other end; `close` closes it.
+        memory: File descriptor of the shared memory, which the caller closes; None sends everything by the socket.
+        values: Maximum number of large values in transit at a time, all of them in one direction.
     """
 
-    def __init__(self, connection: socket.socket, arena: int | None, values: int) -> None:
+    def __init__(self, connection: socket.socket, memory: int | None, values: int) -> None:
         self.connection = connection
-        self._arena = None if arena is None else mmap(arena, values * SLOT_BYTES)
-        self._places = cycle(range(0, values * SLOT_BYTES, SLOT_BYTES))
+        self._memory = None if memory is None else mmap(memory, values * SLOT_BYTES)
+        self._slots = cycle(range(0, values * SLOT_BYTES, SLOT_BYTES))
 
     def send(self, value: object) -> None:
         """Send a value.
 
         Raises:
-            OSError: nobody listens any more.
-            Exception: the value cannot be pickled, whatever its classes raise.
+            OSError: If the other end is closed.
+            Exception: If the value cannot be pickled.
         """
         buffers: list[pickle.PickleBuffer] = []
         stream = BytesIO()
@@ -79,52 +81,53 @@ class Channel:
         parts = [stream.getbuffer(), *(buffer.raw() for buffer in buffers)]
         sizes = [part.nbytes for part in parts]
         self.connection.sendall(b"".join(map(_NUMBER.pack, (len(parts), *sizes))))
-        if self._arena is not None and _SMALL < sum(sizes) <= SLOT_BYTES:
-            place = next(self._places)
-            for part, (begin, end) in zip(parts, pairwise(accumulate(sizes, initial=place)), strict=True):
-                self._arena[begin:end] = part
-            self.connection.sendall(_NUMBER.pack(place))
+        if self._memory is not None and _SMALL < sum(sizes) <= SLOT_BYTES:
+            slot = next(self._slots)
+            for part, (begin, end) in zip(parts, pairwise(accumulate(sizes, initial=slot)), strict=True):
+                self._memory[begin:end] = part
+            self.connection.sendall(_NUMBER.pack(slot))
         else:
             for part in parts:
                 self.connection.sendall(part)
 
     def receive(self) -> Any:
-        """The next value that the other end sent.
+        """Receive the next value.
 
         Raises:
-            EOFError: the other end is closed.
-            OSError: the connection is broken.
-            pickle.UnpicklingError: the value has a part that is not of this package, nor one of `_KNOWN`.
+            EOFError: If the other end is closed.
+            OSError: If the connection is broken.
+            pickle.UnpicklingError: If the value has a class or function that is neither of this package nor in
+                `_ALLOWED`.
         """
         (count,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
         sizes = [size for (size,) in _NUMBER.iter_unpack(self._exactly(count * _NUMBER.size))]
-        if self._arena is not None and _SMALL < sum(sizes) <= SLOT_BYTES:
-            (place,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
-            ends = pairwise(accumulate(sizes, initial=place))
-            parts = [_writable(memoryview(self._arena)[begin:end]) for begin, end in ends]
+        if self._memory is not None and _SMALL < sum(sizes) <= SLOT_BYTES:
+            (slot,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
+            ends = pairwise(accumulate(sizes, initial=slot))
+            parts = [_writable(memoryview(self._memory)[begin:end]) for begin, end in ends]
         else:
             parts = [self._exactly(size) for size in sizes]
         stream, *buffers = parts
         return _Unpickler(BytesIO(stream), buffers=buffers).load()
 
     def close(self) -> None:
-        """End the connection, which the other end is told."""
+        """Close the connection."""
         self.connection.close()
 
     def _exactly(self, size: int) -> memoryview:
-        """So many bytes from the connection, in memory that may be written to."""
-        content = np.empty(size, np.uint8).data  # a bytearray would be filled with zeros first
-        got = 0
-        while got < size:
-            came = self.connection.recv_into(content[got:])
-            if came == 0:
+        """Receive a number of bytes in writable memory."""
+        content = np.empty(size, np.uint8).data  # not initialised, unlike a bytearray
+        received = 0
+        while received < size:
+            count = self.connection.recv_into(content[received:])
+            if count == 0:
                 raise EOFError("the other process has ended")
-            got += came
+            received += count
         return content
 
 
 def _writable(shared: memoryview) -> memoryview:
-    """A copy, for another value takes the place of this one."""
+    """Return a copy, because the next value overwrites the shared memory."""
     return np.frombuffer(shared, np.uint8).copy().data
 
 
@@ -132,7 +135,7 @@ class _Pickler(pickle.Pickler):
     def reducer_override(self, value: object) -> tuple[Callable[..., Tensor], tuple[object, ...]] | Any:
         if type(value) is not Tensor:
             return NotImplemented
-        # In the order of the memory: an image whose channels come last there stays as it is.
+        # In the order of the memory, so that channels-last images keep their layout.
         order = sorted(range(value.ndim), key=value.stride, reverse=True)
         rows = value.detach().permute(order).contiguous().numpy()
         if rows.dtype == np.bool_:
@@ -142,9 +145,9 @@ class _Pickler(pickle.Pickler):
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        if module.partition(".")[0] == "v3d_torch" or (module, name) in _KNOWN:
+        if module.partition(".")[0] == "v3d_torch" or (module, name) in _ALLOWED:
             return super().find_class(module, name)
-        raise pickle.UnpicklingError(f"{module}.{name} is not for other processes")
+        raise pickle.UnpicklingError(f"{module}.{name} is not allowed")
 
 
 def _tensor(rows: NDArray[Any], order: Sequence[int]) -> Tensor:

@@ -1,4 +1,4 @@
-"""What a run has so far is written while it goes, so that little is lost when it is killed."""
+"""Periodic saving of results and checkpoints during a run."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _LOG = logging.getLogger(__name__)
 
 
 class Autosave:
-    """Writes results and checkpoints, as often as the configuration says.
+    """Saves results and checkpoints as often as the configuration says.
 
-    Where they cannot be written the run goes on, and ``run.unsaved`` says why; it may end better.
+    If they cannot be written, the run continues and ``record.save_error`` holds the reason.
 
     Args:
-        folder: of the results.
-        pipeline: that runs.
-        request: what was asked of the run; None where nobody would go on with it: then there are no checkpoints.
+        folder: Folder of the results.
+        pipeline: Pipeline that runs.
+        request: Request of the run, stored in the checkpoints; None saves no checkpoints.
     """
 
     def __init__(self, folder: Path, pipeline: Pipeline, request: RunRequest | None) -> None:
@@ -35,27 +35,27 @@ class Autosave:
         self._due = time.perf_counter() + self._config.interval
 
     def __call__(self) -> None:
-        """A frame is done: write what there is, if it is time."""
-        begin = time.perf_counter()
-        if begin < self._due:
+        """Save after a frame, if it is time."""
+        start = time.perf_counter()
+        if start < self._due:
             return
         try:
             write_intermediate_results(self._folder, self._pipeline)
             self._write_checkpoint()
         except OutputError as error:
-            self._give_up(error)
+            self._report(error)
         end = time.perf_counter()
-        self._due = end + max(self._config.interval, (end - begin) * (1 / self._config.max_time_share - 1))
+        self._due = end + max(self._config.interval, (end - start) * (1 / self._config.max_time_share - 1))
 
     def end(self) -> None:
-        """The frames are over, before their results are written: where that was too early, write a last checkpoint.
+        """Save a last checkpoint if the run ended early between two frames, before the results are written.
 
-        Of a frame that is half taken in there is none: the one before stays.
+        If the run ended within a frame, the last checkpoint stays: the state within a frame is not consistent.
         """
-        run = self._pipeline.record
+        record = self._pipeline.record
         if (
-            run.failure is None
-            or not run.frames
+            record.failure is None
+            or not record.frames
             or not self._pipeline.between_frames
             or math.isinf(self._config.interval)
         ):
@@ -63,21 +63,21 @@ class Autosave:
         try:
             self._write_checkpoint()
         except OutputError as error:
-            self._give_up(error)
+            self._report(error)
 
     def discard(self) -> None:
-        """The results are written: where they are those of the whole sequence, nobody goes on from here."""
+        """Remove the checkpoint if the run reached the end of the sequence."""
         if self._pipeline.record.failure is None:
             (self._folder / CHECKPOINT).unlink(missing_ok=True)
 
     def _write_checkpoint(self) -> None:
         if self._request is None:
             return
-        begin, path = time.perf_counter(), self._folder / CHECKPOINT
+        start, path = time.perf_counter(), self._folder / CHECKPOINT
         write_checkpoint(self._folder, self._pipeline, self._request)
-        seconds, size = time.perf_counter() - begin, path.stat().st_size / (1 << 20)
+        seconds, size = time.perf_counter() - start, path.stat().st_size / (1 << 20)
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.frames), size, seconds)
 
-    def _give_up(self, error: OutputError) -> None:
+    def _report(self, error: OutputError) -> None:
         self._pipeline.record.save_error = str(error)
         _LOG.warning("no checkpoint: %s", error)

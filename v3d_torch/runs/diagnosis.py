@@ -1,4 +1,4 @@
-"""What the results of a run lack although the sequence came to its end: every pose, or the scores."""
+"""Diagnosis of a run that reached the end of its sequence with incomplete results."""
 
 from __future__ import annotations
 
@@ -12,52 +12,55 @@ from v3d_torch.evaluation.report import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.types import TrackingStatus
 
-_LOOKED_AT = 5
-"""Frames that stand for all."""
+_SAMPLES = 5
+"""Number of frames that are examined."""
 
-_PLAIN = 4.0
-"""Standard deviation of an image that shows nothing, of 255: a dark one has as much of noise."""
+_MAX_PLAIN_SIGMA = 4.0
+"""Standard deviation of the grey values of an image without content, of 255: sensor noise in the dark is as large."""
 
-_EMPTY = 0.01
-"""Share of the pixels with depth in an image that shows nothing."""
+_MAX_EMPTY_FRACTION = 0.01
+"""Fraction of pixels with depth in a depth image without content."""
 
 
 def diagnose(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
-    """Say what is wrong with a run that no frame stopped.
+    """Explain incomplete results of a run that no error ended.
 
     Args:
-        pipeline: that has run.
-        evaluation: its scores, where it has some.
+        pipeline: Pipeline that has run.
+        evaluation: Its scores; None without ground truth.
 
     Returns:
-        A sentence with the cause and the cure; None where nothing is wrong.
+        One sentence with cause and fix; None if the results are complete.
     """
     statuses = pipeline.slam.poses.statuses
     name = pipeline.sequence.name
     if not statuses:
-        return f"{name}: gave no frame before its end; record it again"
+        return f"{name}: has no frames; record it again"
     if all(status is TrackingStatus.LOST for status in statuses):
-        return f"{name}: the camera was found in none of the {len(statuses)} frames, {_why_lost(pipeline)}"
-    return pipeline.record.mask_error or _why_unscored(pipeline, evaluation)
+        return f"{name}: the camera was not found in any of the {len(statuses)} frames, {_cause_of_loss(pipeline)}"
+    return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
 
 
-def _why_lost(pipeline: Pipeline) -> str:
-    sequence, reach = pipeline.sequence, pipeline.slam.config.features.max_depth
+def _cause_of_loss(pipeline: Pipeline) -> str:
+    sequence, max_depth = pipeline.sequence, pipeline.slam.config.features.max_depth
     if isinstance(sequence, RGBDSequence):
-        indices = np.linspace(0, len(sequence) - 1, min(_LOOKED_AT, len(sequence))).astype(int)
+        indices = np.linspace(0, len(sequence) - 1, min(_SAMPLES, len(sequence))).astype(int)
         frames = [sequence[int(index)] for index in indices]
-        if all(float(frame.image.float().std()) < _PLAIN for frame in frames):
-            return "their colour is the same all over; record it again, with light and an open lens"
-        if all(float((frame.depth > 0).float().mean()) < _EMPTY for frame in frames):
-            return "they have no depth; record or export the depth images again"
-        if all(float(((frame.depth > 0) & (frame.depth < reach)).float().mean()) < _EMPTY for frame in frames):
-            return f"all depth lies beyond {reach:g} m; correct the camera's depth_scale, or raise features.max_depth"
+        if all(float(frame.image.float().std()) < _MAX_PLAIN_SIGMA for frame in frames):
+            return "the colour images are uniform; record it again, with light and an open lens"
+        if all(float((frame.depth > 0).float().mean()) < _MAX_EMPTY_FRACTION for frame in frames):
+            return "the depth images are empty; record or export them again"
+        if all(
+            float(((frame.depth > 0) & (frame.depth < max_depth)).float().mean()) < _MAX_EMPTY_FRACTION
+            for frame in frames
+        ):
+            return f"all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise features.max_depth"
     if pipeline.record.dynamics:
-        return "people and what else may move cover them; see figures/masks.png, and try --segmenter none"
-    return "nothing in them can be followed from one to the next; check camera and depth, and move more slowly"
+        return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
+    return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 
 
-def _why_unscored(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
+def _cause_of_missing_scores(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
     sequence, trajectory = pipeline.sequence, pipeline.slam.poses.trajectory()
     if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
         return str(sequence.groundtruth_error)

@@ -1,7 +1,7 @@
-"""Debug mode: whatever leaves a stage is looked through for numbers that are not finite, and the stage is named.
+"""Debug mode: everything that a stage returns is checked for NaN and infinity, and the first such stage is named.
 
-A NaN goes far before it shows: a pose that is none, a keyframe, a map. `CheckedSLAM` stops at the door that it came
-through. Its results are those of `V3DSLAM`, byte by byte.
+A NaN spreads before it becomes visible, from a pose to a keyframe to the map. `CheckedSLAM` stops at the stage that returned it.
+Its results are byte-identical to those of `V3DSLAM`.
 """
 
 from __future__ import annotations
@@ -22,46 +22,43 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-STAGES = frozenset(
-    {
-        *("segment", "smooth_depth", "detect_features", "register", "odometry", "free_space_check"),
-        *("propose_unlabelled", "back_project_instances", "classify_motion", "map_tracker", "track_camera"),
-        *("compensate_rolling_shutter", "compensate_depth_delay", "mapper", "loop_closer", "back_end"),
-    }
-)
-"""Attributes of `V3DSLAM` that are its stages."""
+_NOT_STAGES = frozenset({"camera", "config", "timer", "map", "poses", "motion_model", "predictions"})
+"""Public attributes of `V3DSLAM` that are not stages."""
+
+_STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
+"""Methods whose results are not checked: NaN has a meaning in some of the fields that they return."""
 
 MAY_BE_NAN = frozenset(
     {
         "InstanceClouds.centroid",  # of a cloud with too few points
-        "NewlyOccupied.appeared",  # where it cannot be told
-        "TrackedObject.centroid",  # of an object that was never well seen
-        "TrackedObject.chamfer",  # that was not measured
+        "NewlyOccupied.appeared",  # if it is not known
+        "TrackedObject.centroid",  # of an object that never had a clean cloud
+        "TrackedObject.chamfer",  # if it was not measured
     }
 )
-"""Fields in which NaN has a meaning, each said where the class is; infinite they may not be."""
+"""Fields in which NaN has a meaning, which their class documents; infinity is an error in them, too."""
 
 
 def check_finite(name: str, value: object, *, nan: bool = False) -> None:
-    """Look through tensors, arrays and numbers, in dataclasses, tuples, lists and dicts too.
+    """Check tensors, arrays and numbers, also in dataclasses, sequences and mappings.
 
     Args:
-        name: of the value, for the message; fields and positions are put behind it.
-        value: to be looked through; what is none of these is passed over.
-        nan: whether NaN is allowed at the top.
+        name: Name of the value in the message; names of fields and positions are appended.
+        value: Value to check; values of other types are ignored.
+        nan: True to allow NaN in the value itself.
 
     Raises:
-        NumericsError: something is NaN, and not a field of `MAY_BE_NAN`, or infinite.
+        NumericsError: If a number is infinite, or NaN outside of the fields in `MAY_BE_NAN`.
     """
     if isinstance(value, Tensor | np.ndarray):
         _check_tensor(name, torch.as_tensor(value), nan=nan)
     elif isinstance(value, float):
         _check_tensor(name, torch.tensor(value, dtype=torch.float64), nan=nan)
     elif is_dataclass(value) and not isinstance(value, type):
-        kinds = [kind.__name__ for kind in type(value).__mro__]
+        classes = [cls.__name__ for cls in type(value).__mro__]
         for field in fields(value):
-            may = any(f"{kind}.{field.name}" in MAY_BE_NAN for kind in kinds)
-            check_finite(f"{name}.{field.name}", getattr(value, field.name), nan=may)
+            allowed = any(f"{cls}.{field.name}" in MAY_BE_NAN for cls in classes)
+            check_finite(f"{name}.{field.name}", getattr(value, field.name), nan=allowed)
     elif isinstance(value, Mapping):
         for key, item in value.items():
             check_finite(f"{name}[{key!r}]", item)
@@ -78,87 +75,86 @@ def _check_tensor(name: str, tensor: Tensor, *, nan: bool) -> None:
     count = int(wrong.sum())
     if count:
         first = tuple(torch.nonzero(wrong)[0].tolist())
-        what = "NaN" if math.isnan(abs(tensor[first].item())) else "infinite"
-        where = f", the first at {list(first)}" if first else ""
-        raise NumericsError(f"{name} is {what}: {count} of {tensor.numel()} numbers{where}")
+        kind = "NaN" if math.isnan(abs(tensor[first].item())) else "infinite"
+        position = f", the first at {list(first)}" if first else ""
+        raise NumericsError(f"{name} is {kind}: {count} of {tensor.numel()} numbers{position}")
 
 
 class CheckedStage:
-    """Stands for a stage: calls it, or its methods, and checks what comes out.
+    """Wrapper of a stage that checks what its call and its methods return.
 
     Args:
-        stage: any callable.
-        name: of the stage.
+        stage: Stage.
+        name: Name of the stage in messages.
     """
 
-    _OWN = ("_behind", "_sign")
+    _OWN = ("_stage", "_name")
 
     def __init__(self, stage: Any, name: str) -> None:
-        self._behind = stage
-        self._sign = name
+        self._stage = stage
+        self._name = name
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the stage.
 
         Raises:
-            NumericsError: what it gives is not finite.
+            NumericsError: If the result is not finite.
         """
-        given = self._behind(*args, **kwargs)
-        check_finite(self._sign, given)
-        return given
+        result = self._stage(*args, **kwargs)
+        check_finite(self._name, result)
+        return result
 
     def __getattr__(self, name: str) -> Any:
-        if name in self._OWN:  # asked for before there is one, as by copy
+        if name in self._OWN:  # read before it is set, for example by copy
             raise AttributeError(name)
-        found = getattr(self._behind, name)
-        return CheckedStage(found, f"{self._sign}.{name}") if callable(found) else found
+        value = getattr(self._stage, name)
+        is_checked = callable(value) and name not in _STATE_METHODS
+        return CheckedStage(value, f"{self._name}.{name}") if is_checked else value
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self._OWN:
             super().__setattr__(name, value)
         else:
-            setattr(self._behind, name, value)
+            setattr(self._stage, name, value)
 
 
 class CheckedSLAM(V3DSLAM):
-    """`V3DSLAM` with a door at each stage, also at those that are put in the place of one, and at both ends.
+    """`V3DSLAM` that checks the frames, the results of all stages, also of replaced ones, and the map.
 
-    The commands take it with ``--set check_numerics=true``. What stages keep for themselves is not looked at, but for
-    the map: its poses and landmarks.
+    The commands use it with ``--set check_numerics=true``.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
-        super().__setattr__(name, CheckedStage(value, name) if name in STAGES else value)
+        is_stage = not name.startswith("_") and name not in _NOT_STAGES
+        super().__setattr__(name, CheckedStage(value, name) if is_stage else value)
 
-    def perceive(self, frame: RGBDFrame, outlook: PosePrediction | None) -> PreprocessedFrame:
-        """`V3DSLAM.preprocess`.
+    def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
+        """Run `V3DSLAM.preprocess`.
 
         Raises:
-            NumericsError: the frame, or what a stage makes of it, is not finite.
+            NumericsError: If the frame, or the result of a stage, is not finite.
         """
-        with _of(frame):
+        with _frame_in_message(frame):
             check_finite("the input", frame)
-            return super().preprocess(frame, outlook)
+            return super().preprocess(frame, prediction)
 
-    def take_in(self, percept: PreprocessedFrame) -> FrameResult:
-        """`V3DSLAM.track`.
+    def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
+        """Run `V3DSLAM.track`.
 
         Raises:
-            NumericsError: what a stage gives is not finite, or the map is not after it.
+            NumericsError: If the result of a stage, or the map, is not finite.
         """
-        with _of(percept.frame):
-            tracked = super().track(percept)
-            check_finite("the result", tracked)
-            known = self.mapper.map
-            check_finite(
-                "the map", {"T_cw": known.T_cw, "landmarks": known.landmarks["point"][known.landmarks["alive"]]}
-            )
-            return tracked
+        with _frame_in_message(preprocessed.frame):
+            result = super().track(preprocessed)
+            check_finite("the result", result)
+            landmarks = self.map.landmarks
+            check_finite("the map", {"T_cw": self.map.T_cw, "landmarks": landmarks["point"][landmarks["active"]]})
+            return result
 
 
 @contextmanager
-def _of(frame: RGBDFrame) -> Iterator[None]:
-    """Put the frame in front of the message."""
+def _frame_in_message(frame: RGBDFrame) -> Iterator[None]:
+    """Prepend the index of the frame to error messages."""
     try:
         yield
     except NumericsError as error:

@@ -1,35 +1,42 @@
-"""What a user asks of a run, beside its configuration and the folder of its results."""
+"""Request of a run: everything that the user asks for, in one value."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Any
 
+from v3d_torch.config import Config
 from v3d_torch.datasets import SourceOptions
 from v3d_torch.datasets.cameras import PRESETS
 from v3d_torch.io.paths import expand_user
 
+_PATHS = ("data_root", "masks", "weights", "load_map", "save_map")
+
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a run takes in and gives out. It goes into checkpoints, so that the run can be gone on with.
+    """Inputs, outputs and configuration of one run. Checkpoints store it, so that the run can be resumed.
 
     Attributes:
-        seq: as `open_source` takes it.
-        data_root: where named sequences are; None takes the usual places.
-        camera: file or preset; None takes the sequence's own.
-        rgb_topic: see `SourceOptions`, as the next three.
-        depth_topic: of a bag.
-        info_topic: of a bag.
-        fps: of images and videos.
-        masks: folder of id images; None where nothing is read there.
-        weights: of the network; None takes the usual ones.
-        map_in: map to find the camera in; None begins a new one.
-        map_out: where the map goes in the end; None for nowhere.
-        save_masks: whether what is left out of tracking is written.
+        seq: Sequence, as `open_source` takes it.
+        config: Configuration of the system.
+        data_root: Folder of named sequences; None searches the usual places.
+        camera: Camera file or preset; None takes the camera of the sequence.
+        rgb_topic: Topic of the colour images of a bag; None guesses it, as for the next two.
+        depth_topic: Topic of the depth images of a bag.
+        info_topic: Topic of the camera info of a bag.
+        fps: Frame rate of images or videos without timestamps, Hz.
+        masks: Folder of id images, if instances are read from files.
+        weights: Weights file of the network; None takes the published ones.
+        load_map: Map file in which the camera is localised; None starts a new map.
+        save_map: File to which the map is saved at the end; None saves none.
+        save_masks: True to write an image of the masked pixels for each frame.
     """
 
     seq: str
+    config: Config
     data_root: str | None = None
     camera: str | None = None
     rgb_topic: str | None = None
@@ -43,38 +50,54 @@ class RunRequest:
     save_masks: bool = False
 
     @property
-    def options(self) -> SourceOptions:
-        """What the source does not say itself."""
+    def source_options(self) -> SourceOptions:
+        """Options of the source of frames."""
         return SourceOptions(self.rgb_topic, self.depth_topic, self.info_topic, self.fps)
 
     def absolute(self) -> RunRequest:
-        """The same, meaning the same in every working directory."""
-        values = asdict(self)
+        """Return the same request with absolute paths, independent of the working directory."""
+        values = self._options()
         for name in _PATHS:
             if values[name] is not None:
                 values[name] = str(expand_user(values[name]).absolute())
-        for name, no_path in (("seq", ("demo",)), ("camera", (None, *PRESETS))):
-            if values[name] not in no_path:
-                values[name] = _path_if_there(values[name])
-        return RunRequest(**values)
+        for name, not_a_path in (("seq", ("demo",)), ("camera", (None, *PRESETS))):
+            if values[name] not in not_a_path:
+                values[name] = _absolute_if_exists(values[name])
+        return RunRequest(config=self.config, **values)
 
-    def conflicting_option(self, given: RunRequest) -> str | None:
-        """The first option, but for those that say where sequences are, that another request gives and this one not."""
-        for name, value in asdict(given.absolute()).items():
-            if name not in ("seq", "data_root") and value not in (None, False) and value != getattr(self, name):
-                return _OPTIONS.get(name, f"--{name.replace('_', '-')}")
+    def conflicting_option(self, other: RunRequest) -> str | None:
+        """Return the first option that the other request sets to another value, as it is typed; None if none does.
+
+        Options that name the location of the sequence do not conflict, because the sequence may have been moved.
+        """
+        options = self._options()
+        for name, value in other.absolute()._options().items():
+            if name not in ("seq", "data_root") and value not in (None, False) and value != options[name]:
+                return f"--{name.replace('_', '-')}"
         return None
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values, which `from_dict` reads."""
+        return {**self._options(), "config": self.config.model_dump(mode="json")}
 
-_PATHS = ("data_root", "masks", "weights", "map_in", "map_out")
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> RunRequest:
+        """Make a request from the values of `to_dict`.
 
-_OPTIONS = {"map_in": "--load-map", "map_out": "--save-map"}
-"""Those that are called otherwise on the command line."""
+        Raises:
+            ValueError: If a value of the configuration is not valid.
+            TypeError: If a key is missing or unknown.
+        """
+        return RunRequest(**{**values, "config": Config.model_validate(values["config"])})
+
+    def _options(self) -> dict[str, Any]:
+        """Return everything but the configuration."""
+        return {name: value for name, value in vars(self).items() if name != "config"}
 
 
-def _path_if_there(name: str) -> str:
-    """A name that may be a path: absolute where it is one."""
-    with suppress(OSError):  # a name that is too long
+def _absolute_if_exists(name: str) -> str:
+    """Return the absolute path if the name is that of an existing file or folder, else the name."""
+    with suppress(OSError):  # names can be too long for a path
         if (path := expand_user(name)).exists():
             return str(path.absolute())
     return name

@@ -1,43 +1,87 @@
-"""A folder of results that is used again: nothing of the earlier run may be taken for the next one's."""
+"""Folder of the results of a run: created by name or time, cleared of an earlier run."""
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 
 from v3d_torch.errors import OutputError
 
 _LOG = "run.log"
-"""Written anew by the next run, and before that the sign that a run made the rest."""
+"""Every run writes its log first, so this file marks the other files as results of a run."""
 
-_WRITTEN = (
+_RESULTS = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "report.html"),
     *("checkpoint.v3d", "frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png", "masks/*.png"),
 )
-"""All else that a run, or the report of one, writes."""
+"""Files that a run, or the report of a run, writes beside the log."""
 
-_HALF_WRITTEN = (".*.part*", "figures/.*.part*", "masks/.*.part*")
-"""Left where a run is killed while it writes."""
+_UNFINISHED = (".*.part*", "figures/.*.part*", "masks/.*.part*")
+"""Temporary files of a run that was killed while it wrote."""
 
 
-def prepare_folder(folder: Path) -> None:
-    """Make a folder for the results of a run, and remove what an earlier run has left there; what else is there stays.
+def make_result_folder(out: Path | None, name: str) -> Path:
+    """Make the folder of the results of a run.
+
+    Args:
+        out: Folder given by the user; None makes ``results/<name>/<time>``, and a link ``latest`` to it.
+        name: Name of the sequence.
 
     Raises:
-        OutputError: it has files of the same names and no log of a run, so they may be the user's own, such as the
-            ground truth of a sequence; or it cannot be written.
+        OutputError: If the folder cannot be made.
+    """
+    runs = Path("results") / name.replace("/", "_")
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            return out
+        folder = _make_folder_by_time(runs)
+    except OSError as error:
+        raise OutputError(
+            f"{out or runs}: cannot be made ({error.strerror}); choose another folder with --out"
+        ) from error
+    link = runs / f".latest.{os.getpid()}"  # renamed afterwards, so that ``latest`` always exists
+    with suppress(OSError):  # Windows without developer mode and some file systems have no links
+        link.symlink_to(folder.name)
+        link.replace(runs / "latest")
+    return folder
+
+
+def _make_folder_by_time(runs: Path) -> Path:
+    """Make a folder named by the time; runs that start in the same second get a number."""
+    runs.mkdir(parents=True, exist_ok=True)
+    now = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    folder, number = runs / now, 1
+    while True:
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            number += 1
+            folder = runs / f"{now}_{number}"
+        else:
+            return folder
+
+
+def clear_earlier_results(folder: Path) -> None:
+    """Remove the results of an earlier run from a folder, which is made if it is missing; other files stay.
+
+    Raises:
+        OutputError: If the folder has files with the names of results but no log of a run (they can be the user's
+            own, such as a ground truth), or if it cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        earlier = [path for pattern in (*_WRITTEN, *_HALF_WRITTEN) for path in sorted(folder.glob(pattern))]
+        earlier = [path for pattern in (*_RESULTS, *_UNFINISHED) for path in sorted(folder.glob(pattern))]
         if earlier and not (folder / _LOG).is_file():
-            raise OutputError(f"{earlier[0]}: is there and was left by no run; choose another folder with --out")
+            raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
         for path in earlier:
             path.unlink()
-        for emptied in (folder / "figures", folder / "masks"):
-            with suppress(OSError):  # not there, or with something else in it
-                emptied.rmdir()
+        for subfolder in (folder / "figures", folder / "masks"):
+            with suppress(OSError):  # missing, or with other files in it
+                subfolder.rmdir()
     except OSError as error:
         raise OutputError(
             f"{folder}: cannot be written ({error.strerror}); choose another folder with --out"
@@ -45,7 +89,7 @@ def prepare_folder(folder: Path) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what an earlier run was about to write when it was killed."""
-    for pattern in _HALF_WRITTEN:
+    """Remove the temporary files of a run that was killed while it wrote."""
+    for pattern in _UNFINISHED:
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The results of a run as files: the contract that other tools read (README, "Results")."""
+"""Writer of the result files of a run; docs/results.md documents every file, key and column."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ _DYNAMICS = pa.schema(
 
 
 def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
-    """Write everything that a run leaves behind, ``metrics.json`` last: where it is, all the rest is.
+    """Write all results of a run, ``metrics.json`` last, so that its presence shows that they are complete.
 
     Args:
-        folder: of this run; made when it is not there.
-        pipeline: that has run, to the end or not.
+        folder: Folder of the results; made if it is missing.
+        pipeline: Pipeline that has run, to the end or not.
 
     Returns:
-        The scores where there is ground truth.
+        The scores, if there is ground truth.
 
     Raises:
-        OutputError: when the folder cannot be written or the disk is full.
+        OutputError: If the folder cannot be written or the disk is full.
     """
     trajectory, evaluation = _write_tables(folder, pipeline)
     _write_maps(folder, pipeline, trajectory)
@@ -73,34 +73,34 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
 
 
 def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
-    """Write what a run that goes on has until now: all but maps and figures, which take seconds.
+    """Write the results so far of a run in progress, without maps and figures, which take seconds.
 
     Args:
-        folder: of this run; made when it is not there.
-        pipeline: between two frames.
+        folder: Folder of the results; made if it is missing.
+        pipeline: Pipeline between two frames.
 
     Raises:
-        OutputError: when the folder cannot be written or the disk is full.
+        OutputError: If the folder cannot be written or the disk is full.
     """
     _, evaluation = _write_tables(folder, pipeline)
     done = len(pipeline.slam.poses.statuses)
     known = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
-    _write_metrics(folder, pipeline, evaluation, f"killed, or still running, after {done}{known} frames")
+    _write_metrics(folder, pipeline, evaluation, f"killed or still running after {done}{known} frames")
 
 
 def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluation | None]:
-    """Poses and rows of all frames so far, and the scores where there is ground truth."""
+    """Write poses and tables of all frames so far; return the trajectory, and the scores if there is ground truth."""
     slam, sequence = pipeline.slam, pipeline.sequence
     trajectory = slam.poses.trajectory()
-    write_trajectory(folder / "trajectory.txt", trajectory)  # first: the disk may have room for this and no more
+    write_trajectory(folder / "trajectory.txt", trajectory)  # first, in case the disk gets full
     write_text(folder / "config.yaml", dump_config(slam.config))
-    own = [keyframe for keyframe in slam.mapper.map.active_keyframes if not keyframe.is_from_earlier_run]
+    own = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
     stamps = torch.tensor([keyframe.stamp for keyframe in own], dtype=torch.float64)
     write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(stack_poses(own))))
     evaluation = None
     if sequence.groundtruth is not None:
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
-        with suppress(InputError):  # too few poses to score are still worth writing
+        with suppress(InputError):  # too few poses for scores
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
     _write_table(folder / "frames.parquet", *_frames(pipeline))
     _write_table(folder / "dynamics.parquet", pipeline.record.dynamics, _DYNAMICS)
@@ -112,17 +112,17 @@ def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | No
 
 
 def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
-    """How each frame was found, whether the map kept it, and the seconds of each stage; 0 where one did not run."""
+    """Return the table of frames: status, keyframe, and seconds of each stage, 0 if it did not run."""
     slam, rows = pipeline.slam, pipeline.record.frames
     stages = list(slam.timer.seconds)
     columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
-    kept = {keyframe.frame for keyframe in slam.mapper.map.active_keyframes}
+    keyframes = {keyframe.frame for keyframe in slam.map.active_keyframes}
     table: list[dict[str, object]] = [
         {
-            **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in kept},
+            **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in keyframes},
             **{f"seconds_{stage}": row.get(stage, 0.0) for stage in stages},
         }
-        for row, status in zip(rows, slam.poses.statuses, strict=False)  # interrupted within a frame: one row less
+        for row, status in zip(rows, slam.poses.statuses, strict=False)  # one row less if a frame was interrupted
     ]
     return table, pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
 
@@ -146,11 +146,11 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],
-        "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.mapper.map.active_keyframes),
-        "known_keyframes": sum(keyframe.is_from_earlier_run for keyframe in slam.mapper.map.active_keyframes),
-        "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
+        "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
+        "known_keyframes": sum(keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
+        "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
-        "readout": slam.mapper.map.readout.seconds,
+        "readout": slam.map.readout.seconds,
         "failure": failure,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,
@@ -169,7 +169,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
 def _peak_memory_mb() -> float | None:
     if sys.platform == "win32":
         return None
-    if (status := Path("/proc/self/status")).is_file():  # Linux: there getrusage counts the parent process in
+    if (status := Path("/proc/self/status")).is_file():  # on Linux getrusage includes the parent process
         found = re.search(r"^VmHWM:\s*(\d+) kB$", status.read_text(encoding="utf-8"), re.MULTILINE)
         if found is not None:
             return int(found[1]) / (1 << 10)
@@ -184,8 +184,8 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
-    kept = slam.mapper.map.active_keyframes
-    frames = [keyframe.frame for keyframe in kept]
+    keyframes = slam.map.active_keyframes
+    frames = [keyframe.frame for keyframe in keyframes]
     statuses = [status.value for status in slam.poses.statuses]
-    path = camera_path(trajectory, statuses, invert(stack_poses(kept)), frames, pipeline.sequence.camera)
+    path = camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -1,4 +1,4 @@
-"""The result files of a run, read back (README, "Results")."""
+"""Reader of the result files of a run."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from v3d_torch.types import TrackingStatus, Trajectory
 
 _METRICS = "metrics.json"
 
-_DEPTH = 3
-"""Folders between a run and the one above it that is given: a batch has sequence, configuration and seed."""
+_MAX_DEPTH = 3
+"""Levels of folders above a run: a batch has sequence, configuration and seed."""
 
 
 class Metrics(BaseModel):
-    """What ``metrics.json`` says beside the scores; the names are its keys."""
+    """Content of ``metrics.json`` beside the scores; field names are its keys."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -51,19 +51,19 @@ class Metrics(BaseModel):
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as its files tell it.
+    """Results of a run.
 
     Attributes:
-        folder: of the files.
-        metrics: numbers of the whole run.
-        trajectory: a pose for every frame that was processed; None where the file is missing or the run has no frame.
-        keyframes: the poses that the map kept; None where there are none.
-        groundtruth: true poses, if known.
-        evaluation: scores; None without ground truth, or where fewer than three poses have any.
-        frames: a row per frame; None where the file is missing.
-        dynamics: a row per frame and object; None where the file is missing.
-        config_text: the configuration as written; empty where the file is missing.
-        config: the same; None where it is of a version with other keys, or missing.
+        folder: Folder of the files.
+        metrics: Figures of the whole run.
+        trajectory: Pose of each processed frame; None if the file is missing or the run has no frames.
+        keyframes: Poses of the keyframes; None if there are none.
+        groundtruth: True poses; None if there are none.
+        evaluation: Scores; None without ground truth, or if fewer than three poses have ground truth.
+        frames: Table with one row per frame; None if the file is missing.
+        dynamics: Table with one row per frame and object; None if the file is missing.
+        config_text: Text of the configuration file; empty if it is missing.
+        config: Configuration; None if it is missing, or from a version with other keys.
     """
 
     folder: Path
@@ -79,30 +79,32 @@ class StoredRun:
 
 
 def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
-    """Read what a run left in its folder; all but ``metrics.json`` may be missing.
+    """Read the results of a run; all files but ``metrics.json`` are optional.
 
     Args:
-        folder: given to the run as ``--out``.
-        groundtruth: true poses to use instead of those in the folder.
+        folder: Folder of the results.
+        groundtruth: File of true poses to use instead of those in the folder.
 
     Raises:
-        InputError: the folder holds no results, a file in it is broken, or the given true poses are of another time.
+        InputError: If the folder has no results, a file is damaged, or the given ground truth is of another time.
     """
     if not (folder / _METRICS).is_file():
         raise InputError(
-            f"{folder}: holds no results of a run, there is no {_METRICS};"
-            f" {suggest_folder(folder, _METRICS) or 'give the folder that run names at its end'}"
+            f"{folder}: has no results of a run ({_METRICS} is missing);"
+            f" {suggest_folder(folder, _METRICS) or 'give the folder that the run printed at its end'}"
         )
     config_path = folder / "config.yaml"
     config_text = read_text(config_path, "it is a configuration in YAML") if config_path.is_file() else ""
     metrics, trajectory = read_metrics(folder / _METRICS), _read_poses(folder / "trajectory.txt")
     frames = len(metrics.status)
-    if trajectory is not None and metrics.failure is not None:  # killed between writing the two: it has more poses
+    if (
+        trajectory is not None and metrics.failure is not None
+    ):  # killed between the two files: the trajectory has more poses
         trajectory = Trajectory(trajectory.stamps[:frames], trajectory.T_wc[:frames])
     if trajectory is not None and len(trajectory) != frames:
         raise InputError(
-            f"{folder}: trajectory.txt has {len(trajectory)} poses, metrics.json {frames} frames; they are"
-            " not of the same run, run again"
+            f"{folder}: trajectory.txt has {len(trajectory)} poses and metrics.json {frames} frames, so they belong to"
+            " different runs; run the sequence again"
         )
     truth_path = groundtruth or folder / "groundtruth.txt"
     truth = read_trajectory(truth_path) if groundtruth is not None or truth_path.is_file() else None
@@ -130,44 +132,46 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
 
 
 def suggest_folder(path: Path, file: str) -> str | None:
-    """Which folder to give instead of one that is none of a run: the one around a file, or the newest run below it.
+    """Suggest a folder of a run: the folder of the given file, or the newest run below the given folder.
 
     Args:
-        path: that was given.
-        file: name of the file that a run's folder has to have.
+        path: Path given by the user.
+        file: Name of a file that the folder of a run has.
 
     Returns:
-        What to do, in words; None where there is no such folder.
+        A suggestion in words; None if there is no such folder.
     """
     if path.is_file() and (path.parent / file).is_file():
-        return f"give the folder that {path.name} is in, {path.parent}"
-    found = [place for depth in range(1, _DEPTH + 1) for place in path.glob("*/" * depth + file)]
+        return f"give its folder, {path.parent}"
+    found = [match for depth in range(1, _MAX_DEPTH + 1) for match in path.glob("*/" * depth + file)]
     if not found:
         return None
-    # A name that points to the newest, as latest does, is as new as what it points to, and easier to type.
-    newest = max(found, key=lambda place: (place.stat().st_mtime_ns, place.parent.is_symlink()))
-    return f"give the newest of the runs in it, {newest.parent}"
+    # Prefer a link such as ``latest`` to the folder that it points to, because it is easier to type.
+    newest = max(found, key=lambda match: (match.stat().st_mtime_ns, match.parent.is_symlink()))
+    return f"give the newest run in it, {newest.parent}"
 
 
 def read_metrics(path: Path) -> Metrics:
     """Read the ``metrics.json`` of a run.
 
     Raises:
-        InputError: it cannot be read, or is not what a run of this version writes.
+        InputError: If it cannot be read, or was not written by a run of this version.
     """
     text = read_text(path, "it is written by a run")
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON ({error}); run the sequence again") from error
+        raise InputError(f"{path}: is not JSON ({error}); run the sequence again") from error
     try:
         return Metrics.model_validate(tree)
     except ValidationError as error:
-        raise InputError(f"{path}: {first_error(error)}; it is not of this version, run again") from error
+        raise InputError(
+            f"{path}: {first_error(error)}; the file is from another version, run the sequence again"
+        ) from error
 
 
 def _read_poses(path: Path) -> Trajectory | None:
-    """Poses of a run; it writes an empty file when it has none."""
+    """Read poses; a run without poses writes an empty file."""
     return read_trajectory(path) if path.is_file() and path.stat().st_size else None
 
 
@@ -176,13 +180,13 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> pa.Table | None:
         return None
     try:
         table = pq.read_table(path)
-        missing = set(columns) - set(table.column_names)  # which decodes the names
+        missing = set(columns) - set(table.column_names)  # decodes the names, which can fail
     except (pa.ArrowException, OSError, ValueError) as error:
-        why = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: is no parquet table ({why}); run again") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: is not a parquet table ({reason}); run the sequence again") from error
     if missing:
         raise InputError(
-            f"{path}: lacks the columns {', '.join(sorted(missing))}; it is not of this version, run again"
+            f"{path}: has no columns {', '.join(sorted(missing))}; the file is from another version, run the sequence again"
         )
     return table
 
@@ -190,5 +194,5 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> pa.Table | None:
 def _read_config(path: Path) -> Config | None:
     try:
         return load_config(path) if path.is_file() else None
-    except ConfigError:  # written by a version with other keys: it can be shown, not compared
+    except ConfigError:  # from a version with other keys: it is shown, but not compared
         return None

@@ -1,4 +1,4 @@
-"""What is refused at the door: frames and instances that callers make themselves, before they break a stage inside."""
+"""Checks of frames, instances and parameters that callers pass in, before they fail inside a stage."""
 
 from __future__ import annotations
 
@@ -13,33 +13,26 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Instances, RGBDFrame
 
 
-def check_parts(camera: PinholeCamera | None, config: Config | None) -> None:
-    """Look whether a system is made of what it should be.
+def check_parameters(camera: PinholeCamera, config: Config | None) -> None:
+    """Check the types of the parameters of `V3DSLAM`.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: If one has the wrong type.
     """
-    if not isinstance(camera, PinholeCamera | None):
-        raise ConfigError(f"the camera of a V3DSLAM is {_kind(camera)}; give a PinholeCamera, such as sequence.camera")
+    if not isinstance(camera, PinholeCamera):
+        raise ConfigError(f"V3DSLAM needs a PinholeCamera, got {_kind(camera)}; give one, such as sequence.camera")
     if not isinstance(config, Config | None):
-        raise ConfigError(f'the config of a V3DSLAM is {_kind(config)}; give a Config, such as load_config("paper")')
+        raise ConfigError(f'V3DSLAM needs a Config, got {_kind(config)}; give one, such as load_config("paper")')
 
 
-def check_frame(frame: RGBDFrame, camera: PinholeCamera | None) -> PinholeCamera:
-    """Look whether a frame is what its class says, and of the camera that is tracked.
-
-    Returns:
-        The camera; where it was not known, that of the frame.
+def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
+    """Check that a frame is complete and belongs to the camera.
 
     Raises:
-        InputError: it is not.
-        ConfigError: nobody said which camera took it.
+        InputError: If it does not.
     """
     if not isinstance(frame, RGBDFrame):
-        raise InputError(f"V3DSLAM takes frames, this is {_kind(frame)}; make one of arrays with RGBDFrame.of")
-    camera = frame.camera if camera is None else camera
-    if camera is None:
-        raise ConfigError("the camera is not known: give it to V3DSLAM, or frames that carry it")
+        raise InputError(f"expected an RGBDFrame, got {_kind(frame)}; RGBDFrame.from_arrays makes frames from arrays")
     size = (camera.height, camera.width)
     for name, image, shape, dtype in (
         ("colour", frame.image, (3, *size), torch.uint8),
@@ -47,41 +40,41 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera | None) -> PinholeCamera
     ):
         if not isinstance(image, Tensor) or image.shape != shape or image.dtype != dtype:
             raise InputError(
-                f"frame {frame.index}: the {name} image is {_said(image)}, and not a tensor, {dtype} of shape {shape}"
-                " as the camera has it; RGBDFrame.of makes frames of arrays"
+                f"frame {frame.index}: the {name} image is {_description(image)}, expected a tensor, {dtype} of shape"
+                f" {shape}; RGBDFrame.from_arrays makes frames from arrays"
             )
-    for name, seconds in (("stamp", frame.stamp), ("delay of depth", frame.depth_delay)):
+    for name, seconds in (("stamp", frame.stamp), ("depth delay", frame.depth_delay)):
         if not math.isfinite(seconds):
-            raise InputError(f"frame {frame.index}: the {name} is {seconds}; give seconds, as a finite number")
+            raise InputError(f"frame {frame.index}: the {name} is {seconds}; give a finite number of seconds")
     if frame.camera is not None and frame.camera != camera:
         raise InputError(
-            f"frame {frame.index}: carries another camera than the V3DSLAM has; make one for each camera, or frames"
-            " without"
+            f"frame {frame.index}: its camera differs from that of the V3DSLAM; make one V3DSLAM for each camera"
         )
-    return camera
 
 
-def check_order(frame: RGBDFrame, last: float) -> None:
-    """Look whether a frame comes after the one before it.
+def check_order(frame: RGBDFrame, previous_stamp: float) -> None:
+    """Check that a frame is later than the previous one.
 
     Raises:
-        InputError: it does not.
+        InputError: If it is not.
     """
-    if frame.stamp <= last:
+    if frame.stamp <= previous_stamp:
         raise InputError(
-            f"frame {frame.index}: its stamp, {frame.stamp:.6f} s, is not after {last:.6f} s, that of the frame before;"
-            " give frames in order of time, each once"
+            f"frame {frame.index}: its stamp, {frame.stamp:.6f} s, is not after {previous_stamp:.6f} s, that of the"
+            " previous frame; give frames in order of time, each once"
         )
 
 
 def check_instances(instances: Instances, frame: RGBDFrame) -> None:
-    """Look whether a segmenter gave what its signature says.
+    """Check that a segmenter returned valid instances.
 
     Raises:
-        ConfigError: it did not.
+        ConfigError: If it did not.
     """
     if not isinstance(instances, Instances):
-        raise ConfigError(f"the segmenter gave {_kind(instances)} for frame {frame.index}; it has to give Instances")
+        raise ConfigError(
+            f"the segmenter returned {_kind(instances)} for frame {frame.index}; it must return Instances"
+        )
     count, size = len(instances.masks), tuple(frame.image.shape[-2:])
     for name, shape, dtype in (
         ("masks", (count, *size), torch.bool),
@@ -92,18 +85,18 @@ def check_instances(instances: Instances, frame: RGBDFrame) -> None:
         value = getattr(instances, name)
         if not isinstance(value, Tensor) or value.shape != shape or value.dtype != dtype:
             raise ConfigError(
-                f"the segmenter's {name} for frame {frame.index} are {_said(value)}, and not a tensor, {dtype} of shape"
-                f" {shape}"
+                f"the segmenter's {name} for frame {frame.index} are {_description(value)}, expected a tensor, {dtype}"
+                f" of shape {shape}"
             )
 
 
-def _said(value: object) -> str:
-    """What something is, in words."""
+def _description(value: object) -> str:
+    """Return the type and shape of a value in words."""
     if isinstance(value, Tensor):
         return f"{value.dtype} of shape {tuple(value.shape)}"
     return _kind(value)
 
 
 def _kind(value: object) -> str:
-    """Of which class something is, in words."""
+    """Return the class of a value in words."""
     return f"a {type(value).__qualname__}"

@@ -10,23 +10,22 @@ import torch
 
 
 def set_num_threads(threads: int) -> None:
-    """Let torch and OpenCV work with so many threads; left to itself, OpenCV takes all cores for a tenth of the work.
+    """Set the number of threads of torch and OpenCV.
 
-    onnxruntime's are told when the network is opened (``segmentation.threads``); kornia-rs takes all cores for the
-    pyramid's levels, or what RAYON_NUM_THREADS says, which it reads once.
+    The operations of a frame are small, and more threads mostly wait for each other. onnxruntime gets its number from
+    ``segmentation.threads``; kornia-rs reads RAYON_NUM_THREADS once, at its first call.
 
     Args:
-        threads: of each.
+        threads: Number of threads of each library.
     """
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
 
 
 def trim_memory() -> None:
-    """Let the C library return what lies free in between; it keeps pages, a quarter of what a long run seems to take.
+    """Return unused memory of the C library to the system; does nothing if the library is not glibc.
 
-    What each frame leaves behind is small and lives long, what it works with is large and does not: so the free parts
-    lie between the kept ones, where glibc does not return them by itself. Other C libraries are left alone.
+    Each frame leaves small, long-lived blocks between large, short-lived ones, so glibc keeps many free pages.
     """
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -1,17 +1,18 @@
-"""Seconds spent in each stage."""
+"""Time spent in each stage."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 
 class StageTimer:
-    """Adds up wall time by stage.
+    """Sums the wall time of each stage.
 
     Attributes:
-        seconds: stage to total, in the order in which the stages first ran.
+        seconds: Total time by stage, seconds, in the order in which the stages first ran.
     """
 
     def __init__(self) -> None:
@@ -20,7 +21,7 @@ class StageTimer:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Time the block under ``stage``."""
+        """Measure the time of a ``with`` block."""
         start = time.perf_counter()
         try:
             yield
@@ -28,12 +29,20 @@ class StageTimer:
             self.add({stage: time.perf_counter() - start})
 
     def add(self, seconds: Mapping[str, float]) -> None:
-        """Add what another clock measured, by stage."""
+        """Add times that another timer measured, by stage."""
         for stage, elapsed in seconds.items():
             for total in (self.seconds, self._lap):
                 total[stage] = total.get(stage, 0.0) + elapsed
 
     def lap(self) -> dict[str, float]:
-        """Seconds by stage since this was last asked: of a frame, when asked after each."""
+        """Return the time of each stage since the last call, and start a new lap."""
         lap, self._lap = self._lap, {}
         return lap
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the times measured so far."""
+        return {"seconds": self.seconds, "lap": self._lap}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the times of `state_dict`."""
+        self.seconds, self._lap = dict(state["seconds"]), dict(state["lap"])

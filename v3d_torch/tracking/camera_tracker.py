@@ -1,75 +1,80 @@
-"""The pose of a frame by the best that can be had: the map, a place seen before, the motion since the last frame."""
+"""Pose of each frame: from the local map, else by relocalisation, else from the motion alone."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.features.orb import Features
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.tracking.map_tracker import MapTracker
+from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
 
 
+class _PlaceMatch(Protocol):
+    @property
+    def tracking(self) -> MapTracking: ...
+
+
+class Relocaliser(Protocol):
+    """Finds the pose of a lost camera; `v3d_torch.backend.loop_closer.LoopCloser` is one."""
+
+    def relocalise(self, features: Features, sparse_map: SparseMap) -> _PlaceMatch | None:
+        """Find the place of the map that the features show; None if there is none."""
+
+
 class CameraTracker:
-    """Finds the camera.
+    """Estimates the pose of a frame in the map.
 
     Args:
-        track: finds a frame in a local map.
-        places: finds it where it was before.
-        sparse_map: of the system.
-        local_keyframes: keyframes that make up a local map.
+        track_map: Tracks a frame against a local map.
+        relocaliser: Finds a lost camera in the map.
+        sparse_map: Map of the system.
+        local_keyframes: Number of keyframes whose landmarks make up the local map.
     """
 
-    def __init__(self, track: MapTracker, places: LoopCloser, sparse_map: SparseMap, local_keyframes: int) -> None:
-        self._track = track
-        self._places = places
+    def __init__(
+        self, track_map: MapTracker, relocaliser: Relocaliser, sparse_map: SparseMap, local_keyframes: int
+    ) -> None:
+        self._track_map = track_map
+        self._relocaliser = relocaliser
         self._map = sparse_map
         self._local_keyframes = local_keyframes
 
     def __call__(
-        self, static: Features, depth: Tensor, T_cw: Tensor, carried: Tensor, poses: PoseHistory, *, moved: bool
+        self, features: Features, depth: Tensor, T_cw: Tensor, landmarks: Tensor, motion: CameraMotion, poses: PoseHistory
     ) -> FramePose:
-        """Pose in the local map, else in a place seen before, else by the motion alone, else lost.
+        """Estimate the pose of a frame.
 
         Args:
-            static: features on what stands still.
-            depth: of the frame, metres, shape :math:`(1, H, W)`, 0 = none.
-            T_cw: predicted, by the motion where it is known, float64, shape :math:`(4, 4)`.
-            carried: id of the landmark behind each feature as far as the last frame tells, -1 for none.
-            poses: of the frames before.
-            moved: whether the motion since the last frame is known.
+            features: Static features of the frame.
+            depth: Depth of the frame, metres, shape :math:`(1, H, W)`, 0 = no measurement.
+            T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
+            landmarks: Landmark id of each feature as matched from the previous frame, -1 for none, int64, shape
+                :math:`(N,)`.
+            motion: Motion of the camera since the previous frame.
+            poses: Poses of all earlier frames.
         """
         if self._map.keyframes:
-            local = self._map.local_map(poses.landmarks, self._local_keyframes)
-            tracking = self._track(static, T_cw, local, carried, depth)
+            local_map = self._map.local_map(poses.landmark_ids, self._local_keyframes)
+            tracking = self._track_map(features, T_cw, local_map, landmarks, depth)
             if tracking is None:
-                place = self._places.relocalise(static, self._map)
-                tracking = place.tracking if place is not None else None
+                match = self._relocaliser.relocalise(features, self._map)
+                tracking = None if match is None else match.tracking
             if tracking is not None:
                 self._map.count_matches(tracking.found, tracking.visible)
                 return FramePose(TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks)
-        known = moved and poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
-        nothing = torch.full((len(static),), -1, dtype=torch.int64)
-        return FramePose(TrackingStatus.ODOMETRY if known else TrackingStatus.LOST, T_cw, nothing)
+        known = motion.is_measured and poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
+        status = TrackingStatus.ODOMETRY if known else TrackingStatus.LOST
+        return FramePose(status, T_cw, torch.full((len(features),), -1, dtype=torch.int64))
 
-    def again(self, features: Features, points: Tensor, poses: PoseHistory) -> None:
-        """Refine the pose of the frame before the last, now that it is known better what that saw.
-
-        Args:
-            features: of that frame, put right.
-            points: the landmarks that they show, world frame, metres, float64, shape :math:`(L, 3)`.
-            poses: of all frames.
-        """
-        refined = self._track.refine(poses.T_pw, points, features, rounds=1)
-        if refined is not None:
-            poses.correct(refined.T_cw)
-
-    def reference(self, estimate: FramePose) -> Keyframe | None:
-        """The keyframe that shares most with the frame, else the last one; None while there is none."""
+    def reference_keyframe(self, pose: FramePose) -> Keyframe | None:
+        """Return the keyframe that shares most landmarks with a frame, else the last one; None if there are none."""
         keyframes = self._map.keyframes
-        best = self._map.covisible_keyframes(estimate.landmarks[estimate.landmarks >= 0], 1)
+        best = self._map.covisible_keyframes(pose.landmark_ids, 1)
         return keyframes[int(best[0])] if len(best) else (keyframes[-1] if keyframes else None)

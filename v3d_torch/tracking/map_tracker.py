@@ -1,4 +1,4 @@
-"""Tracks a frame against the local map: project, match nearby, refine the pose (paper, Sec. III-E; ORB-SLAM2)."""
+"""Tracking of a frame against the local map: projection, matching, pose refinement (paper, Sec. III-E; ORB-SLAM2)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,25 @@ from v3d_torch.features.projection_matcher import LocalMap, Projection, Projecti
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
 
-_ERRS = 2
-"""Standard deviations that 95 % of depths err by at most."""
+_SEARCH_RADIUS = 10.0
+"""Radius around the projection of a landmark in which it is matched, pixels at level 0; it grows with the level. The error of
+a predicted pose is some pixels."""
+
+_REFINED_SEARCH_RATIO = 0.5
+"""The second search starts from a refined pose and uses this fraction of the radius."""
+
+_OCCLUSION_SIGMAS = 2.0
+"""Landmarks farther behind the measured depth than this many standard deviations are occluded."""
 
 
 @dataclass(frozen=True)
-class Tracking:
-    """A frame's pose in the map.
+class MapTracking:
+    """Pose of a frame in the map.
 
     Attributes:
-        T_cw: world to camera, float64, shape :math:`(4, 4)`.
-        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
-        visible: ids of the landmarks that should have been seen, int64, shape :math:`(V,)`.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+        landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
+        visible: Ids of the landmarks that the frame should have observed, int64, shape :math:`(V,)`.
     """
 
     T_cw: Tensor
@@ -38,73 +45,76 @@ class Tracking:
 
     @property
     def count(self) -> int:
-        """Number of landmarks found."""
+        """Number of landmarks that were found."""
         return int((self.landmarks >= 0).sum())
 
 
 class MapTracker:
-    """Finds the pose of a frame in the local map.
+    """Estimates the pose of a frame in the local map.
 
     Args:
-        config: search and noise.
-        features: scale pyramid of the features.
-        camera: projects the landmarks.
+        config: Matching thresholds and noise.
+        features: Scale pyramid of the features.
+        camera: Camera of all frames.
     """
 
     def __init__(self, config: TrackingConfig, features: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._features = features
         self._camera = camera
-        self._search = ProjectionMatcher(config, features, camera)
+        self._match = ProjectionMatcher(config, features, camera)
 
     def __call__(
-        self, features: Features, T_cw: Tensor, local: LocalMap, carried: Tensor, depth: Tensor | None = None
-    ) -> Tracking | None:
-        """Track ``features`` from a predicted pose.
+        self, features: Features, T_cw: Tensor, local_map: LocalMap, landmarks: Tensor, depth: Tensor | None = None
+    ) -> MapTracking | None:
+        """Track a frame from a predicted pose.
 
         Args:
-            features: of the frame, on pixels that stand still.
-            T_cw: predicted world-to-camera pose.
-            local: landmarks near the prediction.
-            carried: id of the landmark behind each feature as far as the frame before tells, -1 for none, int64,
-                shape :math:`(N,)`.
-            depth: image of the view, metres, shape :math:`(1, H, W)`, 0 = none: landmarks behind what it shows are
-                hidden, by people most of all, and need not have been seen. None where it is not at hand.
+            features: Static features of the frame.
+            T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
+            local_map: Landmarks near the prediction.
+            landmarks: Landmark id of each feature as matched from the previous frame, -1 for none, int64, shape
+                :math:`(N,)`.
+            depth: Depth of the frame, metres, shape :math:`(1, H, W)`, 0 = no measurement. Landmarks behind it are
+                occluded, mostly by people, and do not count as visible. None if it is not known.
 
         Returns:
-            None when fewer than ``min_inliers`` landmarks are found: the camera is lost.
+            None if fewer than ``min_inliers`` landmarks are found: the camera is lost.
         """
-        row = torch.searchsorted(local.ids, carried).clamp(max=max(len(local.ids) - 1, 0))
-        feature = torch.nonzero((carried >= 0) & (local.ids[row] == carried))[:, 0] if len(local.ids) else row[:0]
-        first = self.refine(T_cw, local.points[row[feature]], features[feature], rounds=2)
+        # Landmarks matched by the frame-to-frame motion need no search.
+        row = torch.searchsorted(local_map.ids, landmarks).clamp(max=max(len(local_map.ids) - 1, 0))
+        in_local_map = (landmarks >= 0) & (local_map.ids[row] == landmarks) if len(local_map.ids) else landmarks < -1
+        feature = torch.nonzero(in_local_map)[:, 0]
+        first = self.refine(T_cw, local_map.points[row[feature]], features[feature], rounds=2)
         if first is None:
-            seen = self._search.project(T_cw, local)
-            landmark, feature = self._search(features, seen, local, self._config.search_radius).unbind(dim=1)
-            first = self.refine(T_cw, local.points[landmark], features[feature], rounds=2)
+            projected = self._match.project(T_cw, local_map)
+            landmark, feature = self._match(features, projected, local_map, _SEARCH_RADIUS).unbind(dim=1)
+            first = self.refine(T_cw, local_map.points[landmark], features[feature], rounds=2)
         if first is None:
             return None
-        # From the refined pose, what the prediction had put out of reach is found as well, within half the radius.
-        seen = self._search.project(first.T_cw, local)
-        landmark, feature = self._search(features, seen, local, 0.5 * self._config.search_radius).unbind(dim=1)
-        found = self.refine(first.T_cw, local.points[landmark], features[feature], rounds=4)
-        if found is None:
+        # The refined pose brings the remaining landmarks into reach.
+        projected = self._match.project(first.T_cw, local_map)
+        radius = _REFINED_SEARCH_RATIO * _SEARCH_RADIUS
+        landmark, feature = self._match(features, projected, local_map, radius).unbind(dim=1)
+        refined = self.refine(first.T_cw, local_map.points[landmark], features[feature], rounds=4)
+        if refined is None:
             return None
         ids = torch.full((len(features),), -1, dtype=torch.int64)
-        ids[feature[found.inliers]] = local.ids[landmark[found.inliers]]
-        visible = seen.rows if depth is None else seen.rows[~self._hidden(seen, depth)]
-        return Tracking(found.T_cw, ids, local.ids[visible])
+        ids[feature[refined.inliers]] = local_map.ids[landmark[refined.inliers]]
+        visible = projected.rows if depth is None else projected.rows[~self._is_occluded(projected, depth)]
+        return MapTracking(refined.T_cw, ids, local_map.ids[visible])
 
     def refine(self, T_cw: Tensor, points: Tensor, features: Features, *, rounds: int) -> PoseRefinement | None:
-        """Refine a pose from landmarks that are known to be behind features, but for outliers.
+        """Refine a pose from matches of landmarks and features, some of which can be outliers.
 
         Args:
-            T_cw: world to camera, about.
-            points: the landmarks, world frame, metres, float64, shape :math:`(N, 3)`.
-            features: that show them.
-            rounds: see `refine_pose`.
+            T_cw: Initial world-to-camera pose, float64, shape :math:`(4, 4)`.
+            points: Landmark of each feature, world frame, metres, float64, shape :math:`(N, 3)`.
+            features: Matched features.
+            rounds: Rounds of `refine_pose`.
 
         Returns:
-            None when fewer than ``min_inliers`` agree.
+            None if fewer than ``min_inliers`` matches agree.
         """
         config = self._config
         if len(features) < config.min_inliers:
@@ -112,7 +122,8 @@ class MapTracker:
         refined = refine_pose(T_cw, points, measurements(features, config, self._features), self._camera, rounds=rounds)
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
-    def _hidden(self, seen: Projection, depth: Tensor) -> Tensor:
-        """Which landmarks lie behind what is seen in their places, by more than depth errs; bool, shape (V,)."""
-        z = sample_depth(self._camera.distort(seen.pixels).round().to(torch.int64), depth, torch.inf)
-        return (z > 0) & (1 / z - 1 / seen.depth > _ERRS * self._config.inverse_depth_sigma)
+    def _is_occluded(self, projected: Projection, depth: Tensor) -> Tensor:
+        """Return which landmarks lie behind the measured depth at their projection, bool, shape (V,)."""
+        pixels = self._camera.distort(projected.pixels).round().to(torch.int64)
+        z = sample_depth(pixels, depth, torch.inf)
+        return (z > 0) & (1 / z - 1 / projected.depth > _OCCLUSION_SIGMAS * self._config.inverse_depth_sigma)

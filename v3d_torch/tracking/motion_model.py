@@ -2,31 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any
 
+import torch
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.tracking.pose_history import PoseHistory
+from v3d_torch.types import FramePose, TrackingStatus
+
+MAX_EXTRAPOLATION = 0.2
+"""Longest time over which a velocity is extrapolated, seconds: a hand changes its motion within that time. A camera that is
+lost for longer is predicted to stand still."""
 
 
 @dataclass(frozen=True)
 class PosePrediction:
-    """How a camera is expected to go on from where it was.
+    """Prediction of the camera motion after a frame.
 
     Attributes:
-        stamp: of the frame that this was after, seconds.
-        T_cw: of that frame, world to camera, float64, shape :math:`(4, 4)`.
-        velocity: twist per second, in the camera frame, float64, shape :math:`(6,)`.
+        stamp: Time of that frame, seconds.
+        T_cw: World-to-camera pose of that frame, float64, shape :math:`(4, 4)`.
+        velocity: Twist of the points in the camera frame, [translation, rotation] per second, float64, shape
+            :math:`(6,)`.
     """
 
     stamp: float
     T_cw: Tensor
     velocity: Tensor
 
-    LONGEST: ClassVar[float] = 0.2  # seconds: a hand changes its motion within that; then a lost camera stands still
+    def motion_until(self, stamp: float) -> Tensor:
+        """Motion ``T_cp`` from the camera at that frame to the camera at ``stamp``, float64, shape :math:`(4, 4)`."""
+        return se3_exp(self.velocity * min(stamp - self.stamp, MAX_EXTRAPOLATION))
 
-    def at(self, stamp: float) -> Tensor:
-        """``T_cw`` at ``stamp`` with constant velocity."""
-        elapsed = min(stamp - self.stamp, self.LONGEST)
-        return se3_exp(self.velocity * elapsed) @ self.T_cw
+    def pose_at(self, stamp: float) -> Tensor:
+        """World-to-camera pose at ``stamp``, float64, shape :math:`(4, 4)`."""
+        return self.motion_until(stamp) @ self.T_cw
+
+
+class MotionModel:
+    """Estimates the velocity of the camera from the poses of its frames.
+
+    Attributes:
+        velocity: Twist per second after the last frame, as in `PosePrediction`.
+        previous_velocity: Mean twist per second around the frame before the last one, which is known once both of its
+            neighbours are; None if it is not known.
+    """
+
+    def __init__(self) -> None:
+        self.velocity = torch.zeros(6, dtype=torch.float64)
+        self.previous_velocity: Tensor | None = None
+
+    def predict(self, poses: PoseHistory) -> PosePrediction:
+        """Predict the motion after the last frame; before the first frame the camera stands at the origin."""
+        stamp = poses.stamp if poses.statuses else 0.0
+        return PosePrediction(stamp, poses.T_cw, self.velocity)
+
+    def update(self, poses: PoseHistory, stamp: float, pose: FramePose, motion: CameraMotion) -> None:
+        """Update the velocity with a new frame.
+
+        Args:
+            poses: Poses of all earlier frames.
+            stamp: Time of the new frame, seconds.
+            pose: Pose of the new frame.
+            motion: Motion of the camera since the previous frame.
+        """
+        self.previous_velocity = None
+        if not poses.statuses:
+            return
+        elapsed = stamp - poses.stamp
+        if pose.status is TrackingStatus.LOST and motion.is_measured:
+            self.velocity = motion.twist / elapsed
+        elif pose.status is TrackingStatus.LOST:
+            self.velocity = self.velocity * (stamp - poses.last_found < MAX_EXTRAPOLATION)
+        elif poses.status is not TrackingStatus.LOST and elapsed > 0:
+            velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / elapsed
+            if motion.is_measured:  # without a measured motion the pose can jump to a place found by relocalisation
+                self.previous_velocity = (self.velocity + velocity) / 2 if poses.has_motion else velocity
+            self.velocity = velocity
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the velocity."""
+        return {"velocity": self.velocity}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the velocity of `state_dict`."""
+        self.velocity = state["velocity"]

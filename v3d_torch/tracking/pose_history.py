@@ -1,186 +1,186 @@
-"""The pose of every frame, tied to a keyframe so that it follows when the map is corrected."""
+"""Poses of all frames, stored relative to keyframes, so that they follow corrections of the map."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, rigid, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.tracking.motion_model import PosePrediction
+from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
 
 @dataclass(frozen=True)
-class _Entry:
+class PoseEntry:
+    """Pose of one frame.
+
+    Attributes:
+        stamp: Timestamp, seconds.
+        status: Source of the pose.
+        keyframe: Keyframe that the pose is relative to; None for the world frame, before the first keyframe.
+        T_ck: Motion from the keyframe to the camera, float64, shape :math:`(4, 4)`.
+        has_motion: True if the motion since the previous frame was measured.
+    """
+
     stamp: float
     status: TrackingStatus
-    keyframe: Keyframe | None  # None before the first
+    keyframe: Keyframe | None
     T_ck: Tensor
-    linked: bool  # whether the motion since the frame before is known
+    has_motion: bool
 
     @property
     def T_cw(self) -> Tensor:
+        """World-to-camera pose in the current map, float64, shape :math:`(4, 4)`."""
         return self.T_ck @ _pose(self.keyframe)
 
 
 class PoseHistory:
-    """Remembers the pose of each frame relative to a keyframe, and predicts the next one."""
+    """Poses of all frames in the order of time.
+
+    Attributes:
+        landmark_ids: Landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
+    """
 
     def __init__(self) -> None:
-        self._entries: list[_Entry] = []
-        self._velocity = torch.zeros(6, dtype=torch.float64)  # twist per second, in the camera frame
-        self.passed: Tensor | None = None  # mean velocity around the frame before the last, where it is known
-        self.landmarks = torch.zeros(0, dtype=torch.int64)  # seen by the last frame that was found
+        self._entries: list[PoseEntry] = []
+        self.landmark_ids = torch.zeros(0, dtype=torch.int64)
+
+    @property
+    def statuses(self) -> list[TrackingStatus]:
+        """Statuses of all frames."""
+        return [entry.status for entry in self._entries]
 
     @property
     def status(self) -> TrackingStatus | None:
-        """Of the last frame; None before the first."""
+        """Status of the last frame; None before the first."""
         return self._entries[-1].status if self._entries else None
 
     @property
     def stamp(self) -> float:
-        """Of the last frame, seconds; minus infinity before the first."""
+        """Time of the last frame, seconds; minus infinity before the first."""
         return self._entries[-1].stamp if self._entries else -torch.inf
 
     @property
-    def located(self) -> bool:
-        """Whether any frame was found so far."""
-        return self._last_found() > -torch.inf
-
-    @property
-    def statuses(self) -> list[TrackingStatus]:
-        """Of all frames."""
-        return [entry.status for entry in self._entries]
-
-    @property
     def T_cw(self) -> Tensor:
-        """World to camera of the last frame, float64, shape :math:`(4, 4)`."""
+        """World-to-camera pose of the last frame, float64, shape :math:`(4, 4)`; the identity before the first."""
         return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
 
     @property
-    def T_pw(self) -> Tensor:
-        """World to camera of the frame before the last, of at least two, float64, shape :math:`(4, 4)`."""
-        return self._entries[-2].T_cw
+    def has_motion(self) -> bool:
+        """True if the motion between the last frame and the one before it was measured."""
+        return bool(self._entries) and self._entries[-1].has_motion
 
-    def outlook(self) -> PosePrediction:
-        """How the camera is expected to go on from the last frame; where there is none it stands at the origin."""
-        stamp = self._entries[-1].stamp if self._entries else 0.0
-        return PosePrediction(stamp, self.T_cw, self._velocity)
+    @property
+    def is_located(self) -> bool:
+        """True if any frame was found so far."""
+        return self.last_found > -torch.inf
 
-    def predict(self, stamp: float) -> Tensor:
-        """``T_cw`` at ``stamp`` with constant velocity."""
-        return self.outlook().at(stamp)
+    @property
+    def last_found(self) -> float:
+        """Time of the last frame that was found, seconds; minus infinity if there is none."""
+        found = (entry.stamp for entry in reversed(self._entries) if entry.status is not TrackingStatus.LOST)
+        return next(found, -torch.inf)
 
-    def record(
-        self, stamp: float, estimate: FramePose, keyframe: Keyframe | None, T_cp: Tensor | None = None
+    def append(
+        self, stamp: float, pose: FramePose, motion: CameraMotion, reference: Keyframe | None, new: Keyframe | None
     ) -> Tensor | None:
-        """Note a frame's pose relative to ``keyframe``.
+        """Append the pose of a frame.
 
-        Lost frames whose motions up to a frame that is found are known are put where these say. So are, by a guess,
-        those before the first that is found: their world was none.
+        If the camera is found again, the lost frames before it get the poses that the measured motions imply. If it is
+        found for the first time, all frames before it are moved, because their world frame was a guess.
 
         Args:
-            stamp: seconds.
-            estimate: of the frame.
-            keyframe: that it is tied to.
-            T_cp: the camera's motion since the frame before, previous camera to this one; None where it is not known.
+            stamp: Timestamp, seconds.
+            pose: Estimated pose.
+            motion: Motion of the camera since the previous frame.
+            reference: Keyframe that the pose is stored relative to; None before the first keyframe.
+            new: Keyframe that this frame has become; None if it has not.
 
         Returns:
-            Where the camera is found for the first time: the correction of the world as it was guessed until then, new
-            world from old, shape :math:`(4, 4)`; else None.
+            The correction from the guessed world frame to the map if the camera was found for the first time, new world
+            from old, float64, shape :math:`(4, 4)`; else None.
         """
-        status = estimate.status
-        if status is TrackingStatus.TRACKED and keyframe is not None and keyframe.disconnected:
+        status = pose.status
+        if status is TrackingStatus.TRACKED and reference is not None and reference.disconnected:
             status = TrackingStatus.DISCONNECTED
         T_new_old = None
         if self.status is TrackingStatus.LOST and status is not TrackingStatus.LOST:
-            expected = self.predict(stamp) if T_cp is None else T_cp @ self.T_cw
-            correction, first = rigid(invert(estimate.T_cw) @ expected), not self.located
-            self._put_right(correction, keyframe, linked=T_cp is not None, first=first)
+            correction = rigid(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
+            first = not self.is_located
+            self._correct_lost(correction, reference, motion.is_measured, move_all=first)
             T_new_old = correction if first else None
-        self.passed = None
-        if self._entries:
-            elapsed = stamp - self._entries[-1].stamp
-            if estimate.status is TrackingStatus.LOST and T_cp is not None:
-                self._velocity = se3_log(T_cp) / elapsed
-            elif estimate.status is TrackingStatus.LOST:
-                self._velocity = self._velocity * (stamp - self._last_found() < PosePrediction.LONGEST)
-            elif self.status is not TrackingStatus.LOST and elapsed > 0:
-                velocity = se3_log(estimate.T_cw @ invert(self.T_cw)) / elapsed
-                if T_cp is not None:  # else it may be a jump to a place seen before
-                    self.passed = (self._velocity + velocity) / 2 if self._entries[-1].linked else velocity
-                self._velocity = velocity
-        T_ck = _relative(estimate.T_cw, keyframe)
-        self._entries.append(_Entry(stamp, status, keyframe, T_ck, linked=T_cp is not None))
-        if estimate.count:
-            self.landmarks = estimate.landmarks[estimate.landmarks >= 0]
+        if new is None:
+            entry = PoseEntry(stamp, status, reference, _relative(pose.T_cw, reference), motion.is_measured)
+            if pose.count:
+                self.landmark_ids = pose.landmark_ids
+        else:
+            if new.disconnected:
+                status = TrackingStatus.DISCONNECTED
+            elif status is TrackingStatus.LOST:
+                status = TrackingStatus.TRACKED  # the first keyframe of the map
+            entry = PoseEntry(stamp, status, new, torch.eye(4, dtype=torch.float64), motion.is_measured)
+            self.landmark_ids = new.landmark_ids
+        self._entries.append(entry)
         return T_new_old
 
-    def correct(self, T_pw: Tensor) -> None:
-        """Take the frame before the last for taken from another pose, which has become known since."""
-        before = self._entries[-2]
-        self._entries[-2] = replace(before, T_ck=_relative(T_pw, before.keyframe))
-
-    def _put_right(self, T_new_old: Tensor, keyframe: Keyframe | None, *, linked: bool, first: bool) -> None:
-        """Move the lost frames before one that is found, as far back as motions are known; all, before the first."""
-        found = (
-            TrackingStatus.DISCONNECTED if keyframe is not None and keyframe.disconnected else TrackingStatus.ODOMETRY
-        )
-        for index in reversed(range(len(self._entries))):
-            entry = self._entries[index]
-            if entry.status is not TrackingStatus.LOST or not (linked or first):
-                break
-            T_ck = _relative(entry.T_cw @ invert(T_new_old), keyframe)
-            self._entries[index] = _Entry(
-                entry.stamp, found if linked else TrackingStatus.LOST, keyframe, T_ck, entry.linked
-            )
-            linked = linked and entry.linked
-
-    def anchor(self, keyframe: Keyframe) -> None:
-        """The last frame became a keyframe: from now on its pose is the keyframe's, and so is what it saw."""
-        status = self._entries[-1].status
-        if keyframe.disconnected:
-            status = TrackingStatus.DISCONNECTED
-        elif status is TrackingStatus.LOST:
-            status = TrackingStatus.TRACKED  # the first of all
-        own = torch.eye(4, dtype=torch.float64)
-        self._entries[-1] = _Entry(keyframe.stamp, status, keyframe, own, self._entries[-1].linked)
-        self.landmarks = keyframe.landmarks[keyframe.landmarks >= 0]
+    def replace_last(self, T_cw: Tensor) -> None:
+        """Replace the pose of the last frame by a refined one, world to camera, float64, shape :math:`(4, 4)`."""
+        last = self._entries[-1]
+        self._entries[-1] = replace(last, T_ck=_relative(T_cw, last.keyframe))
 
     def trajectory(self) -> Trajectory:
-        """All frames after all corrections; lost ones interpolated between their neighbours that were found."""
+        """Poses of all frames in the current map; lost frames are interpolated between the nearest found ones."""
         stamps = torch.tensor([entry.stamp for entry in self._entries], dtype=torch.float64)
         T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(entry.T_cw[None] for entry in self._entries)])
         found = torch.tensor([entry.status is not TrackingStatus.LOST for entry in self._entries])
         return Trajectory(stamps, invert(_interpolate(stamps, T_cw, found)))
 
-    def _last_found(self) -> float:
-        found = (entry.stamp for entry in reversed(self._entries) if entry.status is not TrackingStatus.LOST)
-        return next(found, -torch.inf)
+    def state_dict(self) -> dict[str, Any]:
+        """Return the poses of all frames."""
+        return {"entries": self._entries, "landmark_ids": self.landmark_ids}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the poses of `state_dict`."""
+        self._entries, self.landmark_ids = list(state["entries"]), state["landmark_ids"]
+
+    def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
+        """Move the lost frames at the end: those linked to the new frame by measured motions, or all of them."""
+        disconnected = keyframe is not None and keyframe.disconnected
+        found = TrackingStatus.DISCONNECTED if disconnected else TrackingStatus.ODOMETRY
+        for index in reversed(range(len(self._entries))):
+            entry = self._entries[index]
+            if entry.status is not TrackingStatus.LOST or not (linked or move_all):
+                break
+            T_ck = _relative(entry.T_cw @ invert(T_new_old), keyframe)
+            status = found if linked else TrackingStatus.LOST
+            self._entries[index] = replace(entry, status=status, keyframe=keyframe, T_ck=T_ck)
+            linked = linked and entry.has_motion
 
 
 def _pose(keyframe: Keyframe | None) -> Tensor:
-    """World to camera of a keyframe; the world itself, where there is none."""
+    """Return the world-to-camera pose of a keyframe; the identity if there is none."""
     return torch.eye(4, dtype=torch.float64) if keyframe is None else keyframe.T_cw
 
 
 def _relative(T_cw: Tensor, keyframe: Keyframe | None) -> Tensor:
-    """A pose as it is tied to a keyframe, keyframe to camera, float64, shape :math:`(4, 4)`."""
+    """Return a pose relative to a keyframe, keyframe to camera, float64, shape :math:`(4, 4)`."""
     return rigid(T_cw @ invert(_pose(keyframe)))
 
 
 def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:
-    """Poses where ``found`` is false on the geodesic between the nearest that were found; the ends stay as they are."""
+    """Interpolate poses along the geodesic between the nearest found ones; those before and after all found ones stay."""
     known = torch.nonzero(found)[:, 0]
     if known.shape[0] == 0:
         return T
     after = torch.searchsorted(known, torch.arange(stamps.shape[0]))
     between = torch.nonzero(~found & (after > 0) & (after < known.shape[0]))[:, 0]
     a, b = known[after[between] - 1], known[after[between].clamp(max=known.shape[0] - 1)]
-    share = (stamps[between] - stamps[a]) / (stamps[b] - stamps[a])
+    fraction = (stamps[between] - stamps[a]) / (stamps[b] - stamps[a])
     T = T.clone()
-    T[between] = se3_exp(share[:, None] * se3_log(T[b] @ invert(T[a]))) @ T[a]
+    T[between] = se3_exp(fraction[:, None] * se3_log(T[b] @ invert(T[a]))) @ T[a]
     return T

@@ -22,12 +22,12 @@ CASES = [
     Case(
         "not there",
         options("--config", "{root}/none.yaml"),
-        Says("{root}/none.yaml: is neither a configuration nor a YAML file; there are full, ..."),
+        Says("{root}/none.yaml: is neither the name of a configuration (full, ...) nor a YAML file; check name or path"),
     ),
     Case(
         "a folder",
         options("--config", "{seq}"),
-        Says("{seq}: is neither a configuration nor a YAML file; there are full, ..."),
+        Says("{seq}: is neither the name of a configuration (full, ...) nor a YAML file; check name or path"),
     ),
     Case(
         "an image",
@@ -40,17 +40,17 @@ CASES = [
     Case(
         "a name of 5000 letters",
         options("--config", 5000 * "x"),
-        Says("...: is neither a configuration nor a YAML file; there are full, ..."),
+        Says("...: is neither the name of a configuration (full, ...) nor a YAML file; check name or path"),
     ),
     Case(
         "in the home of nobody",
         options("--config", "~nobody-of-this-name/own.yaml"),
-        Says("~nobody-of-this-name/own.yaml: is neither a configuration nor a YAML file; there are full, ..."),
+        Says("~nobody-of-this-name/own.yaml: is neither the name of a configuration (full, ...) nor a YAML file; check name or path"),
     ),
     Case(
         "a device without end",
         options("--config", "/dev/zero"),
-        Says("/dev/zero: is neither a configuration nor a YAML file; there are full, ..."),
+        Says("/dev/zero: is neither the name of a configuration (full, ...) nor a YAML file; check name or path"),
     ),
     Case(
         "UTF-16",
@@ -105,14 +105,14 @@ CASES = [
     Case(
         "two documents", config("seed: 1\n---\nseed: 2\n"), Says("{seq}/own.yaml: is not valid YAML (...); repair it")
     ),
-    Case("a list", config("- seed\n"), Says("{seq}/own.yaml: holds a list; a configuration is a mapping of sections")),
-    Case("a word", config("seed\n"), Says("{seq}/own.yaml: holds a str; a configuration is a mapping of sections")),
+    Case("a list", config("- seed\n"), Says("{seq}/own.yaml: contains a list; a configuration is a mapping of sections")),
+    Case("a word", config("seed\n"), Says("{seq}/own.yaml: contains a str; a configuration is a mapping of sections")),
     Case(
         "an unknown key",
         config("objects: {voting: {vote_treshold: 3}}\n"),
-        Says("{seq}/own.yaml: there is no objects.voting.vote_treshold; did you mean objects.voting.vote_threshold?"),
+        Says("{seq}/own.yaml: unknown key objects.voting.vote_treshold; did you mean objects.voting.vote_threshold?"),
     ),
-    Case("a key that is a number", config("1: 2\n"), Says("{seq}/own.yaml: there is no 1; did you mean tracking?")),
+    Case("a key that is a number", config("1: 2\n"), Says("{seq}/own.yaml: unknown key 1; did you mean tracking?")),
     Case("a key that is a list", config("? [a, b]\n: 2\n"), Says("{seq}/own.yaml: is not valid YAML (...); repair it")),
     Case(
         "a value for a section",
@@ -150,7 +150,7 @@ CASES = [
     Case(
         "--set over a file: an unknown key",
         config("seed: 1\n", "--set", "sed=2"),
-        Says("--set: there is no sed; did you mean seed?"),
+        Says("--set: unknown key sed; did you mean seed?"),
     ),
     Case(
         "--set over a file: a wrong value",
@@ -168,7 +168,7 @@ CASES = [
     Case(
         "--set of an unknown key",
         setting("objects.voting.vote_treshold=3"),
-        Says("--set: there is no objects.voting.vote_treshold; did you mean objects.voting.vote_threshold?"),
+        Says("--set: unknown key objects.voting.vote_treshold; did you mean objects.voting.vote_threshold?"),
     ),
     Case(
         "--set without a value",
@@ -188,7 +188,7 @@ CASES = [
     Case(
         "--set of a key with two dots",
         setting("features..count=3"),
-        Says("--set: there is no features.; did you mean features.scale?"),
+        Says("--set: unknown key features.; did you mean features.scale?"),
     ),
     Case(
         "--set of a key below a value",
@@ -264,7 +264,7 @@ CASES = [
     Case(
         "--set of a tiny voxel",
         setting("dense_map.voxel_size=1e-30"),
-        Says("--set: dense_map.voxel_size: input should lie between 1e-09 and 1e+09, got 1e-30"),
+        Says("--set: dense_map.voxel_size: input should be between 1e-09 and 1e+09, got 1e-30"),
     ),
     Case(
         "--seed that is negative",

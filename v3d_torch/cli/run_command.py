@@ -1,0 +1,227 @@
+"""Steps of the run command: open the inputs, run, print the summary."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from v3d_torch.cli.stage_table import stage_table
+from v3d_torch.config import Config
+from v3d_torch.config.loading import FULL, changed, find_config, load_config
+from v3d_torch.datasets import RGBDStream, open_source
+from v3d_torch.errors import ConfigError, InputError, OutputError
+from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.tables import paper_table
+from v3d_torch.io.files import check_writable
+from v3d_torch.mapping.map_io import load_map, save_map
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
+from v3d_torch.runs.console import ProgressBar, progress_bars, run_with_progress
+from v3d_torch.runs.diagnosis import diagnose
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.run import Run
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.viz.viewer import make_viewer
+
+
+@dataclass(frozen=True)
+class ConfigChoice:
+    """Configuration as it is given on the command line.
+
+    Attributes:
+        name: Name or file of a configuration; None takes the default.
+        overrides: Values to set, such as ``objects.voting.distance_threshold=0.05``.
+    """
+
+    name: str | None
+    overrides: tuple[str, ...]
+
+    def load(self) -> Config:
+        """Load the configuration.
+
+        Raises:
+            ConfigError: If the name, a key or a value is not valid.
+        """
+        return load_config(find_config(self.name or FULL), self.overrides)
+
+    def conflict(self, config: Config) -> str | None:
+        """Return the first option that would change a configuration; None if there is none."""
+        if self.name is not None and self.load() != config:
+            return f"--config {self.name}"
+        return next((override for override in self.overrides if changed(config, [override]) != config), None)
+
+
+@dataclass(frozen=True)
+class Display:
+    """Output of a run beside its files and its summary.
+
+    Attributes:
+        viz: Viewer that shows the run live: ``rerun``; None for none.
+        rerun_file: File in which the run is recorded for rerun; None for none.
+        profile: True to print the time of each stage.
+    """
+
+    viz: str | None = None
+    rerun_file: Path | None = None
+    profile: bool = False
+
+
+def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
+    """Run a sequence from its first frame.
+
+    Args:
+        request: Inputs, outputs and configuration.
+        out: Folder of the results; None makes a new one.
+        display: Output on the screen.
+
+    Raises:
+        V3DError: If an input is not valid, or the run ended early; its results so far are written.
+    """
+    if request.load_map is None and not request.config.mapping.enabled:
+        raise ConfigError("mapping.enabled=false needs a map to localise in; give one with --load-map")
+    _run(request, out, None, display)
+
+
+def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path | None, display: Display) -> None:
+    """Resume a run that was killed or interrupted.
+
+    Args:
+        folder: Folder of its results.
+        given: Options given beside ``--resume``: the sequence, if it was moved. Other options must not differ.
+        choice: Configuration given beside ``--resume``.
+        out: The same folder, or None.
+        display: Output on the screen.
+
+    Raises:
+        V3DError: If there is no checkpoint, if an option conflicts with the run, or as for `start_run`.
+    """
+    if is_finished(folder):
+        Console(soft_wrap=True).print(f"{folder}: the run is finished; nothing to resume", markup=False)
+        return
+    checkpoint = read_checkpoint(folder)
+    request = checkpoint.request
+    if out is not None and out.resolve() != folder.resolve():
+        raise InputError(f"--out {out}: conflicts with the run in {folder}; remove this option")
+    if (option := request.conflicting_option(given)) is not None:
+        raise InputError(f"{option}: conflicts with the run in {folder}; remove this option")
+    if (option := choice.conflict(request.config)) is not None:
+        raise ConfigError(f"{option}: conflicts with the run in {folder}; remove this option")
+    moved = {name: value for name in ("seq", "data_root") if (value := getattr(given, name))}
+    _run(replace(request, **moved), folder, checkpoint, display)
+
+
+def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, display: Display) -> None:
+    """Open the inputs, run, save the map and print the summary."""
+    console = Console(soft_wrap=True)
+    map_file, masks = _path(request.save_map), _path(request.masks)
+    if map_file is not None:
+        check_writable(map_file)
+    sequence = _open_sequence(request, console)
+    if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
+        raise InputError(
+            f"{request.seq}: has changed since the run in {checkpoint.folder} began ({change}); restore the sequence,"
+            " or start a new run"
+        )
+    known_map = None
+    if request.load_map is not None and checkpoint is None:  # a checkpoint has what became of the map
+        known_map = load_map(Path(request.load_map), sequence.camera, request.config)
+    segment = make_segmenter(request.config.segmentation, weights=_path(request.weights), masks_dir=masks)
+    viewer = make_viewer(display.viz, display.rerun_file, sequence)
+    folder = make_result_folder(out, sequence.name)
+    if masks is not None and masks.resolve() == (folder / "masks").resolve():
+        raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
+    if checkpoint is not None:
+        console.print(f"resuming after {checkpoint.frames} of {checkpoint.sequence['frames']} frames", markup=False)
+    pipeline, evaluation = run_with_progress(
+        lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
+        folder,
+        console,
+        checkpoint,
+    )
+    if map_file is not None:
+        save_map(map_file, pipeline.slam.map, pipeline.views)
+    _print_summary(request, display, folder, pipeline, evaluation, console)
+
+
+def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
+    with progress_bars(console) as progress:
+        return open_source(
+            request.seq,
+            data_root=_path(request.data_root),
+            camera=request.camera,
+            options=request.source_options,
+            progress=ProgressBar(progress, "sequence"),
+        )
+
+
+def _path(text: str | None) -> Path | None:
+    return None if text is None else Path(text)
+
+
+def _print_summary(
+    request: RunRequest,
+    display: Display,
+    folder: Path,
+    pipeline: Pipeline,
+    evaluation: Evaluation | None,
+    console: Console,
+) -> None:
+    """Print the result of a run.
+
+    Raises:
+        InputError: If the run ended early, or its results are incomplete.
+    """
+    record = pipeline.record
+    console.print(_summary_table(pipeline, evaluation))
+    if evaluation is not None and (table := paper_table(pipeline.sequence.name, evaluation)) is not None:
+        console.print(table)
+    if display.profile and record.frames:
+        console.print(stage_table(record))
+    for note in evaluation.notes if evaluation is not None else ():
+        console.print(f"note: {note}", markup=False)
+    if record.save_error is not None:
+        console.print(f"note: no checkpoint was saved, {record.save_error}", markup=False)
+    console.print(f"results: {folder}", markup=False)  # the name can contain brackets
+    if record.failure is not None:
+        frames = len(pipeline.slam.poses.statuses)
+        resume = f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
+        raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
+    if request.load_map is not None and not pipeline.slam.poses.is_located:
+        raise InputError(
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; its results are in {folder}"
+        )
+    if (problem := diagnose(pipeline, evaluation)) is not None:
+        raise InputError(f"{problem} (the results are in {folder})")
+
+
+def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
+    slam, record = pipeline.slam, pipeline.record
+    statuses = Counter(slam.poses.statuses)
+    motion_states = Counter(str(row["motion_state"]) for row in record.dynamics)
+    table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
+    table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frames}")
+    table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
+    active = slam.map.active_keyframes
+    known = sum(keyframe.is_from_earlier_run for keyframe in active)
+    table.add_row("keyframes, loops", f"{len(active) - known}, {slam.loop_closer.loop_count}")
+    if known:
+        table.add_row("loaded map", f"{known} keyframes")
+    table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
+    table.add_row("frames per second", f"{len(slam.poses.statuses) / record.seconds:.1f}" if record.seconds else "-")
+    if evaluation is not None:
+        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")
+        if evaluation.rpe is not None:
+            table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
+    if (masks := record.mask_evaluation.scores()) is not None:
+        fractions = {"moving": masks.moving_left_out, "static": masks.static_left_out}
+        texts = [f"{value:.1%} of the {name} pixels" for name, value in fractions.items() if value is not None]
+        table.add_row("masked", ", ".join(texts))
+        if (changes := masks.id_changes_per_60_frames) is not None:
+            table.add_row("id switches", f"{changes:.1f} per 60 frames ({masks.people_found:.0%} found)")
+    return table

@@ -1,0 +1,180 @@
+"""Console of the commands that run sequences: progress bars, errors in one line, Ctrl-C between two frames."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence, Sized
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.datasets.stored import StoredSequence
+from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
+from v3d_torch.evaluation import Evaluation
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.checkpoint import Checkpoint
+from v3d_torch.runs.log import log_to
+from v3d_torch.runs.result_folder import clear_earlier_results
+from v3d_torch.runs.run import Run, describe_motion
+from v3d_torch.types import RGBDFrame
+
+
+@contextmanager
+def exit_on_error() -> Iterator[None]:
+    """Print an error that the user can act on as one line on stderr, and exit with code 2."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GroundTruthWarning)  # the commands report it after the results
+            yield
+    except V3DError as error:
+        print(f"error: {_printable(error)}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:  # of a path given by the user: too long a name, a folder without permission
+        path, reason = error.filename or "a file", error.strerror or error
+        print(f"error: {_printable(path)}: cannot be used ({reason}); check path and permissions", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("error: interrupted before the results were written", file=sys.stderr)
+        sys.exit(2)
+
+
+def _printable(value: object) -> str:
+    """Return a text in one line; file names and contents in it can hold control characters."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))
+
+
+def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
+    """Open a sequence as `load_sequence` does, with a progress bar for downloads."""
+    with progress_bars(console) as progress:
+        return load_sequence(name, data_root=data_root, camera=camera, progress=ProgressBar(progress, "sequence"))
+
+
+def open_sequences(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
+    """Open several sequences in the given order, before the first of them is run.
+
+    Returns:
+        Sequences by their name in tables.
+
+    Raises:
+        InputError: If a sequence is not valid, or two sequences have the same name.
+        DownloadError: If a sequence is missing and cannot be downloaded.
+    """
+    sequences: dict[str, RGBDSequence] = {}
+    for name in dict.fromkeys(names):
+        sequence = open_sequence(name, data_root, None, console)
+        if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
+            raise sequence.groundtruth_error  # runs are compared by their scores, so all need ground truth
+        if sequence.name in sequences:
+            raise InputError(f"{name}: another sequence has the same name, {sequence.name}; run them separately")
+        sequences[sequence.name] = sequence
+    return sequences
+
+
+def wide_console() -> Console:
+    """Console for tables, which are not squeezed into 80 columns if the output is a file or pipe."""
+    return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
+
+
+def run_with_progress(
+    make_run: Callable[[], Run], folder: Path, console: Console, checkpoint: Checkpoint | None = None
+) -> tuple[Pipeline, Evaluation | None]:
+    """Carry out a run with a progress bar on the console and a log file in its folder.
+
+    Args:
+        make_run: Makes the run; called after the files of an earlier run were removed.
+        folder: Folder of the results.
+        console: Console.
+        checkpoint: Checkpoint that the run resumes from; None if it starts with the first frame.
+
+    Returns:
+        The pipeline that ran, and the scores if there is ground truth.
+
+    Raises:
+        OutputError: If the results cannot be written.
+    """
+    if checkpoint is None:
+        clear_earlier_results(folder)
+    log = log_to(folder / "run.log", append=checkpoint is not None)
+    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log:
+        run = make_run()
+        sequence = run.pipeline.sequence
+        total = len(sequence) if isinstance(sequence, Sized) else None
+        done = 0 if checkpoint is None else checkpoint.frames
+        evaluation = run(_TrackingBar(progress, total, interrupted, done))
+    run.pipeline.record.interrupted |= interrupted.is_set()  # also after the last frame, while results were written
+    return run.pipeline, evaluation
+
+
+def progress_bars(console: Console) -> Progress:
+    """Progress bars with counts, remaining time and a note; hidden if the console is not a terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+class ProgressBar:
+    """Progress bar of a job that reports (done, total), such as a download."""
+
+    def __init__(self, progress: Progress, description: str) -> None:
+        self._progress, self._description = progress, description
+        self._task: TaskID | None = None
+
+    def __call__(self, done: int, total: int | None) -> None:
+        """Update the bar."""
+        if self._task is None:
+            self._task = self._progress.add_task(self._description, note="")
+        self._progress.update(self._task, completed=done, total=total)
+
+
+class _TrackingBar:
+    """Progress bar of a run: frame rate, tracking status and moving objects."""
+
+    def __init__(self, progress: Progress, frames: int | None, interrupted: Event, done: int) -> None:
+        self._progress = progress
+        self._interrupted = interrupted
+        self._task = progress.add_task("tracking", total=frames, completed=done, note="starting")
+        self._start: float | None = None
+        self._frames = 0
+
+    def __call__(self, frame: RGBDFrame, result: FrameResult) -> None:
+        now, note = time.perf_counter(), f"{result.status.value}  {describe_motion(result)}"
+        if self._start is None:
+            self._start = now  # the first frame is not counted, as it waits for the network
+        else:
+            self._frames += 1
+            note = f"{self._frames / (now - self._start):.1f} frames/s  {note}"
+        self._progress.update(self._task, advance=1, note=note)
+        if self._interrupted.is_set():
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def interrupts_between_frames() -> Iterator[Event]:
+    """Delay Ctrl-C until the current frame is complete; a second Ctrl-C interrupts at once."""
+    interrupted = Event()
+
+    def delay(signum: int, frame: FrameType | None) -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        interrupted.set()
+
+    before = signal.signal(signal.SIGINT, delay)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,57 @@
+"""Log file of a run."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from v3d_torch.errors import OutputError
+
+_LOG = logging.getLogger("v3d_torch")
+
+
+@contextmanager
+def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
+    """Write the log of the package to a file; an exception that leaves the block is logged with its traceback.
+
+    Args:
+        path: Log file.
+        append: True to append to the file, False to start a new one.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    try:
+        if not append:
+            path.write_text("")
+        # Append mode: if the interpreter crashes, faulthandler can write its report to the same file.
+        handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another folder with --out") from error
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    _LOG.addHandler(handler)
+    _LOG.setLevel(logging.INFO)
+    _LOG.propagate = False
+    try:
+        yield
+    except Exception:
+        _LOG.exception("the run failed")
+        raise
+    finally:
+        _LOG.removeHandler(handler)
+        handler.close()
+
+
+class _LogFile(logging.FileHandler):
+    """Log file that ignores a full disk: the run continues, and writing its results reports the error."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        if not isinstance(sys.exception(), OSError):
+            super().handleError(record)
+
+    def close(self) -> None:
+        with suppress(OSError):
+            super().close()

@@ -1,0 +1,125 @@
+"""One run: a sequence through a new system, with its log, checkpoints and results."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sized
+from pathlib import Path
+
+import torch
+
+from v3d_torch.config.loading import dump_config
+from v3d_torch.datasets import RGBDStream
+from v3d_torch.evaluation import Evaluation
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.io.files import write_text
+from v3d_torch.mapping.map_io import StoredMap
+from v3d_torch.objects.motion_classifier import FrameObjects, MotionState
+from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.runs.autosave import Autosave
+from v3d_torch.runs.checkpoint import Checkpoint
+from v3d_torch.runs.numerics_check import CheckedSLAM
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_folder import remove_unfinished
+from v3d_torch.runs.results import write_results
+from v3d_torch.runtime.process import set_num_threads
+from v3d_torch.segmentation.coco import class_name
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame, Segmenter
+from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
+
+_LOG = logging.getLogger(__name__)
+
+
+class Run:
+    """A run of one sequence, which writes all its files. The log goes to the file of `log_to`.
+
+    Args:
+        request: Configuration and outputs of the run; its inputs are opened already.
+        sequence: Frames.
+        segment: Segmenter.
+        folder: Folder of the results; it exists.
+        viewer: Viewer that is shown each frame.
+        known_map: Map of an earlier run in which the camera is localised; None starts a new map.
+        checkpoint: Checkpoint of the same run to resume from; None starts with the first frame.
+        save_checkpoints: False to save no checkpoints.
+
+    Attributes:
+        pipeline: Pipeline of the run.
+
+    Raises:
+        OutputError: If the folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        request: RunRequest,
+        sequence: RGBDStream,
+        segment: Segmenter,
+        folder: Path,
+        *,
+        viewer: Viewer = NULL_VIEWER,
+        known_map: StoredMap | None = None,
+        checkpoint: Checkpoint | None = None,
+        save_checkpoints: bool = True,
+    ) -> None:
+        config = request.config
+        write_text(folder / "config.yaml", dump_config(config))  # fails before the first frame if the disk is full
+        set_num_threads(config.threads)
+        torch.manual_seed(config.seed)
+        system = CheckedSLAM if config.check_numerics else V3DSLAM
+        slam = system(sequence.camera, segment, config, None if known_map is None else known_map.map)
+        self._folder = folder
+        self.pipeline = Pipeline(
+            sequence,
+            slam,
+            folder / "masks" if request.save_masks else None,
+            viewer,
+            None if known_map is None else known_map.views,
+        )
+        if checkpoint is not None:
+            remove_unfinished(folder)
+            self.pipeline.load_state_dict(checkpoint.state)
+            _LOG.info("resumed after %d frames", checkpoint.frames)
+        self._autosave = Autosave(folder, self.pipeline, request if save_checkpoints else None)
+
+    def __call__(self, on_frame: FrameCallback) -> Evaluation | None:
+        """Process all frames and write the results.
+
+        Args:
+            on_frame: Called after each frame; a KeyboardInterrupt that it raises ends the run between two frames.
+
+        Returns:
+            The scores, if there is ground truth. If the run ended early, ``pipeline.record.failure`` says why.
+
+        Raises:
+            OutputError: If the results cannot be written.
+        """
+        sequence = self.pipeline.sequence
+        _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
+
+        def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
+            motion = describe_motion(result) or "nothing moves"
+            _LOG.info("frame %d at %.6f: %s; %s", frame.index, frame.stamp, result.status.value, motion)
+            self._autosave()
+            on_frame(frame, result)
+
+        record = self.pipeline(log_and_save)
+        self._autosave.end()
+        self.pipeline.flush()
+        evaluation = write_results(self._folder, self.pipeline)
+        self._autosave.discard()
+        if record.failure:
+            _LOG.error(record.failure)
+        return evaluation
+
+
+def describe_motion(objects: FrameObjects) -> str:
+    """Return the objects that are not static in words, by class and motion state; empty if there are none."""
+    counts = Counter(
+        f"{class_name(each.label)} {each.motion_state.value}"
+        for each in objects.objects
+        if each.motion_state is not MotionState.STATIC
+    )
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))

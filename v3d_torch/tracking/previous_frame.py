@@ -1,0 +1,54 @@
+"""Refinement of the previous frame, whose velocity is known from both sides once the next frame is tracked."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.odometry.odometry import TrackedFrame
+from v3d_torch.odometry.time_compensation import TimeCompensation
+from v3d_torch.tracking.map_tracker import MapTracker
+from v3d_torch.tracking.pose_history import PoseHistory
+
+
+class PreviousFrameRefinement:
+    """Compensates the features of the previous frame again with its better velocity, and refines its pose.
+
+    If the previous frame is the newest keyframe, its features in the map are updated instead, and the bundle adjustment
+    refines its pose.
+
+    Args:
+        compensate: Compensation of rolling shutter and depth delay.
+        track_map: Refines a pose.
+        sparse_map: Map of the system.
+        refine_pose: False to update keyframes only.
+    """
+
+    def __init__(
+        self, compensate: TimeCompensation, track_map: MapTracker, sparse_map: SparseMap, *, refine_pose: bool
+    ) -> None:
+        self._compensate = compensate
+        self._track_map = track_map
+        self._map = sparse_map
+        self._refine_pose = refine_pose
+
+    def __call__(self, previous: TrackedFrame | None, velocity: Tensor | None, poses: PoseHistory) -> None:
+        """Refine the last frame of the history.
+
+        Args:
+            previous: That frame; None before the second frame.
+            velocity: Mean twist per second around that frame, float64, shape :math:`(6,)`; None if it is not known.
+            poses: Poses of all frames so far.
+        """
+        if previous is None or previous.landmark_ids is None or velocity is None or not self._map.keyframes:
+            return
+        newest, depth, delay = self._map.keyframes[-1], previous.depth, previous.frame.depth_delay
+        if newest.frame == previous.frame.index:
+            features = self._compensate(newest.features, depth, delay, velocity, self._map.readout)
+            self._map.update_features(newest, features)
+        elif self._refine_pose:
+            matched, points = self._map.landmark_positions(previous.landmark_ids)
+            features = self._compensate(previous.features[matched], depth, delay, velocity, self._map.readout)
+            refined = self._track_map.refine(poses.T_cw, points, features, rounds=1)
+            if refined is not None:
+                poses.replace_last(refined.T_cw)
