@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import Features, sample_depth
+from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.odometry.depth_delay import DepthDelayCompensation

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import ORB, Features, select_evenly
+from v3d_torch.features.features import Features, select_evenly
+from v3d_torch.features.orb import ORB
 from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp

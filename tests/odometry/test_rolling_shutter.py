@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.readout_calibration import calibrate_readout

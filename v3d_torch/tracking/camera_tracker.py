@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.backend.loop_closer import LoopCloser
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.tracking.map_tracker import MapTracker
