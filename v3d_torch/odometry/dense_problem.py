@@ -24,8 +24,8 @@ _REGULARISATION = 1e-9
 """Added to the diagonal of the normal equations, which are singular without valid residuals."""
 
 _OCCLUSION_RATIO = 0.1
-"""A point is occluded if the inverse depth in the current view differs from the expected one by more than this fraction:
-the views then show different surfaces, and their difference contains no information on the motion."""
+"""A point is occluded if the inverse depth in the current view differs from the expected one by more than this
+fraction: the views then show different surfaces, and their difference contains no information on the motion."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,9 @@ class AlignmentProblem:
     """Smallest depth of a point, metres, below the range of any RGB-D camera; keeps 1/z finite."""
 
     _GRADIENT_NOISE = 0.3
-    """Variance of the noise in brightness gradients over the squared scale of the residuals. The Sobel gradient has 12/64
-    of a pixel's variance, and the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its variance."""
+    """Variance of the noise in brightness gradients over the squared scale of the residuals. The Sobel gradient has
+    12/64 of a pixel's variance; the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its
+    variance."""
 
     def __init__(
         self,
