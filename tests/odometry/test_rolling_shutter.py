@@ -85,10 +85,8 @@ def test_features_without_depth_are_compensated_as_infinitely_far() -> None:
 
 
 def test_compensation_with_another_velocity_replaces_the_first() -> None:
-    observed, compensate = (
-        observe_rolling(points_in_view(), VELOCITY, KINECT.seconds),
-        RollingShutterCompensation(CAMERA),
-    )
+    observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
+    compensate = RollingShutterCompensation(CAMERA)
     twice = compensate(compensate(observed, -2 * VELOCITY, KINECT), VELOCITY, KINECT)
     torch.testing.assert_close(twice.uv, compensate(observed, VELOCITY, KINECT).uv, rtol=0, atol=1e-9)
     torch.testing.assert_close(compensate(twice, AT_REST, KINECT).uv, observed.uv, rtol=0, atol=1e-9)
