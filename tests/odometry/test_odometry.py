@@ -37,7 +37,7 @@ def estimate_motion(
     a, b = (
         TrackedFrame(frame, frame.depth, detect(frame.image, frame.depth)) for frame in (demo[previous], demo[current])
     )
-    a = replace(a, static=torch.ones(a.depth.shape[-2:], dtype=torch.bool))
+    a = TrackedFrame(a.frame, a.depth, a.features, torch.ones(a.depth.shape[-2:], dtype=torch.bool))
     register = MotionEstimator(config.odometry, config.features, demo.camera, config.seed)
     assert demo.groundtruth is not None
     rows = [int((demo.groundtruth.stamps - view.frame.stamp).abs().argmin()) for view in (a, b)]
