@@ -40,8 +40,8 @@ class Projection:
     """Predicted image positions of the V landmarks of a local map that are in view.
 
     Attributes:
-        rows: Indices of the landmarks in the local map, int64, shape :math:`(V,)`.
-        pixels: Undistorted pixels, float64, shape :math:`(V, 2)`.
+        indices: Indices of the landmarks in the local map, int64, shape :math:`(V,)`.
+        uv: Undistorted pixels, float64, shape :math:`(V, 2)`.
         depth: Depth along z, metres, float64, shape :math:`(V,)`.
         levels: Expected levels of the scale pyramid, int64, shape :math:`(V,)`.
     """

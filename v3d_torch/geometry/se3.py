@@ -90,7 +90,7 @@ def se3_exp(xi: Tensor) -> Tensor:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
     X = hat(xi)
-    # At smaller angles the coefficients of the smallest angle are exact to float64.
+    # The coefficients hardly change below the small angle, and higher powers of the angle multiply them there.
     angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL_ANGLE)
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3

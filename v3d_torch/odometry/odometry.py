@@ -25,8 +25,8 @@ class TrackedFrame:
         frame: The frame as it was recorded.
         depth: Re-estimated depth, metres, shape :math:`(1, H, W)`.
         features: Features on static pixels; all features while the static pixels are unknown.
-        static: Mask of the static pixels, bool, shape :math:`(H, W)`; None while unknown.
-        landmarks: Landmark id of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
+        static_mask: Mask of the static pixels, bool, shape :math:`(H, W)`; None while unknown.
+        landmark_ids: Landmark id of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
     """
 
     frame: RGBDFrame
