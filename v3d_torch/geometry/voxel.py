@@ -24,7 +24,7 @@ class Voxels(NamedTuple):
         means: Mean of the points in each voxel, metres, shape :math:`(B, M, 3)`; 0 in the padding.
         valid: Mask of the voxels that are not padding, bool, shape :math:`(B, M)`.
         counts: Number of points in each voxel, int64, shape :math:`(B, M)`; 0 in the padding.
-        voxel_index: Index of the voxel of each point within its cloud, int64, shape :math:`(B, N)`; -1 for invalid points.
+        voxel_index: Index of each point's voxel within its cloud, int64, shape :math:`(B, N)`; -1 for invalid points.
     """
 
     means: Tensor
