@@ -1,7 +1,7 @@
-"""Degenerate geometry and large coordinates, stage by stage: a right result, or none; never NaN, never a wrong one.
+"""Degenerate geometry and large coordinates, stage by stage: a correct result or none, never NaN or a wrong result.
 
-Points on a plane, on a line, in one place, or three of them; a camera that only turns or stands; identical clouds; and
-worlds whose origin is a kilometre away, where float32 has a tenth of a millimetre left and float64 all that it needs.
+Points on a plane, on a line, in one place, or only three; a camera that only rotates or is at rest; identical clouds;
+and worlds whose origin is a kilometre away, where float32 resolves a tenth of a millimetre.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import Config
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, scale_error
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.features.ransac import epipolar_inliers
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.normals import surface_normals
@@ -39,7 +39,7 @@ from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
 KILOMETRE = torch.tensor([1024.0, -512.0, 768.0], dtype=torch.float64)
-"""Away from the origin by numbers that are exact in every type, and whole voxels of 2**-6 m."""
+"""Offset from the origin, metres: exact in every dtype, and a multiple of the voxel size 2**-6 m."""
 
 TURN = torch.tensor([0.0, 0.0, 0.0, 0.03, -0.05, 0.02], dtype=torch.float64)
 STEP = torch.tensor([0.04, -0.02, 0.03, 0.0, 0.0, 0.0], dtype=torch.float64)
@@ -50,7 +50,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def points(shape: str, count: int = 200) -> Tensor:
-    """In front of the camera, on a lattice of 2**-10 m, so that a shift by a kilometre changes no difference."""
+    """Points in front of the camera on a lattice of 2**-10 m, whose differences are exact at the offset, too."""
     box = torch.stack([2 * random(count, seed=1) - 1, 1.5 * random(count, seed=2) - 0.75, 2 + random(count, seed=3)])
     x, y, z = box
     cloud = {
@@ -68,7 +68,7 @@ SHAPES = ("plane", "slope", "line", "place", "three")
 each_shape = pytest.mark.parametrize("shape", SHAPES)
 
 
-def everywhere(cloud: Tensor) -> Tensor:
+def all_valid(cloud: Tensor) -> Tensor:
     return torch.ones(cloud.shape[:-1], dtype=torch.bool)
 
 
@@ -77,21 +77,21 @@ def everywhere(cloud: Tensor) -> Tensor:
 
 @each_shape
 @pytest.mark.parametrize("offset", [0.0, 1.0])
-def test_dbscan(shape: str, offset: float) -> None:
+def test_dbscan_of_degenerate_clouds_equals_sklearn(shape: str, offset: float) -> None:
     cloud = points(shape) + offset * KILOMETRE
     expected = sklearn.cluster.DBSCAN(eps=0.1, min_samples=4).fit(points(shape).numpy()).labels_
-    np.testing.assert_array_equal(dbscan(cloud[None], everywhere(cloud[None]), 0.1, 4)[0].numpy(), expected)
+    np.testing.assert_array_equal(dbscan(cloud[None], all_valid(cloud[None]), 0.1, 4)[0].numpy(), expected)
 
 
 @each_shape
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_voxels(shape: str, dtype: torch.dtype) -> None:
+def test_voxel_means_of_degenerate_clouds(shape: str, dtype: torch.dtype) -> None:
     size = 2.0**-6
     cloud = points(shape)
     cells, inverse = np.unique(np.floor(cloud.numpy() / size), axis=0, return_inverse=True)
     expected = np.stack([cloud.numpy()[inverse.ravel() == k].mean(axis=0) for k in range(len(cells))])
     for offset in (torch.zeros(3, dtype=torch.float64), KILOMETRE):
-        pooled = voxel_pool((cloud + offset)[None].to(dtype), everywhere(cloud[None]), size)
+        pooled = voxel_pool((cloud + offset)[None].to(dtype), all_valid(cloud[None]), size)
         assert pooled.means.isfinite().all() and int(pooled.counts.sum()) == len(cloud)
         rounding = 1e-9 if dtype == torch.float64 else 2e-6 + 4e-7 * float(offset.abs().max())
         np.testing.assert_allclose((pooled.means[0] - offset.to(dtype)).numpy(), expected, atol=rounding, rtol=0)
@@ -109,8 +109,8 @@ def test_chamfer_of_identical_clouds_is_zero(shape: str, dtype: torch.dtype) -> 
 
 
 @each_shape
-def test_chamfer_far_from_the_origin(shape: str) -> None:
-    """Against all pairs; a shift of both clouds changes nothing."""
+def test_chamfer_distance_far_from_the_origin(shape: str) -> None:
+    """Compared with all pairs; an offset of both clouds does not change the distance."""
     p, q = points(shape), points(shape) + torch.tensor([0.0, 0.0, 0.125], dtype=torch.float64)
     squared = (p[:, None] - q).square().sum(dim=-1)
     expected = squared.min(dim=1).values.mean() + squared.min(dim=0).values.mean()
@@ -120,48 +120,48 @@ def test_chamfer_far_from_the_origin(shape: str) -> None:
 
 
 @each_shape
-def test_votes_of_what_stands_still(shape: str) -> None:
-    """Nobody is elected, however objects lie, from wherever they are seen."""
+def test_static_objects_get_no_votes(shape: str) -> None:
+    """Whatever the arrangement of the objects and the pose of the camera."""
     centroids = points(shape, 12)
     moved = centroids @ se3_exp(TURN)[:3, :3].T + KILOMETRE
-    votes = hough_vote(centroids, moved, everywhere(centroids), distance_threshold=1e-9, vote_threshold=1)
+    votes = hough_vote(centroids, moved, all_valid(centroids), distance_threshold=1e-9, vote_threshold=1)
     assert not votes.dynamic.any() and votes.change.max() < 1e-9
 
 
 @pytest.mark.parametrize("temperature", [None, 0.01])
 def test_votes_between_centroids_that_coincide(temperature: float | None) -> None:
-    """All in one place, then one leaves: the others vote for it, it for each of them."""
-    then = points("place", 5).requires_grad_()
-    now = then.detach().clone()
-    now[2, 0] += 0.5
-    votes = hough_vote(then, now, everywhere(now), 0.25, vote_threshold=2, temperature=temperature)
+    """All in one place, then one leaves: it gets a vote from each other object, and each of these one from it."""
+    previous = points("place", 5).requires_grad_()
+    current = previous.detach().clone()
+    current[2, 0] += 0.5
+    votes = hough_vote(previous, current, all_valid(current), 0.25, vote_threshold=2, temperature=temperature)
     assert votes.dynamic.tolist() == [False, False, True, False, False]
     torch.testing.assert_close(votes.votes, votes.votes.new_tensor([1, 1, 4, 1, 1]), atol=1e-9, rtol=0)
     if temperature is not None:
         votes.votes.sum().backward()
-        assert then.grad is not None and then.grad.isfinite().all()
+        assert previous.grad is not None and previous.grad.isfinite().all()
 
 
 def test_votes_a_kilometre_away_are_the_same() -> None:
-    then = points("room", 30)
-    now = then + 0.1 * (random(30, 3, seed=4) - 0.5)
-    near = hough_vote(then, now, everywhere(now), 0.05, 3)
-    far = hough_vote(then + KILOMETRE, now + KILOMETRE, everywhere(now), 0.05, 3)
+    previous = points("room", 30)
+    current = previous + 0.1 * (random(30, 3, seed=4) - 0.5)
+    near = hough_vote(previous, current, all_valid(current), 0.05, 3)
+    far = hough_vote(previous + KILOMETRE, current + KILOMETRE, all_valid(current), 0.05, 3)
     assert 0 < near.dynamic.sum() < 30
     torch.testing.assert_close(far.change, near.change, atol=1e-11, rtol=0)
     assert torch.equal(far.votes, near.votes)
 
 
-# ---- the camera's motion -------------------------------------------------------------------------------------------
+# ---- camera motion ------------------------------------------------------------------------------------------------
 
 
 def views(cloud: Tensor, T_ba: Tensor) -> tuple[Features, Features]:
-    """Points as two cameras see them, each with a descriptor of its own."""
+    """Features of points in two views, each point with a descriptor of its own."""
     descriptors = torch.randint(0, 256, (len(cloud), 32), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
-    def view(seen: Tensor) -> Features:
-        uv = CAMERA.project(seen)
-        return Features(uv, uv.round().long(), seen[:, 2], torch.zeros(len(cloud), dtype=torch.int64), descriptors)
+    def view(in_camera: Tensor) -> Features:
+        uv = CAMERA.project(in_camera)
+        return Features(uv, uv.round().long(), in_camera[:, 2], torch.zeros(len(cloud), dtype=torch.int64), descriptors)
 
     return view(cloud), view(cloud @ T_ba[:3, :3].T + T_ba[:3, 3])
 
@@ -171,8 +171,8 @@ MOTIONS = {"turn": TURN, "step": STEP, "stand": 0 * TURN, "both": TURN + STEP}
 
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("shape", ["plane", "slope", "room"])
-def test_motion_before_a_plane_and_of_a_camera_that_only_turns(shape: str, motion: str) -> None:
-    """A fundamental matrix is not determined there; the pose is, and comes out."""
+def test_motion_in_front_of_a_plane_or_with_pure_rotation(shape: str, motion: str) -> None:
+    """The fundamental matrix is not determined, but the pose is."""
     T_ba = se3_exp(MOTIONS[motion])
     a, b = views(points(shape), T_ba)
     assert epipolar_inliers(a.uv, b.uv, threshold=1.0, iterations=200, seed=0).float().mean() > 0.9
@@ -184,7 +184,7 @@ def test_motion_before_a_plane_and_of_a_camera_that_only_turns(shape: str, motio
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("shape", ["line", "place", "three"])
 def test_motion_that_points_do_not_determine(shape: str, motion: str) -> None:
-    """None, or one of those that explain what is seen."""
+    """The result is None or one of the motions that explain the features."""
     T_ba = se3_exp(MOTIONS[motion])
     a, b = views(points(shape), T_ba)
     found = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
@@ -196,8 +196,8 @@ def test_motion_that_points_do_not_determine(shape: str, motion: str) -> None:
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 @pytest.mark.parametrize("shape", [*SHAPES, "room"])
-def test_refined_pose(shape: str, offset: float, depth: bool) -> None:
-    """Observations are met; and where they determine the pose it is the true one, to a micrometre at a kilometre."""
+def test_refined_pose_of_degenerate_points(shape: str, offset: float, depth: bool) -> None:
+    """All residuals vanish; if the points determine the pose, it is the true one, also a kilometre from the origin."""
     cloud = points(shape)
     T_cw = se3_exp(TURN + STEP)
     T_cw[:3, 3] -= T_cw[:3, :3] @ (offset * KILOMETRE)
@@ -219,8 +219,8 @@ def test_refined_pose(shape: str, offset: float, depth: bool) -> None:
 # ---- the map -------------------------------------------------------------------------------------------------------
 
 
-def watched(cloud: Tensor, T_cw: Tensor) -> Observations:
-    """Every point seen by every camera, exactly, with depth."""
+def observe_all(cloud: Tensor, T_cw: Tensor) -> Observations:
+    """Exact observations of every point by every camera, with depth."""
     pose = torch.arange(len(T_cw)).repeat_interleave(len(cloud))
     seen = (T_cw[:, None, :3, :3] @ cloud[..., None])[..., 0] + T_cw[:, None, :3, 3]
     seen = seen.reshape(-1, 3)
@@ -237,15 +237,15 @@ def watched(cloud: Tensor, T_cw: Tensor) -> Observations:
 @pytest.mark.parametrize("cameras", ["stand", "turn", "line"])
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 @pytest.mark.parametrize("shape", [*SHAPES, "room"])
-def test_bundle_adjustment(shape: str, offset: float, cameras: str) -> None:
-    """Points and cameras that determine little; what they do determine comes out, and nothing runs away."""
+def test_bundle_adjustment_of_degenerate_maps(shape: str, offset: float, cameras: str) -> None:
+    """What the observations determine is correct, and what they do not determine stays near its start."""
     cloud = points(shape, 40) + offset * KILOMETRE
     pace = {"stand": 0 * TURN, "turn": TURN, "line": STEP}[cameras]
     T_cw = se3_exp(torch.arange(4, dtype=torch.float64)[:, None] * pace)
     T_cw[:, :3, 3] -= T_cw[:, :3, :3] @ (offset * KILOMETRE)
     fixed = torch.tensor([True, False, False, False])
     wrong = 0.005 * (random(4, 6, seed=5) - 0.5) * ~fixed[:, None]
-    observations = watched(cloud, T_cw)
+    observations = observe_all(cloud, T_cw)
     start = cloud + 0.01 * (random(len(cloud), 3, seed=6) - 0.5)
     found = bundle_adjust(se3_exp(wrong) @ T_cw, start, observations, CAMERA, fixed, iterations=30)
     assert found.T_cw.dtype == found.points.dtype == torch.float64
@@ -260,8 +260,8 @@ def test_bundle_adjustment(shape: str, offset: float, cameras: str) -> None:
 
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 @pytest.mark.parametrize("walk", ["stand", "turn", "line", "half turns"])
-def test_pose_graph(walk: str, offset: float) -> None:
-    """Poses in one place, on a line, or turned by up to half a turn, with edges that say the same twice."""
+def test_pose_graph_of_degenerate_trajectories(walk: str, offset: float) -> None:
+    """Poses in one place, on a line, or with rotations up to half a turn; some edges are duplicated."""
     half = torch.tensor([0.1, 0.0, 0.0, 0.0, 3.1, 0.0], dtype=torch.float64)
     pace = {"stand": 0 * TURN, "turn": TURN, "line": STEP, "half turns": half}[walk]
     T_wc = [torch.eye(4, dtype=torch.float64)]
@@ -276,11 +276,11 @@ def test_pose_graph(walk: str, offset: float) -> None:
     found = optimise_pose_graph(true @ se3_exp(wrong), edges, T_ij)
     assert found.T_wc.dtype == torch.float64 and found.T_wc.isfinite().all()
     torch.testing.assert_close(found.T_wc, true, atol=1e-6 if offset else 1e-7, rtol=0)
-    solved = optimise_pose_graph(true, edges, T_ij)  # nothing to do
+    solved = optimise_pose_graph(true, edges, T_ij)  # already optimal
     torch.testing.assert_close(solved.T_wc, true, atol=1e-9, rtol=0)
 
 
-def test_a_pose_graph_without_edges_or_free_poses_stays_as_it_is() -> None:
+def test_pose_graph_without_edges_or_free_poses_is_unchanged() -> None:
     T_wc = se3_exp(random(3, 6))
     nothing = torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, 4, 4, dtype=torch.float64)
     torch.testing.assert_close(optimise_pose_graph(T_wc, *nothing).T_wc, T_wc, atol=1e-12, rtol=0)
@@ -291,44 +291,44 @@ def test_a_pose_graph_without_edges_or_free_poses_stays_as_it_is() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 20), (20, 1), (2, 2)])
 @pytest.mark.parametrize("z", [0.0, 2.0, 1000.0])
-def test_normals_of_images_without_an_inside(size: tuple[int, int], z: float) -> None:
+def test_normals_of_images_without_interior_pixels_are_zero(size: tuple[int, int], z: float) -> None:
     image = torch.cat([random(1, *size, 2), torch.full((1, *size, 1), z, dtype=torch.float64)], dim=-1)
     assert not surface_normals(image).any()
 
 
-def test_normals_of_points_that_coincide_are_none() -> None:
+def test_normals_of_coincident_points_are_zero() -> None:
     normals = surface_normals(torch.tensor([0.0, 0.0, 2.0]).expand(1, 9, 9, 3))
     assert normals.isfinite().all() and not normals.any()
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.0])
-@pytest.mark.parametrize("seen", ["plane", "line", "place", "three"])
-def test_mesh(seen: str, offset: float) -> None:
-    """A wall has one; a line, a place and three pixels have at most a scrap of one. A kilometre away it is the same."""
-    shown = torch.zeros(240, 320)
+@pytest.mark.parametrize("shape", ["plane", "line", "place", "three"])
+def test_mesh_of_degenerate_depth(shape: str, offset: float) -> None:
+    """A wall has a mesh; a line, one pixel and three pixels have almost none, also a kilometre from the origin."""
+    depth = torch.zeros(240, 320)
     pixels = {
         "plane": (slice(None), slice(None)),
         "line": (slice(120, 121), slice(None)),
         "place": (slice(120, 121), slice(150, 151)),
         "three": ([50, 100, 150], [50, 250, 150]),
-    }[seen]
-    shown[pixels] = 2.0
+    }[shape]
+    depth[pixels] = 2.0
     T_cw = torch.eye(4, dtype=torch.float64)
     T_cw[:3, 3] = -offset * KILOMETRE
-    kept = StaticViews(rooms.CAMERA, 2)
+    views = StaticViews(rooms.CAMERA, 2)
     grey = torch.full((3, 240, 320), 128, dtype=torch.uint8)
-    kept.add(rooms.keyframe(T_cw), grey, shown[None], shown > 0)
-    mesh = fuse_mesh(kept, Config().dense_map)
+    views.add(rooms.keyframe(T_cw), grey, depth[None], depth > 0)
+    mesh = fuse_mesh(views, Config().dense_map)
     assert mesh.vertices.isfinite().all() and mesh.normals.isfinite().all()
     assert ((mesh.vertices[:, 2].double() - offset * KILOMETRE[2] - 2.0).abs() < 0.03).all()
-    assert (len(mesh.faces) > 1000) == (seen == "plane")
+    assert (len(mesh.faces) > 1000) == (shape == "plane")
 
 
 # ---- evaluation ----------------------------------------------------------------------------------------------------
 
 
 def trajectory(shape: str, offset: float) -> Trajectory:
-    """A camera that turns as it goes through the points; stamps of this century."""
+    """Trajectory of a rotating camera through the points, with realistic stamps."""
     places = points(shape, 60) - torch.tensor([0.0, 0.0, 2.5], dtype=torch.float64)
     T_wc = se3_exp(torch.linspace(0, 1, len(places), dtype=torch.float64)[:, None] * 10 * TURN)
     T_wc[:, :3, 3] = places + offset * KILOMETRE
@@ -337,14 +337,14 @@ def trajectory(shape: str, offset: float) -> Trajectory:
 
 @pytest.mark.parametrize("offset", [0.0, 1.0])
 @pytest.mark.parametrize("shape", [*SHAPES, "room"])
-def test_scores_of_a_perfect_estimate(shape: str, offset: float) -> None:
-    """In another world, a kilometre from the true one: no error at all, and a rotation that is one."""
+def test_errors_of_a_perfect_estimate_are_zero(shape: str, offset: float) -> None:
+    """The estimate is in another world frame, a kilometre away; the alignment is a proper rotation."""
     truth = trajectory(shape, offset)
     T_ew = se3_exp(torch.tensor([3.0, -2.0, 1.0, 1.0, -2.0, 0.5], dtype=torch.float64))
     estimate = replace(truth, T_wc=T_ew @ truth.T_wc)
     scores = evaluate(truth, estimate)
     assert scores.ate.max < 1e-9
-    if shape != "three":  # these last no longer than a second
+    if shape != "three":  # this trajectory is too short for the RPE over one second
         assert scores.rpe is not None and scores.rpe.trans.max < 1e-9 and scores.rpe.rot.max < 1e-5
     R = scores.alignment.T_ge[:3, :3]
     torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
@@ -355,11 +355,11 @@ def test_scores_of_a_perfect_estimate(shape: str, offset: float) -> None:
 
 @pytest.mark.parametrize("oriented", [True, False])
 @pytest.mark.parametrize("shape", ["line", "place"])
-def test_alignment_of_what_has_no_rotation_is_still_rigid(shape: str, oriented: bool) -> None:
-    """Also of an estimate that stands still, and where nothing but positions is known."""
+def test_alignment_of_degenerate_positions_is_rigid(shape: str, oriented: bool) -> None:
+    """Also for an estimate at rest, and with positions only."""
     truth = trajectory(shape, 1.0)
-    still = trajectory("place", 0.0).T_wc[: len(truth)]
-    for estimate in (truth.T_wc, still):
+    at_rest = trajectory("place", 0.0).T_wc[: len(truth)]
+    for estimate in (truth.T_wc, at_rest):
         found = align(truth.T_wc, estimate, oriented=oriented)
         assert found.T_ge.isfinite().all()
         torch.testing.assert_close(found.T_ge, rigid(found.T_ge), atol=1e-9, rtol=0)
@@ -371,10 +371,9 @@ def test_alignment_of_what_has_no_rotation_is_still_rigid(shape: str, oriented: 
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 1.0, torch.pi - 1e-9, torch.pi])
-def test_logarithm_of_every_turn(angle: float) -> None:
+def test_logarithm_of_any_rotation_angle(angle: float) -> None:
     xi = torch.tensor([1024.0, -512.0, 768.0, 0.6 * angle, 0.0, 0.8 * angle], dtype=torch.float64)
-    there = se3_exp(xi)
-    back = se3_exp(se3_log(there))
-    assert se3_log(there).isfinite().all()
-    torch.testing.assert_close(back, there, atol=1e-9, rtol=1e-9)
-    torch.testing.assert_close(there @ invert(there), torch.eye(4, dtype=torch.float64), atol=1e-8, rtol=0)
+    T = se3_exp(xi)
+    assert se3_log(T).isfinite().all()
+    torch.testing.assert_close(se3_exp(se3_log(T)), T, atol=1e-9, rtol=1e-9)
+    torch.testing.assert_close(T @ invert(T), torch.eye(4, dtype=torch.float64), atol=1e-8, rtol=0)

@@ -10,7 +10,8 @@ from torch import Tensor
 from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
-from v3d_torch.features.orb import ORB, Features
+from v3d_torch.features.features import Features
+from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import PREFETCHED_FRAMES, FrameResult, PreprocessedFrame
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother

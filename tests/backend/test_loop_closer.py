@@ -13,7 +13,7 @@ from v3d_torch.backend.keyframe_database import KeyframeDatabase
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Keyframe

@@ -1,4 +1,4 @@
-"""The pinhole camera against OpenCV, and the conventions that everything else rests on."""
+"""Pinhole camera: conventions, agreement with OpenCV, validation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FR3 = PinholeCamera(535.4, 539.2, 320.1, 247.6)
 
 
 def test_convention_axes() -> None:
-    """A point to the right and below the optical axis has larger u and v: x right, y down, z forward."""
+    """x right, y down, z forward: a point to the right of and below the optical axis has larger u and v."""
     centre = FR3.project(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
     assert centre.tolist() == pytest.approx([320.1, 247.6])
     u, v = FR3.project(torch.tensor([0.5, 0.25, 2.0], dtype=torch.float64)).tolist()
@@ -33,28 +33,28 @@ def test_convention_pixel_centres_are_integers() -> None:
 
 
 @given(u=st.floats(0, 639), v=st.floats(0, 479), z=st.floats(0.1, 10))
-def test_lift_and_project_are_inverse(u: float, v: float, z: float) -> None:
+def test_project_inverts_back_project(u: float, v: float, z: float) -> None:
     uv = torch.tensor([u, v], dtype=torch.float64)
     assert torch.allclose(FR3.project(FR3.back_project(uv, torch.tensor(z, dtype=torch.float64))), uv, atol=1e-9)
 
 
-def test_undistortion_inverts_opencvs_distortion() -> None:
-    """Ideal pixels, bent by OpenCV's lens model, come back, to 1e-5 pixels over the whole of fr1's strong lens."""
+def test_undistort_inverts_opencv_projection() -> None:
+    """Accurate to 1e-5 pixels over the whole image, even with the strong lens distortion of fr1."""
     v, u = np.mgrid[20:460:20.0, 20:620:20.0]
-    ideal = np.stack([u.ravel(), v.ravel()], axis=1)
-    rays = np.concatenate([(ideal - [FR1.cx, FR1.cy]) / [FR1.fx, FR1.fy], np.ones((len(ideal), 1))], axis=1)
-    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
-    assert np.abs(FR1.undistort(torch.from_numpy(bent)).numpy() - ideal).max() < 1e-5
+    undistorted = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays = np.concatenate([(undistorted - [FR1.cx, FR1.cy]) / [FR1.fx, FR1.fy], np.ones((len(u.ravel()), 1))], axis=1)
+    distorted = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
+    assert np.abs(FR1.undistort(torch.from_numpy(distorted)).numpy() - undistorted).max() < 1e-5
 
 
-def test_distortion_is_opencvs() -> None:
-    ideal = torch.rand(200, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 480
-    rays = FR1.back_project(ideal, torch.ones(200, dtype=torch.float64)).numpy()
-    bent = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
-    torch.testing.assert_close(FR1.distort(ideal), torch.from_numpy(bent), rtol=0, atol=1e-9)
+def test_distort_equals_opencv_projection() -> None:
+    undistorted = torch.rand(200, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * 480
+    rays = FR1.back_project(undistorted, torch.ones(200, dtype=torch.float64)).numpy()
+    distorted = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), FR1.K.numpy(), np.array(FR1.distortion))[0][:, 0]
+    torch.testing.assert_close(FR1.distort(undistorted), torch.from_numpy(distorted), rtol=0, atol=1e-9)
 
 
-def test_undistortion_of_nothing_is_nothing() -> None:
+def test_undistort_of_no_pixels_is_empty() -> None:
     assert FR1.undistort(torch.zeros(0, 2)).shape == (0, 2)
 
 
@@ -64,7 +64,7 @@ def test_distort_inverts_undistort() -> None:
 
 
 @pytest.mark.parametrize("camera", [FR1, FR3])
-def test_back_projection_agrees_with_the_formula(camera: PinholeCamera) -> None:
+def test_back_projected_image_equals_back_projected_pixels(camera: PinholeCamera) -> None:
     depth = torch.rand(2, 1, 480, 640) * 4
     depth[:, :, 100:200, 100:200] = 0
     points = BackProjector(camera)(depth)
@@ -75,16 +75,16 @@ def test_back_projection_agrees_with_the_formula(camera: PinholeCamera) -> None:
     assert torch.allclose(points[1, 300, 400].double(), expected, atol=1e-5)
 
 
-def test_back_projection_has_gradients() -> None:
+def test_back_projection_gradcheck() -> None:
     camera = PinholeCamera(5.0, 5.0, 3.5, 2.5, width=8, height=6)
     depth = (torch.rand(1, 1, 6, 8, dtype=torch.float64) + 0.5).requires_grad_()
     assert torch.autograd.gradcheck(BackProjector(camera), (depth,))
 
 
-def test_numbers_of_any_kind_make_a_camera() -> None:
+def test_camera_accepts_numpy_and_torch_numbers() -> None:
     K = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
-    lens = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera gives it
-    camera = PinholeCamera(K[0, 0], torch.tensor(516.5).double(), K[0, 2], K[1, 2], np.int64(640), 480.0, lens)
+    distortion = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera returns it
+    camera = PinholeCamera(K[0, 0], torch.tensor(516.5).double(), K[0, 2], K[1, 2], np.int64(640), 480.0, distortion)
     assert camera == FR1 and hash(camera) == hash(FR1) and torch.equal(camera.rays, FR1.rays)
     rolling = replace(camera, readout=np.float32(0.03125))
     assert camera.readout is None and rolling.readout == 0.03125
@@ -109,6 +109,6 @@ def test_numbers_of_any_kind_make_a_camera() -> None:
         ({"readout": "rolling"}, "readout is 'rolling'; give seconds"),
     ],
 )
-def test_what_is_no_camera_is_said(change: dict[str, object], message: str) -> None:
+def test_invalid_camera_is_rejected(change: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=f"^the camera's {message}"):
         PinholeCamera(**{"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0} | change)

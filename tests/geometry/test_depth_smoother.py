@@ -1,4 +1,4 @@
-"""Depth smoothing against Kornia's plain Gaussian and a pixel-by-pixel reference."""
+"""Depth re-estimation against Kornia's Gaussian and against a pixel-by-pixel implementation."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from v3d_torch.geometry.depth_smoother import DepthSmoother, smooth_depth
 DTYPES = [torch.float32, torch.float64]
 
 
-def bumpy(height: int, width: int, dtype: torch.dtype = torch.float64, *, batch: int = 2, holes: float = 0.2) -> Tensor:
-    """Two surfaces with a step between them, noise and holes."""
+def stepped_depth(
+    height: int, width: int, dtype: torch.dtype = torch.float64, *, batch: int = 2, holes: float = 0.2
+) -> Tensor:
+    """Depth of two surfaces with a step between them, noise and holes."""
     generator = torch.Generator().manual_seed(0)
     depth = 2 + 0.05 * torch.rand(batch, 1, height, width, generator=generator, dtype=torch.float64)
     depth[..., width // 2 :] += 1.0
@@ -27,14 +29,14 @@ def bumpy(height: int, width: int, dtype: torch.dtype = torch.float64, *, batch:
     return depth.to(dtype)
 
 
-def slow_reference(depth: np.ndarray, kernel_size: int, sigma: float, edge: float) -> np.ndarray:
-    """The definition, written down pixel by pixel."""
+def reference_smoothing(depth: np.ndarray, kernel_size: int, sigma: float, edge_ratio: float) -> np.ndarray:
+    """The definition, pixel by pixel."""
     radius = kernel_size // 2
     height, width = depth.shape
     out = np.zeros_like(depth)
 
     def near(z: float, centre: float) -> bool:
-        return z > 0 and abs(z - centre) <= edge * centre
+        return z > 0 and abs(z - centre) <= edge_ratio * centre
 
     for v, u in np.argwhere(depth > 0):
         total = weight = 0.0
@@ -48,84 +50,84 @@ def slow_reference(depth: np.ndarray, kernel_size: int, sigma: float, edge: floa
     return out
 
 
-@pytest.mark.parametrize(("kernel_size", "sigma", "edge"), [(5, 1.0, 0.01), (3, 0.7, 0.05), (7, 2.0, 2.0)])
-def test_equals_its_definition(kernel_size: int, sigma: float, edge: float) -> None:
-    depth = bumpy(250, 12)  # taller than two strips
-    expected = np.stack([slow_reference(image[0].numpy(), kernel_size, sigma, edge) for image in depth])
-    np.testing.assert_allclose(smooth_depth(depth, kernel_size, sigma, edge)[:, 0].numpy(), expected, rtol=1e-12)
+@pytest.mark.parametrize(("kernel_size", "sigma", "edge_ratio"), [(5, 1.0, 0.01), (3, 0.7, 0.05), (7, 2.0, 2.0)])
+def test_smoothing_equals_its_definition(kernel_size: int, sigma: float, edge_ratio: float) -> None:
+    depth = stepped_depth(250, 12)  # taller than two strips
+    expected = np.stack([reference_smoothing(image[0].numpy(), kernel_size, sigma, edge_ratio) for image in depth])
+    np.testing.assert_allclose(smooth_depth(depth, kernel_size, sigma, edge_ratio)[:, 0].numpy(), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_without_gate_it_is_the_gaussian_of_kornia(dtype: torch.dtype) -> None:
-    depth = bumpy(260, 40, dtype, holes=0.0)  # taller than two strips
+def test_smoothing_without_gates_equals_kornia(dtype: torch.dtype) -> None:
+    depth = stepped_depth(260, 40, dtype, holes=0.0)  # taller than two strips
     blur = {"kernel_size": 5, "sigma": (1.0, 1.0), "border_type": "constant"}
     expected = gaussian_blur2d(depth, **blur) / gaussian_blur2d(torch.ones_like(depth), **blur)
-    smoothed = smooth_depth(depth, edge=math.inf)
+    smoothed = smooth_depth(depth, edge_ratio=math.inf)
     assert smoothed.dtype == dtype
     torch.testing.assert_close(smoothed, expected, rtol=2e-6 if dtype == torch.float32 else 1e-12, atol=0.0)
 
 
 def test_convention_zero_stays_zero_and_is_never_averaged() -> None:
-    depth = bumpy(30, 40, torch.float32)
-    smoothed = smooth_depth(depth, edge=math.inf)
+    depth = stepped_depth(30, 40, torch.float32)
+    smoothed = smooth_depth(depth, edge_ratio=math.inf)
     assert torch.equal(smoothed == 0, depth == 0)
     assert smoothed[depth > 0].min() >= depth[depth > 0].min()
     assert not smooth_depth(torch.zeros(1, 1, 8, 8)).any()
 
 
 @pytest.mark.parametrize("missing", [math.nan, math.inf, -math.inf, -1.0])
-def test_what_is_no_depth_counts_as_missing(missing: float) -> None:
-    depth = bumpy(12, 12)
+def test_invalid_depth_counts_as_missing(missing: float) -> None:
+    depth = stepped_depth(12, 12)
     broken = torch.where(depth == 0, missing, depth)
     assert torch.equal(smooth_depth(broken), smooth_depth(depth))
 
 
-def test_does_not_bridge_an_edge() -> None:
+def test_smoothing_keeps_depth_edges() -> None:
     depth = torch.full((1, 1, 10, 20), 2.0)
     depth[..., 10:] = 3.0
     assert torch.equal(smooth_depth(depth), depth)
-    # A difference of exactly edge times the centre's depth is still the same surface: 3 - 2 = 0.5 * 2.
-    assert (smooth_depth(depth, edge=0.5)[..., 8:10] > 2).all()
-    # As a share of the farther depth the step is a third: seen from there it can be within, seen from here beyond.
-    assert torch.equal(smooth_depth(depth, edge=0.4)[..., :10], depth[..., :10])
-    assert (smooth_depth(depth, edge=0.4)[..., 10:12] < 3).all()
+    # A difference of exactly edge_ratio times the centre's depth is still the same surface: 3 - 2 = 0.5 * 2.
+    assert (smooth_depth(depth, edge_ratio=0.5)[..., 8:10] > 2).all()
+    # The step is half of the nearer depth and a third of the farther: with 0.4, only the far side averages over it.
+    assert torch.equal(smooth_depth(depth, edge_ratio=0.4)[..., :10], depth[..., :10])
+    assert (smooth_depth(depth, edge_ratio=0.4)[..., 10:12] < 3).all()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_a_constant_image_comes_out_bit_for_bit(dtype: torch.dtype) -> None:
+def test_constant_depth_is_unchanged_to_the_bit(dtype: torch.dtype) -> None:
     depth = torch.full((1, 1, 130, 9), 1.2345, dtype=dtype)
     assert torch.equal(smooth_depth(depth), depth)
 
 
-def test_noise_goes_down_on_a_wall() -> None:
+def test_smoothing_reduces_noise_on_a_wall() -> None:
     wall = 2 + 0.01 * torch.randn(1, 1, 60, 80, generator=torch.Generator().manual_seed(1))
     assert smooth_depth(wall).std() < 0.35 * wall.std()  # a 5 x 5 Gaussian of sigma 1 leaves 0.28
 
 
-def test_gradcheck() -> None:
-    depth = bumpy(6, 8, batch=1).requires_grad_()
-    # The finite difference moves no neighbour over the gate and no hole into existence.
-    inside = torch.where(depth == 0, 0.0, 1.0).detach()
-    assert torch.autograd.gradcheck(lambda z: smooth_depth(z * inside, edge=0.1), (depth,))
+def test_smoothing_gradcheck() -> None:
+    depth = stepped_depth(6, 8, batch=1).requires_grad_()
+    # The finite differences must neither cross the gate nor fill a hole.
+    measured = torch.where(depth == 0, 0.0, 1.0).detach()
+    assert torch.autograd.gradcheck(lambda z: smooth_depth(z * measured, edge_ratio=0.1), (depth,))
     smooth_depth(depth).sum().backward()
     assert depth.grad is not None and depth.grad.isfinite().all()
     assert not depth.grad[depth == 0].any()
 
 
-def test_batch_module_and_determinism() -> None:
-    depth = bumpy(240, 32, torch.float32, batch=3)
-    smoothed = DepthSmoother(kernel_size=3, sigma=0.8, edge=0.02)(depth)
+def test_module_on_a_batch_equals_the_function_on_each_image() -> None:
+    depth = stepped_depth(240, 32, torch.float32, batch=3)
+    smoothed = DepthSmoother(kernel_size=3, sigma=0.8, edge_ratio=0.02)(depth)
     each = torch.cat([smooth_depth(image[None], 3, 0.8, 0.02) for image in depth])
     assert torch.equal(smoothed, each)
 
 
 @pytest.mark.parametrize("kernel_size", [0, 4])
-def test_a_window_without_centre_is_refused(kernel_size: int) -> None:
+def test_even_window_is_rejected(kernel_size: int) -> None:
     with pytest.raises(ConfigError, match="odd"):
         smooth_depth(torch.ones(1, 1, 4, 4), kernel_size)
 
 
-def test_real_depth_stays_within_the_gate(v3d_data: Path) -> None:
+def test_real_depth_changes_by_less_than_the_gate(v3d_data: Path) -> None:
     path = sorted((v3d_data / "fr1_rpy" / "depth").glob("*.png"))[0]
     depth = torch.from_numpy(cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000)[None, None]
     smoothed = smooth_depth(depth)

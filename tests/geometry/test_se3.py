@@ -1,4 +1,4 @@
-"""Rigid motions against PyPose and the power series, up to the ends of the angle's range."""
+"""SE(3) against PyPose, from the smallest rotation angles to half turns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from v3d_torch.geometry.se3 import invert, rigid, se3_exp, se3_log
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
-    """Tangent vectors that turn by ``angle``."""
+    """Tangent vectors with the given rotation angle."""
     generator = torch.Generator().manual_seed(1)
     xi = torch.randn(count, 6, generator=generator, dtype=torch.float64)
     xi[:, 3:] *= angle / xi[:, 3:].norm(dim=1, keepdim=True)
@@ -28,7 +28,7 @@ ANGLES = [0.0, 1e-9, 9.9e-5, 1.1e-4, 0.1, 1.0, 3.0, math.pi - 1e-7]
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_equals_pypose(angle: float) -> None:
     xi = tangents(angle)
-    # PyPose's own exponential is good to 1e-8 only where the angle is tiny.
+    # PyPose's exponential is accurate to only 1e-8 at tiny angles.
     torch.testing.assert_close(se3_exp(xi), pp.se3(xi).Exp().matrix(), rtol=0, atol=1e-8 if angle < 1e-3 else 1e-13)
 
 
@@ -49,7 +49,7 @@ def test_log_of_small_rotations_keeps_all_digits() -> None:
     torch.testing.assert_close(se3_log(se3_exp(xi))[:, 3:], xi[:, 3:], rtol=1e-12, atol=0)
 
 
-def test_half_turns() -> None:
+def test_log_of_half_turns() -> None:
     xi = math.pi * torch.eye(6, dtype=torch.float64)[3:]
     torch.testing.assert_close(se3_log(se3_exp(xi)).abs(), xi, rtol=0, atol=1e-13)
 
@@ -65,7 +65,7 @@ def test_group_laws(numbers: list[float]) -> None:
     torch.testing.assert_close(se3_exp(0.5 * xi) @ se3_exp(0.5 * xi), T, rtol=0, atol=1e-13)
 
 
-def test_convention_translation_first() -> None:
+def test_convention_tangent_vector_is_translation_then_rotation() -> None:
     T = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     assert T[:3, 3].tolist() == [1.0, 2.0, 3.0]
     quarter = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.pi / 2], dtype=torch.float64))
@@ -73,22 +73,22 @@ def test_convention_translation_first() -> None:
     torch.testing.assert_close(x, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
 
 
-def test_rigid_puts_bent_rotations_right() -> None:
+def test_orthonormalise_returns_the_nearest_rotation() -> None:
     T = se3_exp(tangents(2.0))
     torch.testing.assert_close(rigid(T), T, rtol=0, atol=1e-14)
-    bent = T.clone()
-    bent[:, :3, :3] += 1e-3 * torch.sin(torch.arange(64 * 9, dtype=torch.float64)).reshape(64, 3, 3)
-    straight = rigid(bent)
-    R = straight[:, :3, :3]
+    perturbed = T.clone()
+    perturbed[:, :3, :3] += 1e-3 * torch.sin(torch.arange(64 * 9, dtype=torch.float64)).reshape(64, 3, 3)
+    nearest = rigid(perturbed)
+    R = nearest[:, :3, :3]
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(64, 3, 3), rtol=0, atol=1e-14)
-    torch.testing.assert_close(straight, T, rtol=0, atol=5e-3)
+    torch.testing.assert_close(nearest, T, rtol=0, atol=5e-3)
     # The nearest rotation R makes R^T M symmetric (polar decomposition).
-    stretch = R.mT @ bent[:, :3, :3]
+    stretch = R.mT @ perturbed[:, :3, :3]
     torch.testing.assert_close(stretch, stretch.mT, rtol=0, atol=1e-14)
 
 
-def test_a_long_chain_of_relative_poses_stays_rigid() -> None:
-    """A pose is kept relative to a keyframe and read back, frame after frame: rounding must not grow from it."""
+def test_orthonormalised_chain_of_poses_stays_rigid() -> None:
+    """Rounding errors do not grow when a pose is converted to a keyframe's frame and back many times."""
     keyframe, pose = se3_exp(tangents(1.0, 2))
     step = se3_exp(1e-2 * tangents(1.0, 1)[0])
     step[3, 3] += 2.2e-16
@@ -100,7 +100,7 @@ def test_a_long_chain_of_relative_poses_stays_rigid() -> None:
     torch.testing.assert_close(pose[:3, :3] @ pose[:3, :3].T, identity, rtol=0, atol=1e-12)
 
 
-def test_batches_of_any_shape() -> None:
+def test_functions_accept_any_batch_shape() -> None:
     xi = tangents(1.0, 6).reshape(2, 3, 6)
     T = se3_exp(xi)
     assert T.shape == (2, 3, 4, 4)
@@ -110,7 +110,7 @@ def test_batches_of_any_shape() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])
-def test_gradients(angle: float) -> None:
+def test_exp_and_log_gradcheck(angle: float) -> None:
     xi = tangents(angle, 2).requires_grad_()
     assert torch.autograd.gradcheck(se3_exp, xi)
     assert torch.autograd.gradcheck(lambda x: se3_log(se3_exp(x)), xi)

@@ -19,7 +19,7 @@ from helpers.bags import DEPTH, INFO, RGB, Kind, Messages
 from helpers.parsers import CAMERA
 from v3d_torch.config import Config
 from v3d_torch.datasets.encodings import COLOURS
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.map_io import save_map
 from v3d_torch.mapping.sparse_map import SparseMap

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import Config, MappingConfig
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.sparse_map import SparseMap
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
 from v3d_torch.config import Config, MappingConfig
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.culling import cull_redundant_keyframes

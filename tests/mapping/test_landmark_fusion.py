@@ -10,7 +10,7 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_fusion import LandmarkFusion

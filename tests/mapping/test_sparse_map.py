@@ -13,7 +13,7 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import local_bundle_adjust

@@ -8,7 +8,7 @@ from helpers.sparse_maps import CAMERA, EYE, features
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.sparse_map import SparseMap

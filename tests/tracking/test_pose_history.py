@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.odometry.odometry import CameraMotion

@@ -11,7 +11,7 @@ from torch import Tensor
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
 from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import LoopConfig
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap

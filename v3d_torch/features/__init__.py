@@ -1,1 +1,1 @@
-"""ORB features: detection, matching, projection search, RANSAC."""
+"""ORB features: detection, descriptor matching, projection matching, RANSAC."""

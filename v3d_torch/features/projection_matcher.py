@@ -1,4 +1,4 @@
-"""Guided search: landmarks are looked for where a pose says they should appear (ORB-SLAM2, Sec. III)."""
+"""Projection matching: match landmarks to features near their predicted image positions (ORB-SLAM2, Sec. III)."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, TrackingConfig
-from v3d_torch.features.matching import match_near
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
+from v3d_torch.features.matching import match_by_projection
 from v3d_torch.geometry.camera import PinholeCamera
 
 
 @dataclass(frozen=True)
 class LocalMap:
-    """Landmarks that a frame may see.
+    """Landmarks that a frame can observe.
 
     Attributes:
-        ids: of the landmarks, ascending, int64, shape :math:`(L,)`.
-        points: world frame, metres, float64, shape :math:`(L, 3)`.
-        directions: unit vectors from where each was first seen to the landmark, world frame, :math:`(L, 3)`.
-        reach: distance at which the landmark would be seen on level 0 of the pyramid, metres, :math:`(L,)`.
-        descriptors: uint8, shape :math:`(L, 32)`.
+        ids: Landmark ids, ascending, int64, shape :math:`(L,)`.
+        points: Positions, world frame, metres, float64, shape :math:`(L, 3)`.
+        directions: Unit vectors from the camera that first observed a landmark to the landmark, world frame, float64,
+            shape :math:`(L, 3)`.
+        reference_distance: Distance at which a landmark appears on level 0 of the scale pyramid, metres, float64,
+            shape :math:`(L,)`.
+        descriptors: 256-bit descriptors, uint8, shape :math:`(L, 32)`.
     """
 
     ids: Tensor
@@ -35,13 +37,13 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class Projection:
-    """Landmarks as they should appear in an image.
+    """Predicted image positions of the V landmarks of a local map that are in view.
 
     Attributes:
-        rows: of the local map, those in view, int64, shape :math:`(V,)`.
-        pixels: undistorted, shape :math:`(V, 2)`.
-        depth: along z, metres, shape :math:`(V,)`.
-        levels: of the scale pyramid, int64, shape :math:`(V,)`.
+        indices: Indices of the landmarks in the local map, int64, shape :math:`(V,)`.
+        uv: Undistorted pixels, float64, shape :math:`(V, 2)`.
+        depth: Depth along z, metres, float64, shape :math:`(V,)`.
+        levels: Expected levels of the scale pyramid, int64, shape :math:`(V,)`.
     """
 
     rows: Tensor
@@ -51,65 +53,81 @@ class Projection:
 
 
 class ProjectionMatcher:
-    """Finds landmarks among the features of a view whose pose is about known.
+    """Matches landmarks to the features of a frame whose pose is approximately known.
 
     Args:
-        config: what counts as alike.
-        features: scale pyramid of the features.
-        camera: projects the landmarks.
+        config: Thresholds of descriptor matching.
+        features: Scale pyramid of the features.
+        camera: Intrinsics.
     """
 
-    _MIN_COSINE = 0.5  # a descriptor seen from 60 degrees aside is another one (ORB-SLAM2)
-    _LEVEL_SLACK = 1.2  # landmarks a level beyond the pyramid's ends are still tried
-    _NEAREST = 0.05  # metres: no camera sees nearer
+    _MIN_COSINE = 0.5
+    """Cosine of the largest change of viewing direction, 60 degrees: beyond, descriptors differ (ORB-SLAM2)."""
+
+    _LEVEL_MARGIN = 1.2
+    """Landmarks up to this many levels beyond either end of the pyramid are matched, too: the expected level is
+    rounded, and descriptors tolerate a difference of one level."""
+
+    _MIN_DEPTH = 0.05
+    """Smallest depth of a landmark, metres: below the range of any RGB-D camera."""
 
     def __init__(self, config: TrackingConfig, features: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._scale = features.scale
         self._levels = features.levels
         self._camera = camera
-        # Of z, u, v, cosine and level, in this order, for a landmark that is in sight.
-        slack = self._LEVEL_SLACK
-        least = [self._NEAREST, 0.0, 0.0, self._MIN_COSINE, -slack]
-        beyond = [math.inf, camera.width, camera.height, math.inf, features.levels - 1 + slack]
-        self._least, self._beyond = torch.tensor([least, beyond], dtype=torch.float64)[..., None]
+        # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower ones are inclusive.
+        margin = self._LEVEL_MARGIN
+        lower = [self._MIN_DEPTH, 0.0, 0.0, self._MIN_COSINE, -margin]
+        upper = [math.inf, camera.width, camera.height, math.inf, features.levels - 1 + margin]
+        self._lower, self._upper = torch.tensor([lower, upper], dtype=torch.float64)[..., None]
 
-    def __call__(self, features: Features, seen: Projection, local: LocalMap, radius: float) -> Tensor:
-        """Pairs (row in ``local``, feature) that lie near each other in the image and look alike.
+    def __call__(self, features: Features, projection: Projection, local_map: LocalMap, radius: float) -> Tensor:
+        """Match projected landmarks to nearby features with similar descriptors.
 
         Args:
-            features: of the view.
-            seen: the landmarks as `project` puts them into it.
-            local: landmarks.
-            radius: around their projections, pixels at level 0; grows with the level.
+            features: Features of the frame.
+            projection: Landmarks projected into the frame, see `project`.
+            local_map: The local map that was projected.
+            radius: Search radius, pixels at level 0; it grows with the level.
 
         Returns:
-            Each landmark and each feature at most once, int64, shape :math:`(K, 2)`.
+            Pairs (row of ``local_map``, feature), int64, shape :math:`(K, 2)`. Each landmark and each feature occurs at
+            most once.
         """
-        pairs = match_near(
-            seen.pixels,
-            radius * self._scale ** seen.levels.to(torch.float64),
-            seen.levels,
-            local.descriptors.index_select(0, seen.rows),
+        pairs = match_by_projection(
+            projection.pixels,
+            radius * self._scale ** projection.levels.to(torch.float64),
+            projection.levels,
+            local_map.descriptors.index_select(0, projection.rows),
             features.uv,
             features.octave,
             features.descriptors,
             max_hamming=self._config.max_hamming,
             max_ratio=self._config.max_ratio,
         )
-        return torch.stack([seen.rows[pairs[:, 0]], pairs[:, 1]], dim=1)
+        return torch.stack([projection.rows[pairs[:, 0]], pairs[:, 1]], dim=1)
 
-    def project(self, T_cw: Tensor, local: LocalMap) -> Projection:
-        """The landmarks that a camera at ``T_cw`` should see, about as they were seen before."""
+    def project(self, T_cw: Tensor, local_map: LocalMap) -> Projection:
+        """Project a local map into a camera, and select the landmarks in view.
+
+        A landmark is in view if it projects into the image, its viewing direction is similar to that of its first
+        observation, and its distance corresponds to a level of the scale pyramid.
+
+        Args:
+            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            local_map: Landmarks to project.
+        """
         R = T_cw[:3, :3]
-        points, directions = torch.addmm(T_cw[:3, 3:], R, local.points.T), R @ local.directions.T  # 3 x L
+        points = torch.addmm(T_cw[:3, 3:], R, local_map.points.T)  # 3 x L, camera frame
+        directions = R @ local_map.directions.T  # 3 x L, camera frame
         distance = points.square().sum(dim=0).sqrt()
         z = points[2]
         u, v = (self._camera.K[:2] @ points) / z
         cosine = (points * directions).sum(dim=0) / distance
-        level = torch.log(local.reference_distance / distance) / math.log(self._scale)
-        found = torch.stack([z, u, v, cosine, level])
-        rows = torch.nonzero(((found >= self._least) & (found < self._beyond)).all(dim=0))[:, 0]
-        z, u, v, _, level = found.index_select(1, rows)
+        level = torch.log(local_map.reference_distance / distance) / math.log(self._scale)
+        predicted = torch.stack([z, u, v, cosine, level])
+        rows = torch.nonzero(((predicted >= self._lower) & (predicted < self._upper)).all(dim=0))[:, 0]
+        z, u, v, _, level = predicted.index_select(1, rows)
         levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
         return Projection(rows, torch.stack([u, v], dim=1), z, levels)

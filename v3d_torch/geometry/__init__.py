@@ -1,1 +1,1 @@
-"""Camera model, rigid motions and depth images as tensors."""
+"""Camera model, rigid motions, depth images and point clouds as tensors."""

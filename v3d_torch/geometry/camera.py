@@ -1,4 +1,4 @@
-"""The pinhole camera: intrinsics, lens distortion, rays of pixels, back-projection (paper, Sec. III-B.1)."""
+"""Pinhole camera with lens distortion: projection, back-projection, pixel rays (paper, Sec. III-B.1)."""
 
 from __future__ import annotations
 
@@ -16,28 +16,36 @@ from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
 
 MAX_READOUT = 0.05
-"""Seconds: no camera takes longer to read the rows of an image."""
+"""Longest accepted readout, seconds: no RGB-D camera takes longer to read the rows of an image."""
+
+# The corners of an image with strong lens distortion take about 20 steps. The tolerance is in pixels.
+_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Intrinsics of an RGB-D camera whose depth is registered to its colour image.
+    """Intrinsics of an RGB-D camera whose depth image is registered to its colour image.
+
+    Convention: x right, y down, z forward, metres. Pixels are (u, v) = (column, row), and pixel centres lie at
+    integers. An *undistorted* pixel is the projection by ``K`` alone; a *distorted* pixel is a position in the recorded
+    image, with lens distortion.
 
     Args:
-        fx: focal length along u, pixels.
-        fy: focal length along v, pixels.
-        cx: u of the principal point, pixels; pixel centres lie at integers.
-        cy: v of the principal point, pixels.
-        width: columns of the images, pixels.
-        height: rows of the images, pixels.
-        distortion: k1, k2, p1, p2, k3 of the Brown model in OpenCV's order; as it gives them, an array of four or more.
-        depth_scale: units of the depth image per metre (TUM: 5000).
-        readout: time from the first row of a colour image to the last, seconds, where it is known: 0 of a global
-            shutter, as rendered images have, less than 0 where rows are read from below; None where the images tell.
+        fx: Focal length along u, pixels.
+        fy: Focal length along v, pixels.
+        cx: Principal point along u, pixels.
+        cy: Principal point along v, pixels.
+        width: Number of image columns.
+        height: Number of image rows.
+        distortion: Coefficients k1, k2, p1, p2, k3 of the Brown-Conrady model in OpenCV's order. An array of four or
+            five coefficients, as OpenCV returns it, is accepted.
+        depth_scale: Units of the depth image per metre (TUM: 5000).
+        readout: Time from the first to the last row of a colour image, seconds. 0 for a global shutter, negative if the
+            rows are read from the bottom up, None if unknown; an unknown readout is calibrated while mapping.
 
     Raises:
-        InputError: one of them is no such number. A focal length below 0, as ICL-NUIM publishes for a y axis that
-            points up, is none: that of an image points down.
+        InputError: If a value is not a finite number in its range. Focal lengths are positive: a negative ``fy``, as
+            published with ICL-NUIM, describes a y axis that points up.
     """
 
     fx: float
@@ -62,10 +70,10 @@ class PinholeCamera:
                     raise InputError(f"the camera's {name} is {given!r}; give whole pixels")
                 value = int(value)
             object.__setattr__(self, name, value)
-        lens = [to_float(value) for value in np.ravel(self.distortion)]
-        if not all(map(math.isfinite, lens)):
+        coefficients = [to_float(value) for value in np.ravel(self.distortion)]
+        if not all(map(math.isfinite, coefficients)):
             raise InputError(f"the camera's distortion is {self.distortion!r}; give the numbers k1, k2, p1, p2, k3")
-        object.__setattr__(self, "distortion", (*lens, *[0.0] * (5 - len(lens))))
+        object.__setattr__(self, "distortion", (*coefficients, *[0.0] * (5 - len(coefficients))))
         if self.readout is not None:
             readout = to_float(self.readout)
             if not abs(readout) <= MAX_READOUT:
@@ -73,7 +81,7 @@ class PinholeCamera:
             object.__setattr__(self, "readout", readout)
 
     def __getstate__(self) -> dict[str, object]:
-        """What it is made of: what is cached follows from that, and takes megabytes."""
+        """Fields without the cached tensors, which follow from them and take megabytes."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -81,115 +89,123 @@ class PinholeCamera:
         """Camera matrix, float64, shape :math:`(3, 3)`."""
         return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
-    @property
-    def is_distorted(self) -> bool:
-        """Whether the lens bends rays at all."""
-        return any(self.distortion)
-
-    def undistort(self, uv: Tensor) -> Tensor:
-        """Pixels of the image as delivered to pixels of an ideal pinhole camera with the same ``K``.
-
-        Args:
-            uv: shape :math:`(N, 2)`, floating point.
-
-        Returns:
-            Shape :math:`(N, 2)`, float64, without gradients.
-        """
-        uv = uv.to(torch.float64)
-        if not self.is_distorted or uv.shape[0] == 0:
-            return uv
-        # With the strong lens of TUM's fr1 the corners need up to 20 steps, and a millionth of a pixel is enough.
-        until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
-        lens = np.array(self.distortion)
-        return torch.from_numpy(cv2.undistortImagePoints(uv.numpy(), self.K.numpy(), lens, None, until)).view_as(uv)
-
-    def distort(self, uv: Tensor) -> Tensor:
-        """Pixels of an ideal pinhole camera to pixels of the image as delivered: the inverse of `undistort`.
-
-        Args:
-            uv: shape :math:`(N, 2)`, floating point.
-
-        Returns:
-            Shape :math:`(N, 2)`, float64.
-        """
-        return self._image(self.slopes(uv)) if self.is_distorted else uv.to(torch.float64)
-
-    def slopes(self, uv: Tensor) -> Tensor:
-        """Directions (x / z, y / z) through pixels of an ideal pinhole camera, :math:`(N, 2)`, float64 both ways."""
-        return (uv.to(torch.float64) - self._centre) / self.focal
-
     @cached_property
-    def focal(self) -> Tensor:
+    def focal_lengths(self) -> Tensor:
         """Focal lengths along u and v, pixels, float64, shape :math:`(2,)`."""
         return torch.tensor([self.fx, self.fy], dtype=torch.float64)
 
     @cached_property
-    def _centre(self) -> Tensor:
-        """Principal point, pixels, float64, shape (2,)."""
+    def _principal_point(self) -> Tensor:
+        """Principal point (u, v), pixels, float64, shape (2,)."""
         return torch.tensor([self.cx, self.cy], dtype=torch.float64)
-
-    def _image(self, slope: Tensor) -> Tensor:
-        """Directions (x / z, y / z) to pixels as delivered, by the Brown model, both (N, 2) and float64."""
-        if self.is_distorted:
-            k1, k2, p1, p2, k3 = self.distortion
-            tangential = slope.new_tensor([p2, p1])
-            square = slope.square().sum(dim=1, keepdim=True)
-            radial = 1 + square * (k1 + square * (k2 + square * k3))
-            slope = slope * (radial + 2 * (slope @ tangential)[:, None]) + square * tangential
-        return slope * self.focal + self._centre
-
-    def project(self, points: Tensor) -> Tensor:
-        """Points in the camera frame to undistorted pixels.
-
-        Args:
-            points: metres, shape :math:`(..., 3)`; z must not be 0.
-
-        Returns:
-            (u, v), shape :math:`(..., 2)`.
-        """
-        u = self.fx * points[..., 0] / points[..., 2] + self.cx
-        v = self.fy * points[..., 1] / points[..., 2] + self.cy
-        return torch.stack([u, v], dim=-1)
-
-    @cached_property
-    def _field(self) -> Tensor:
-        """Least and greatest x / z and y / z of all that is in the image, with a pixel to spare, shape (2, 2)."""
-        ends = self.rays[..., :2].flatten(0, 1).to(torch.float64).aminmax(dim=0)
-        pixel = torch.tensor([1 / self.fx, 1 / self.fy], dtype=torch.float64)
-        return torch.stack([ends.min - pixel, ends.max + pixel])
-
-    def locate(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
-        """Pixels of points in the image as delivered, and whether they are before the camera and in its field.
-
-        A lens' polynomial maps some of what lies far outside of the image into it: such points are not in the field.
-
-        Args:
-            points: camera frame, metres, shape :math:`(P, 3)`.
-            min_depth: nearer points are not seen, metres.
-
-        Returns:
-            (u, v), float64, shape :math:`(P, 2)`, and bool, shape :math:`(P,)`.
-        """
-        slope = points[:, :2] / points[:, 2:]
-        low, high = self._field
-        seen = (points[:, 2] > min_depth) & ((slope >= low) & (slope <= high)).all(dim=1)
-        pixels = self._image(torch.where(seen[:, None], slope, 0.0).to(torch.float64))
-        return pixels, seen & ((pixels >= -0.5) & (pixels < self._size - 0.5)).all(dim=1)
 
     @cached_property
     def _size(self) -> Tensor:
         """Width and height, pixels, float64, shape (2,)."""
         return torch.tensor([self.width, self.height], dtype=torch.float64)
 
-    def back_project(self, uv: Tensor, depth: Tensor) -> Tensor:
-        """Undistorted pixels with their depth to points in the camera frame.
+    @property
+    def is_distorted(self) -> bool:
+        """True if any distortion coefficient is not 0."""
+        return any(self.distortion)
+
+    def undistort(self, uv: Tensor) -> Tensor:
+        """Map distorted pixels to undistorted pixels.
 
         Args:
-            uv: shape :math:`(..., 2)`.
-            depth: metres along z, shape :math:`(...)`.
+            uv: Pixels in the recorded image, floating point, shape :math:`(N, 2)`.
 
         Returns:
-            Shape :math:`(..., 3)`, metres.
+            Pixels of an ideal pinhole camera with the same ``K``, float64, shape :math:`(N, 2)`, without gradients.
+        """
+        uv = uv.to(torch.float64)
+        if not self.is_distorted or uv.shape[0] == 0:
+            return uv
+        K, coefficients = self.K.numpy(), np.array(self.distortion)
+        pixels = cv2.undistortImagePoints(uv.numpy(), K, coefficients, None, _UNDISTORT_CRITERIA)
+        return torch.from_numpy(pixels).view_as(uv)
+
+    def distort(self, uv: Tensor) -> Tensor:
+        """Map undistorted pixels to distorted pixels; the inverse of `undistort`.
+
+        Args:
+            uv: Pixels of an ideal pinhole camera, floating point, shape :math:`(N, 2)`.
+
+        Returns:
+            Pixels in the recorded image, float64, shape :math:`(N, 2)`.
+        """
+        return self._project_normalised(self.normalise(uv)) if self.is_distorted else uv.to(torch.float64)
+
+    def normalise(self, uv: Tensor) -> Tensor:
+        """Normalised image coordinates (x / z, y / z) of undistorted pixels.
+
+        Args:
+            uv: Undistorted pixels, shape :math:`(N, 2)`.
+
+        Returns:
+            Float64, shape :math:`(N, 2)`.
+        """
+        return (uv.to(torch.float64) - self._principal_point) / self.focal_lengths
+
+    def _project_normalised(self, xy: Tensor) -> Tensor:
+        """Distorted pixels at normalised image coordinates, by the Brown-Conrady model, both (N, 2) and float64."""
+        if self.is_distorted:
+            k1, k2, p1, p2, k3 = self.distortion
+            tangential = xy.new_tensor([p2, p1])
+            r2 = xy.square().sum(dim=1, keepdim=True)
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            xy = xy * (radial + 2 * (xy @ tangential)[:, None]) + r2 * tangential
+        return xy * self.focal_lengths + self._principal_point
+
+    def project(self, points: Tensor) -> Tensor:
+        r"""Project points to undistorted pixels: :math:`u = f_x x / z + c_x,\; v = f_y y / z + c_y`.
+
+        Args:
+            points: Points in the camera frame, metres, shape :math:`(..., 3)`; z must not be 0.
+
+        Returns:
+            Undistorted pixels (u, v), shape :math:`(..., 2)`.
+        """
+        u = self.fx * points[..., 0] / points[..., 2] + self.cx
+        v = self.fy * points[..., 1] / points[..., 2] + self.cy
+        return torch.stack([u, v], dim=-1)
+
+    @cached_property
+    def _normalised_bounds(self) -> Tensor:
+        """Minimum and maximum (x / z, y / z) of the image, with a margin of one pixel, shape (2, 2)."""
+        extremes = self.rays[..., :2].flatten(0, 1).to(torch.float64).aminmax(dim=0)
+        pixel = torch.tensor([1 / self.fx, 1 / self.fy], dtype=torch.float64)
+        return torch.stack([extremes.min - pixel, extremes.max + pixel])
+
+    def locate(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
+        """Project points to distorted pixels and check which of them lie in the image.
+
+        Points outside the field of view are rejected before distortion, because the distortion polynomial maps some of
+        them back into the image.
+
+        Args:
+            points: Points in the camera frame, metres, shape :math:`(P, 3)`.
+            min_depth: Points with a depth up to this are not in the image, metres.
+
+        Returns:
+            Distorted pixels (u, v), float64, shape :math:`(P, 2)`, and a mask of the points in the image, bool, shape
+            :math:`(P,)`. Pixels of points outside the mask are meaningless.
+        """
+        xy = points[:, :2] / points[:, 2:]
+        low, high = self._normalised_bounds
+        in_view = (points[:, 2] > min_depth) & ((xy >= low) & (xy <= high)).all(dim=1)
+        pixels = self._project_normalised(torch.where(in_view[:, None], xy, 0.0).to(torch.float64))
+        return pixels, in_view & ((pixels >= -0.5) & (pixels < self._size - 0.5)).all(dim=1)
+
+    def back_project(self, uv: Tensor, depth: Tensor) -> Tensor:
+        r"""Back-project undistorted pixels: :math:`x = (u - c_x) z / f_x,\; y = (v - c_y) z / f_y`.
+
+        Args:
+            uv: Undistorted pixels, shape :math:`(..., 2)`.
+            depth: Depth along z, metres, shape :math:`(...)`.
+
+        Returns:
+            Points in the camera frame, metres, shape :math:`(..., 3)`.
         """
         x = (uv[..., 0] - self.cx) / self.fx
         y = (uv[..., 1] - self.cy) / self.fy
@@ -197,7 +213,7 @@ class PinholeCamera:
 
     @cached_property
     def rays(self) -> Tensor:
-        """Direction through every pixel at unit depth, undistorted, float32, shape :math:`(H, W, 3)`."""
+        """Viewing ray of every pixel of the recorded image at unit depth, float32, shape :math:`(H, W, 3)`."""
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=torch.float64),
             torch.arange(self.width, dtype=torch.float64),
@@ -209,16 +225,16 @@ class PinholeCamera:
 
 
 def back_project(depth: Tensor, rays: Tensor) -> Tensor:
-    r"""Depth image to a point per pixel: :math:`x = (u - c_x) z / f_x,\; y = (v - c_y) z / f_y` (paper, Sec. III-B.1).
+    r"""Back-project a depth image: :math:`x = (u - c_x) z / f_x,\; y = (v - c_y) z / f_y` (paper, Sec. III-B.1).
 
     Args:
-        depth: metres along z, float32 or float64, shape :math:`(B, 1, H, W)`; 0 = no measurement.
-        rays: direction through every pixel at unit depth, shape :math:`(H, W, 3)`, or :math:`(B, H, W, 3)` for a camera
-            each; see `PinholeCamera.rays`.
+        depth: Depth along z, metres, float32 or float64, shape :math:`(B, 1, H, W)`; 0 = no measurement.
+        rays: Viewing ray of every pixel at unit depth, shape :math:`(H, W, 3)`, or :math:`(B, H, W, 3)` for one camera
+            per image; see `PinholeCamera.rays`.
 
     Returns:
-        Points in the camera frame, metres, dtype of ``depth``, shape :math:`(B, H, W, 3)`; (0, 0, 0) where there is no
-        depth. Differentiable in ``depth`` and, for cameras that are learnt, in ``rays``.
+        Points in the camera frame, metres, dtype of ``depth``, shape :math:`(B, H, W, 3)`; (0, 0, 0) for pixels without
+        depth. Differentiable in ``depth`` and ``rays``.
     """
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     KORNIA_CHECK_SHAPE(rays, ["*", *map(str, depth.shape[2:]), "3"])
@@ -226,10 +242,10 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
 
 
 class BackProjector(torch.nn.Module):
-    """:func:`back_project` as a module.
+    """Back-projection of depth images as a module; see :func:`back_project`.
 
     Args:
-        camera: gives the ray of each pixel, lens distortion included.
+        camera: Camera of the depth images; lens distortion is taken into account.
     """
 
     def __init__(self, camera: PinholeCamera) -> None:

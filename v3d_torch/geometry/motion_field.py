@@ -1,4 +1,13 @@
-"""How the image of a camera in motion moves.
+r"""Motion field: image velocity of points seen by a moving camera.
+
+A point with normalised image coordinates :math:`(x, y)` and inverse depth :math:`w` that moves in the camera frame by
+the twist :math:`(v, \omega)`, that is :math:`\dot p = v + \omega \times p`, has
+
+.. math::
+    \dot x = w v_x + \omega_y - \omega_z y - x s, \qquad
+    \dot y = w v_y + \omega_z x - \omega_x - y s, \qquad
+    \dot w = -w s, \qquad
+    s = \dot z / z = w v_z + \omega_x y - \omega_y x
 
 Longuet-Higgins and Prazdny, The interpretation of a moving retinal image, Proceedings of the Royal Society B, 1980.
 """
@@ -9,22 +18,25 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import twist
+from v3d_torch.geometry.se3 import hat
 
 
 def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
-    """Speed of what is seen at some pixels.
+    """Velocity of pixels and of their inverse depth, for static points in front of a moving camera.
 
     Args:
-        uv: undistorted pixels, float64, shape :math:`(N, 2)`.
-        inverse_depth: there, 1/m, float64, shape :math:`(N,)`; 0 is far away, which moves by the rotation alone.
-        velocity: of the points in the camera, twist per second, float64, shape :math:`(6,)`.
-        camera: intrinsics.
+        uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
+        inverse_depth: Inverse depth of each pixel, 1/m, float64, shape :math:`(N,)`; 0 = infinitely far, such a point
+            moves by the rotation alone.
+        velocity: Twist per second ``[m/s, rad/s]`` by which the points move in the camera frame, float64, shape
+            :math:`(6,)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
+        camera: Intrinsics.
 
     Returns:
-        Pixels per second, shape :math:`(N, 2)`, and the change of inverse depth, 1/m per second, shape :math:`(N,)`.
+        Pixel velocity, pixels per second, shape :math:`(N, 2)`, and the rate of inverse depth, 1/m per second, shape
+        :math:`(N,)`.
     """
-    slopes = camera.slopes(uv).T
-    # How points move for each metre of their depth: they are (x / z, y / z, 1, 1 / z) in such units.
-    moves = twist(velocity)[:3] @ torch.cat([slopes, torch.ones_like(inverse_depth)[None], inverse_depth[None]])
-    return (moves[:2] - moves[2] * slopes).T * camera.focal, -moves[2] * inverse_depth
+    xy = camera.normalise(uv).T
+    # Velocity of the points divided by their depth; in these units the points are (x / z, y / z, 1, 1 / z).
+    relative = hat(velocity)[:3] @ torch.cat([xy, torch.ones_like(inverse_depth)[None], inverse_depth[None]])
+    return (relative[:2] - relative[2] * xy).T * camera.focal_lengths, -relative[2] * inverse_depth

@@ -1,4 +1,4 @@
-"""Normals of the surfaces that depth images show."""
+"""Surface normals of organised point clouds."""
 
 from __future__ import annotations
 
@@ -9,39 +9,43 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import pad
 
+_EPS = 1e-30  # keeps the division by a norm finite
 
-def surface_normals(points: Tensor, radius: int = 4, edge: float = 0.05) -> Tensor:
-    """Cross products of the differences between a pixel's neighbours, averaged over a window.
 
-    It is the cross products that are averaged: a window may be cut by an edge, and a plane still comes out as a plane,
-    which an average of depth would bend there.
+def surface_normals(points: Tensor, radius: int = 4, edge_ratio: float = 0.05) -> Tensor:
+    """Estimate normals by averaging cross products of neighbour differences over a window.
+
+    The average is over cross products, not over depth: a window that is cut by a depth edge still gives the normal of a
+    plane exactly, while averaged depth would bend the plane there.
 
     Args:
-        points: camera frame, metres, a point per pixel, z = 0 where there is none, shape :math:`(B, H, W, 3)`.
-        radius: half the side of the window, of which every other row and column takes part, pixels.
-        edge: a pixel whose depth differs by more than this share of another's lies on another surface.
+        points: Points in the camera frame, metres, one per pixel, shape :math:`(B, H, W, 3)`; z = 0 for pixels without
+            measurement.
+        radius: Half the side of the window, pixels; every other row and column of the window is used.
+        edge_ratio: Pixels whose depths differ by more than this fraction lie on different surfaces.
 
     Returns:
-        Unit vectors that point to the side of the camera, shape and dtype of ``points``; (0, 0, 0) where not all four
-        neighbours are measured and on the pixel's surface.
+        Unit normals towards the camera, shape and dtype of ``points``; (0, 0, 0) unless the pixel and its four
+        neighbours are measured and lie on one surface.
     """
     KORNIA_CHECK_SHAPE(points, ["B", "H", "W", "3"])
     z = points[..., 2]
-    right, left, below, above = (_shifted(points, *step) for step in ((0, 1), (0, -1), (1, 0), (-1, 0)))
-    near = [(side[..., 2] > 0) & ((side[..., 2] - z).abs() <= edge * z) for side in (right, left, below, above)]
-    known = torch.stack([z > 0, *near]).all(dim=0)[..., None]
-    products = torch.where(known, torch.linalg.cross(below - above, right - left), 0.0)  # x right, y down: to -z
+    right, left, below, above = (_shift(points, *offset) for offset in ((0, 1), (0, -1), (1, 0), (-1, 0)))
+    near = [(side[..., 2] > 0) & ((side[..., 2] - z).abs() <= edge_ratio * z) for side in (right, left, below, above)]
+    valid = torch.stack([z > 0, *near]).all(dim=0)[..., None]
+    # With x right and y down, this order makes the normals point towards the camera (-z).
+    products = torch.where(valid, torch.linalg.cross(below - above, right - left), 0.0)
     steps = range(-radius, radius + 1, 2) if radius else (0,)
     total = torch.zeros_like(products)
-    for step in product(steps, steps):
-        same = (_shifted(z[..., None], *step) - z[..., None]).abs() <= edge * z[..., None]
-        total += same * _shifted(products, *step)
-    return torch.where(known, total / total.norm(dim=-1, keepdim=True).clamp(min=1e-30), 0.0)
+    for offset in product(steps, steps):
+        same_surface = (_shift(z[..., None], *offset) - z[..., None]).abs() <= edge_ratio * z[..., None]
+        total += same_surface * _shift(products, *offset)
+    return torch.where(valid, total / total.norm(dim=-1, keepdim=True).clamp(min=_EPS), 0.0)
 
 
-def _shifted(images: Tensor, rows: int, columns: int) -> Tensor:
-    """Images whose pixel (v, u) is what was (v + rows, u + columns), 0 beyond the border, (B, H, W, C)."""
+def _shift(images: Tensor, rows: int, columns: int) -> Tensor:
+    """Images (B, H, W, C) whose pixel (v, u) is the input's (v + rows, u + columns), 0 beyond the border."""
     height, width = images.shape[1:3]
-    reach = max(abs(rows), abs(columns))
-    padded = pad(images, (0, 0, reach, reach, reach, reach))
-    return padded[:, reach + rows : reach + rows + height, reach + columns : reach + columns + width]
+    margin = max(abs(rows), abs(columns))
+    padded = pad(images, (0, 0, margin, margin, margin, margin))
+    return padded[:, margin + rows : margin + rows + height, margin + columns : margin + columns + width]

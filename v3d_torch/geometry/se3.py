@@ -1,8 +1,10 @@
-"""Rigid motions as 4x4 matrices: exponential, logarithm, inverse (Sola et al., A micro Lie theory, 2018).
+"""SE(3) as 4x4 matrices: exponential, logarithm, inverse.
 
-Convention: a tangent vector is ``[translation, rotation]``, metres and radians, as PyPose orders se(3). Everything is
-batched over leading dimensions, differentiable, and meant for float64. PyPose computes the same; these work on plain
-matrices, in a tenth of the time for a single pose.
+Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
+All functions are batched over leading dimensions, differentiable, and meant for float64. They compute the same as
+PyPose but on plain matrices, which is faster for single poses.
+
+Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018.
 """
 
 from __future__ import annotations
@@ -10,15 +12,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Row k is the derivative of se3_exp by xi[k] at 0: its 4x4 matrix, flattened.
+# Generators of se(3): row k is the derivative of se3_exp by xi[k] at 0, a flattened 4x4 matrix.
 _GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
 _GENERATORS[(0, 1, 2), (0, 1, 2), 3] = 1.0
 _GENERATORS[(3, 4, 5), (2, 0, 1), (1, 2, 0)] = 1.0
 _GENERATORS[(3, 4, 5), (1, 2, 0), (2, 0, 1)] = -1.0
 _GENERATORS = _GENERATORS.flatten(1)
 
-# 4 q q^T of the quaternion q = (w, x, y, z) of a rotation, less the identity, is made of its nine numbers, row by row.
-_SQUARES = torch.tensor(
+# Linear map from a flattened rotation matrix R to 4 q q^T - I, flattened, with q = (w, x, y, z) the quaternion of R.
+_QUATERNION_PRODUCTS = torch.tensor(
     [
         [1, 0, 0, 0, 1, 0, 0, 0, 1],  # ww
         [0, 0, 0, 0, 0, -1, 0, 1, 0],  # wx
@@ -40,44 +42,56 @@ _SQUARES = torch.tensor(
     dtype=torch.float64,
 ).T
 
-_SMALL = 1e-4  # angle below which the limits of the closed forms are exact to float64
-_TINY = _SMALL**2
+_SMALL_ANGLE = 1e-4
+"""Rotation angle in radians below which the limits of the closed forms are exact to float64."""
+
+_SMALL_ANGLE_SQUARED = _SMALL_ANGLE**2
 
 
 def invert(T: Tensor) -> Tensor:
-    """Inverse of rigid motions, shape :math:`(..., 4, 4)`: ``invert(T_wc)`` is ``T_cw``."""
+    """Invert rigid motions, shape :math:`(..., 4, 4)`: ``invert(T_wc)`` is ``T_cw``."""
     R = T[..., :3, :3].mT
-    return _motion(R, -(R @ T[..., :3, 3:]))
+    return _assemble(R, -(R @ T[..., :3, 3:]))
 
 
 def rigid(T: Tensor) -> Tensor:
-    """The rigid motions nearest to matrices that rounding has bent, shape :math:`(..., 4, 4)`.
+    """Replace rotations by the nearest orthonormal matrices.
 
-    `invert` takes rotations for orthonormal, so that a chain of products and inverses doubles its rounding error at
-    each link: a pose that is kept is put right first. The last row becomes (0, 0, 0, 1), whatever it was.
+    `invert` assumes orthonormal rotations, so a chain of products and inverses doubles its rounding error with each
+    step. Poses are therefore orthonormalised before they are stored.
+
+    Args:
+        T: Rigid motions with rounding errors, shape :math:`(..., 4, 4)`.
+
+    Returns:
+        Rigid motions, shape :math:`(..., 4, 4)`, with (0, 0, 0, 1) as last row.
     """
     U, _, Vh = torch.linalg.svd(T[..., :3, :3])
-    return _motion(U @ Vh, T[..., :3, 3:])
+    return _assemble(U @ Vh, T[..., :3, 3:])
 
 
-def _motion(R: Tensor, t: Tensor) -> Tensor:
-    """Rotations (..., 3, 3) and translations (..., 3, 1) as one. The last row is exact: its error would double, too."""
+def _assemble(R: Tensor, t: Tensor) -> Tensor:
+    """Matrices (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3, 1), with an exact last row."""
     last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*R.shape[:-2], 1, 4)
     return torch.cat([torch.cat([R, t], dim=-1), last], dim=-2)
 
 
 def se3_exp(xi: Tensor) -> Tensor:
-    """Exponential map: the matrix exponential of its `twist`, by its closed form.
+    r"""Exponential map of SE(3): the matrix exponential of :math:`\hat\xi`, in closed form.
+
+    .. math::
+        \exp \hat\xi = I + \hat\xi + \frac{1 - \cos\theta}{\theta^2} \hat\xi^2
+            + \frac{\theta - \sin\theta}{\theta^3} \hat\xi^3, \qquad \theta = \|\phi\|, \quad \xi = [\rho, \phi]
 
     Args:
-        xi: ``[translation, rotation]``, shape :math:`(..., 6)`; rotations by any angle.
+        xi: Tangent vectors ``[translation, rotation]``, shape :math:`(..., 6)`; any rotation angle.
 
     Returns:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
-    X = twist(xi)
-    # Below, the coefficients are multiplied by next to nothing: those of a small angle are exact enough at any smaller.
-    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL)
+    X = hat(xi)
+    # The coefficients hardly change below the small angle, and higher powers of the angle multiply them there.
+    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL_ANGLE)
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
     X2 = X @ X
@@ -85,40 +99,49 @@ def se3_exp(xi: Tensor) -> Tensor:
 
 
 def se3_log(T: Tensor) -> Tensor:
-    """Logarithm, the inverse of `se3_exp`.
+    """Logarithm of SE(3), the inverse of `se3_exp`.
 
     Args:
-        T: rigid motions, shape :math:`(..., 4, 4)`.
+        T: Rigid motions, shape :math:`(..., 4, 4)`.
 
     Returns:
-        ``[translation, rotation]``, shape :math:`(..., 6)`, the rotation by an angle in [0, pi].
+        Tangent vectors ``[translation, rotation]``, shape :math:`(..., 6)`, with a rotation angle in [0, pi].
     """
     phi = _so3_log(T[..., :3, :3])
     square = (phi * phi).sum(dim=-1)[..., None, None]
-    # torch.where evaluates both branches: the 1 keeps the one not taken, and its gradient, finite.
-    safe = torch.where(square < _TINY, 1.0, square)
+    # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.
+    is_small = square < _SMALL_ANGLE_SQUARED
+    safe = torch.where(is_small, 1.0, square)
     half = safe.sqrt() / 2
-    c = torch.where(square < _TINY, 1 / 12, (1 - half / half.tan()) / safe)
-    K = twist(torch.cat([phi, phi], dim=-1))[..., :3, :3]
+    c = torch.where(is_small, 1 / 12, (1 - half / half.tan()) / safe)
+    K = hat(torch.cat([phi, phi], dim=-1))[..., :3, :3]
     t = T[..., :3, 3:]
     rho = t - 0.5 * (K @ t) + c * (K @ (K @ t))
     return torch.cat([rho[..., 0], phi], dim=-1)
 
 
-def twist(xi: Tensor) -> Tensor:
-    """Tangent vectors as matrices, ``[[rotation x, translation], [0, 0]]``, :math:`(..., 6)` to :math:`(..., 4, 4)`."""
+def hat(xi: Tensor) -> Tensor:
+    r"""Hat operator of se(3): tangent vectors as matrices.
+
+    Args:
+        xi: Tangent vectors :math:`[\rho, \phi]`, shape :math:`(..., 6)`.
+
+    Returns:
+        Matrices :math:`\begin{pmatrix} [\phi]_\times & \rho \\ 0 & 0 \end{pmatrix}`, shape :math:`(..., 4, 4)`.
+    """
     return (xi @ _GENERATORS.to(xi.dtype)).unflatten(-1, (4, 4))
 
 
 def _so3_log(R: Tensor) -> Tensor:
-    """Rotation vectors, :math:`(..., 3, 3)` to :math:`(..., 3)`, by way of quaternions: well conditioned up to pi."""
-    # The sixteen numbers 4 q q^T of the quaternion q = (w, x, y, z): each row a multiple of q, the longest the safest.
-    rows = (R.flatten(-2) @ _SQUARES.to(R.dtype)).unflatten(-1, (4, 4)) + torch.eye(4, dtype=R.dtype)
+    """Rotation vectors (..., 3) of rotations (..., 3, 3), by way of quaternions: well conditioned up to pi."""
+    # Each row of 4 q q^T is a multiple of the quaternion q; the longest row has the smallest relative error.
+    rows = (R.flatten(-2) @ _QUATERNION_PRODUCTS.to(R.dtype)).unflatten(-1, (4, 4)) + torch.eye(4, dtype=R.dtype)
     longest = rows.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
     q = torch.take_along_dim(rows, longest[..., None, None], dim=-2)[..., 0, :]
     q = q / q.norm(dim=-1, keepdim=True)
-    q = torch.where(q[..., :1] < 0, -q, q)  # q and -q are one rotation; this one turns by at most pi
+    q = torch.where(q[..., :1] < 0, -q, q)  # q and -q are the same rotation; w >= 0 gives an angle of at most pi
     w, v = q[..., :1], q[..., 1:]
     square = (v * v).sum(dim=-1, keepdim=True)
-    sine = torch.where(square < _TINY, 1.0, square).sqrt()
-    return v * torch.where(square < _TINY, 2 / w.clamp(min=0.5) * (1 - square / 3), 2 * torch.atan2(sine, w) / sine)
+    is_small = square < _SMALL_ANGLE_SQUARED
+    sine = torch.where(is_small, 1.0, square).sqrt()
+    return v * torch.where(is_small, 2 / w.clamp(min=0.5) * (1 - square / 3), 2 * torch.atan2(sine, w) / sine)

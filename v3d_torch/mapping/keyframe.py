@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 
 
 @dataclass

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import measurements
+from v3d_torch.features.features import measurements
 from v3d_torch.features.projection_matcher import ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.keyframe import Keyframe

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import pixel_sigma
+from v3d_torch.features.features import pixel_sigma
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import rigid
 from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust

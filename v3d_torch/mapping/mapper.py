@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_fusion import LandmarkFusion

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, MappingConfig
-from v3d_torch.features.orb import Features, select_evenly
+from v3d_torch.features.features import Features, select_evenly
 from v3d_torch.features.projection_matcher import LocalMap
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, rigid

@@ -1,1 +1,1 @@
-"""The camera stage: features, matching, RANSAC, pose (paper, Sec. III-E)."""
+"""Odometry: camera motion between two frames, rolling shutter, depth delay (paper, Sec. III-E)."""

@@ -1,9 +1,9 @@
-"""Camera motion between two frames from all their pixels: for blur, low light and few corners, where features fail.
+"""Dense RGB-D alignment: camera motion from all pixels, for blur, low light and few corners, where features fail.
 
-Brightness and inverse depth are two images that the same motion warps. Both differences are minimised together, coarse
-to fine, with the weights of a t-distribution, after Kerl, Sturm and Cremers (Robust Odometry Estimation for RGB-D
-Cameras, ICRA 2013; Dense Visual SLAM for RGB-D Cameras, IROS 2013). Inverse depth is linear over a plane, so that its
-difference is a point's distance to the other view's plane in standard deviations of the sensor (point-to-plane).
+Brightness and inverse depth are two images that the same motion warps. Both residuals are minimised together, coarse to
+fine, with the weights of a t-distribution (Kerl, Sturm and Cremers: Robust Odometry Estimation for RGB-D Cameras, ICRA
+2013; Dense Visual SLAM for RGB-D Cameras, IROS 2013). The inverse depth of a plane is linear in the image, so the
+whitened residual is a point-to-plane distance in units of the sensor noise.
 """
 
 from __future__ import annotations
@@ -18,27 +18,42 @@ from torch import Tensor
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, rigid
-from v3d_torch.odometry.dense_problem import Problem, State, System, step
-from v3d_torch.odometry.dense_view import DenseView, Lens
-from v3d_torch.optim.levenberg_marquardt import Minimum, levenberg_marquardt
+from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
+from v3d_torch.odometry.dense_view import DenseView, LevelCamera
+from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_marquardt
+
+_COARSE_INVERSE_DEPTH_SIGMA = 0.02
+"""Minimum standard deviation of inverse depth above the finest level, 1/m. It gives brightness more weight there: depth
+is measured at another time than colour, so in a fast turn its residuals have their optimum at another motion."""
+
+_MIN_INLIER_RATIO = 0.75
+"""Minimum fraction of the points with depth in both views whose depth agrees."""
+
+_MIN_CORRELATION = 0.9
+"""Minimum correlation of the brightness of both views. Unlike a residual, it does not depend on exposure."""
+
+_TOLERANCE = 1e-3
+"""Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
 
 
 @dataclass(frozen=True)
 class DenseAlignment:
-    """A motion between two views, and what supports it.
+    """Motion between two views found by dense alignment, with measures of its quality.
 
     Attributes:
-        T_ba: maps points of the reference's camera a to the current camera b, float64, shape :math:`(4, 4)`.
-        overlap: share of the reference's points that the current view sees on what stands still.
-        inliers: points whose depth agrees in both views.
-        inlier_share: of the points whose depth both views measure.
-        correlation: of both views' brightness at the same points, from -1 to 1.
-        photometric_rms: difference of brightness after gain and bias, in units of the current image.
-        geometric_rms: difference of inverse depth, 1/m.
-        information: inverse covariance of the left perturbation ``exp(xi) @ T_ba``, ``xi = [translation, rotation]``
-            in metres and radians, gain and bias marginalised, float64, shape :math:`(6, 6)`. Pixels count as
-            independent, which neighbours are not: right in shape, too sure in scale.
-        observability: its smallest over its greatest eigenvalue, translation measured in median depths.
+        T_ba: Maps points from the reference's camera a to the current camera b, float64, shape :math:`(4, 4)`.
+        overlap: Fraction of the reference points that lie on static pixels of the current view.
+        inliers: Number of points whose depth agrees in both views.
+        inlier_ratio: Inliers as a fraction of the points with depth in both views.
+        correlation: Correlation of the brightness of both views at the same points, from -1 to 1.
+        photometric_rms: Root mean square of the brightness residuals after gain and bias, in brightness of the current
+            image.
+        geometric_rms: Root mean square of the inverse-depth residuals, 1/m.
+        information: Information matrix (inverse covariance) of the left perturbation ``exp(xi) @ T_ba``,
+            ``xi = [translation, rotation]``, metres and radians, with gain and bias marginalised, float64, shape
+            :math:`(6, 6)`. It treats pixels as independent, so its scale is too large.
+        observability: Ratio of the smallest to the largest eigenvalue of the information, with translation in units of
+            the median depth.
     """
 
     T_ba: Tensor
@@ -53,101 +68,108 @@ class DenseAlignment:
 
 
 class DenseAligner:
-    """Finds the motion between two views from what stands still in both.
+    """Estimates the motion between two views from their static pixels.
 
     Args:
-        config: levels, noise, and what is trusted.
-        camera: of both views, with its lens. Levels of which its image leaves less than 2 pixels are left out.
+        config: Pyramid levels, noise, acceptance thresholds.
+        camera: Camera of both views, with lens distortion. Levels with fewer than 2 rows or columns are skipped.
     """
 
-    _LEAST_CONTRAST = 2e-3  # standard deviation of a coarse image that shows anything: half a step of 8 bits
-    _AGREEMENT = 5.0  # least sigmas of inverse depth within which depth agrees: time lag and edges make long tails
+    _MIN_CONTRAST = 2e-3
+    """Minimum standard deviation of brightness on the coarsest level: half an 8-bit step."""
+
+    _MAX_DEPTH_SIGMAS = 5.0
+    """Depth agrees up to this many standard deviations of inverse depth: colour-depth delay and depth edges make the
+    residuals heavy-tailed."""
 
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
         size = min(camera.width, camera.height)
         self._config = config
         self._halvings = tuple(halvings for halvings in config.halvings if size >= 2 << halvings) or (0,)
-        self._lenses = {halvings: Lens.of(camera, halvings) for halvings in self._halvings}
+        self._cameras = {halvings: LevelCamera.from_camera(camera, halvings) for halvings in self._halvings}
 
     def view(self, grey: Tensor, depth: Tensor, static: Tensor) -> DenseView:
-        """Prepare a frame; see `DenseView`."""
-        return DenseView(grey, depth, static, self._lenses, self._config)
+        """Prepare a frame for alignment; see `DenseView`."""
+        return DenseView(grey, depth, static, self._cameras, self._config)
 
     @torch.no_grad()
     def __call__(self, a: DenseView, b: DenseView, T_ba: Tensor) -> DenseAlignment | None:
-        """Motion from a reference to the current view.
+        """Estimate the motion from the reference view a to the current view b.
 
         Args:
-            a: reference; its points with depth take part.
-            b: current view.
-            T_ba: prediction, float64, shape :math:`(4, 4)`.
+            a: Reference view; its points with depth are aligned.
+            b: Current view.
+            T_ba: Predicted motion, float64, shape :math:`(4, 4)`.
 
         Returns:
-            None when the motion is not to be trusted: there is nothing to see, too little of the reference is in view,
-            a direction of motion cannot be observed, or the views disagree at the optimum.
+            None if the result is not reliable: an image has no contrast, the overlap is too small, a direction of
+            motion is not observable, or the views disagree at the optimum.
         """
-        found = self._align(a, b, T_ba)
-        return found if found is not None and self._trusts(found) else None
+        alignment = self._align(a, b, T_ba)
+        return alignment if alignment is not None and self._is_reliable(alignment) else None
 
     def _align(self, a: DenseView, b: DenseView, T_ba: Tensor) -> DenseAlignment | None:
         *_, finest = self._halvings
-        light = self._light(a, b)
-        if light is None or not T_ba.isfinite().all() or not len(a.levels[finest].anchors.points):
+        gain_and_bias = self._initial_gain_and_bias(a, b)
+        if gain_and_bias is None or not T_ba.isfinite().all() or not len(a.levels[finest].reference_points.points):
             return None
-        state = (T_ba, light)
+        state = (T_ba, gain_and_bias)
         for halvings in self._halvings:
-            sigma = self._config.inverse_depth_sigma if halvings == finest else self._config.coarse_inverse_depth_sigma
-            problem = Problem(a.levels[halvings], b.levels[halvings], state, sigma, self._config)
-            # Convergence is quadratic: after a step that gained a thousandth nothing worth a step is left.
-            found = levenberg_marquardt(state, problem.linearise, step, self._config.iterations, tolerance=1e-3)
-            state = found.state
-        return self._summarise(problem, found)
+            sigma = self._config.inverse_depth_sigma if halvings == finest else _COARSE_INVERSE_DEPTH_SIGMA
+            problem = AlignmentProblem(a.levels[halvings], b.levels[halvings], state, sigma, self._config)
+            result = levenberg_marquardt(state, problem.linearise, step, self._config.iterations, tolerance=_TOLERANCE)
+            state = result.state
+        return self._summarise(problem, result)
 
-    def _light(self, a: DenseView, b: DenseView) -> Tensor | None:
-        """First gain and bias, (2,), from the contrast and mean of both images; None where either shows nothing."""
+    def _initial_gain_and_bias(self, a: DenseView, b: DenseView) -> Tensor | None:
+        """Gain and bias from the contrast and mean of both images, shape (2,); None if either has no contrast."""
         coarsest = self._halvings[0]
-        greys = [grey[grey.isfinite()].to(torch.float64) for grey in (v.levels[coarsest].channels[0] for v in (a, b))]
+        greys = [view.levels[coarsest].channels[0] for view in (a, b)]
+        greys = [grey[grey.isfinite()].to(torch.float64) for grey in greys]
         mean_a, mean_b = (grey.mean() for grey in greys)
         contrast_a, contrast_b = ((grey - grey.mean()).square().mean().sqrt() for grey in greys)
-        if not min(contrast_a, contrast_b) > self._LEAST_CONTRAST:  # not a number where nothing stands still
+        if not min(contrast_a, contrast_b) > self._MIN_CONTRAST:  # also true for NaN, if no pixel is static
             return None
         gain = contrast_b / contrast_a
         return torch.stack([gain, mean_b - gain * mean_a])
 
-    def _summarise(self, problem: Problem, found: Minimum[State, System]) -> DenseAlignment:
-        T_ba, (gain, _) = rigid(found.state[0]), found.state[1]
-        now = problem.compare(found.state)
-        (brightness, inverse), lit = problem.anchors.values.to(torch.float64), now.compared[0]
-        agree = now.compared[1] & (now.residuals[1].abs() <= self._AGREEMENT * self._config.inverse_depth_sigma)
-        rms = [float(r[c].square().mean().sqrt()) for r, c in zip(now.residuals, now.compared, strict=True)]
-        information = problem.information(found.system, lit)
-        by_depth = torch.ones(6, dtype=torch.float64)
-        by_depth[:3] = 1 / inverse.median()
-        eigenvalues = torch.linalg.eigvalsh(by_depth[:, None] * information * by_depth)
-        to_right = SE3_Adj(mat2SE3(invert(T_ba)).tensor())  # exp(xi) T = T exp(Ad(T^-1) xi)
+    def _summarise(self, problem: AlignmentProblem, result: OptimisationResult[State, System]) -> DenseAlignment:
+        T_ba, (gain, _) = rigid(result.state[0]), result.state[1]
+        residuals = problem.residuals(result.state)
+        (brightness, inverse_depth), valid_brightness = problem.reference.values.to(torch.float64), residuals.valid[0]
+        max_difference = self._MAX_DEPTH_SIGMAS * self._config.inverse_depth_sigma
+        inliers = residuals.valid[1] & (residuals.values[1].abs() <= max_difference)
+        rms = [float(r[v].square().mean().sqrt()) for r, v in zip(residuals.values, residuals.valid, strict=True)]
+        information = problem.information(result.system, valid_brightness)
+        scale = torch.ones(6, dtype=torch.float64)
+        scale[:3] = 1 / inverse_depth.median()
+        eigenvalues = torch.linalg.eigvalsh(scale[:, None] * information * scale)
+        left_to_right = SE3_Adj(mat2SE3(invert(T_ba)).tensor())  # exp(xi) T = T exp(Ad(T^-1) xi)
         return DenseAlignment(
             T_ba=T_ba,
-            overlap=float(now.seen.to(torch.float64).mean()),
-            inliers=int(agree.sum()),
-            inlier_ratio=float(agree.sum() / (now.compared[1] | now.hidden).sum()),
-            correlation=_correlation(brightness[lit], (gain * brightness + now.residuals[0])[lit]),
+            overlap=float(residuals.in_view.to(torch.float64).mean()),
+            inliers=int(inliers.sum()),
+            inlier_ratio=float(inliers.sum() / (residuals.valid[1] | residuals.occluded).sum()),
+            correlation=_correlation(
+                brightness[valid_brightness], (gain * brightness + residuals.values[0])[valid_brightness]
+            ),
             photometric_rms=rms[0],
             geometric_rms=rms[1],
-            information=to_right.mT @ information @ to_right,
+            information=left_to_right.mT @ information @ left_to_right,
             observability=float(eigenvalues[0] / eigenvalues[-1]),
         )
 
-    def _trusts(self, found: DenseAlignment) -> bool:
-        """Whether nothing speaks against it; what is not a number does."""
+    def _is_reliable(self, alignment: DenseAlignment) -> bool:
+        """Check the quality of an alignment; NaN counts as bad."""
         return (
-            found.overlap >= self._config.min_overlap
-            and found.inlier_ratio >= self._config.min_inlier_share
-            and found.correlation >= self._config.min_correlation
-            and found.observability >= self._config.min_observability
+            alignment.overlap >= self._config.min_overlap
+            and alignment.inlier_ratio >= _MIN_INLIER_RATIO
+            and alignment.correlation >= _MIN_CORRELATION
+            and alignment.observability >= self._config.min_observability
         )
 
 
 def _correlation(x: Tensor, y: Tensor) -> float:
-    """Pearson's; not a number where either is constant."""
+    """Pearson correlation; NaN if either input is constant."""
     x, y = x - x.mean(), y - y.mean()
     return float((x * y).sum() / (x.norm() * y.norm()))

@@ -1,4 +1,4 @@
-"""The least-squares problem of dense alignment on one level: differences of brightness and of inverse depth."""
+"""Least-squares problem of dense alignment on one pyramid level: brightness and inverse-depth residuals."""
 
 from __future__ import annotations
 
@@ -16,106 +16,137 @@ from v3d_torch.optim.levenberg_marquardt import student_t, student_t_scale
 State = tuple[Tensor, Tensor]  # T_ba (4, 4); gain and bias from the reference's brightness to the current one's (2,)
 System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba @ exp(xi), gain, bias
 
+_DAMPING_FACTOR = 1e3
+"""Additional damping. The Jacobian is the reference's and only approximates that of the current view; with less damping
+a step after a rejected one is rejected, too."""
+
+_REGULARISATION = 1e-9
+"""Added to the diagonal of the normal equations, which are singular without valid residuals."""
+
+_OCCLUSION_RATIO = 0.1
+"""A point is occluded if the inverse depth in the current view differs from the expected one by more than this
+fraction: the views then show different surfaces, and their difference contains no information on the motion."""
+
 
 @dataclass(frozen=True)
-class Comparison:
-    """Reference against current view.
+class Residuals:
+    """Residuals of M reference points in the current view.
 
     Attributes:
-        residuals: current minus expected brightness and inverse depth, float64, shape :math:`(2, M)`.
-        compared: where both views show one surface, bool, shape :math:`(2, M)`.
-        hidden: points where the current view shows another surface, bool, shape :math:`(M,)`.
-        seen: points that lie in the current view on what stands still, bool, shape :math:`(M,)`.
+        values: Current minus expected brightness and inverse depth (1/m), float64, shape :math:`(2, M)`.
+        valid: Mask of the residuals for which both views show the same surface, bool, shape :math:`(2, M)`.
+        occluded: Mask of the points for which the current view shows another surface, bool, shape :math:`(M,)`.
+        in_view: Mask of the points that lie on static pixels of the current view, bool, shape :math:`(M,)`.
     """
 
-    residuals: Tensor
-    compared: Tensor
-    hidden: Tensor
-    seen: Tensor
+    values: Tensor
+    valid: Tensor
+    occluded: Tensor
+    in_view: Tensor
 
 
-class Problem:
-    """The least-squares problem of one level. Noise and Jacobian are those at its start.
+class AlignmentProblem:
+    """Least-squares problem of one pyramid level, with noise scales and Jacobian fixed at the initial state.
 
     Args:
-        reference: gives the points.
-        current: where they are looked up.
-        start: motion, gain and bias.
-        inverse_depth_sigma: least standard deviation of inverse depth, 1/m.
-        config: what hides, and the tails of the noise.
+        reference: Level of the reference view; its reference points are aligned.
+        current: Level of the current view, in which the points are looked up.
+        initial_state: Motion ``T_ba``, gain and bias.
+        inverse_depth_sigma: Minimum standard deviation of inverse depth, 1/m.
+        config: Degrees of freedom of the t-distribution.
     """
 
-    _LEAST = 50  # comparisons: from fewer, eight unknowns are noise
-    _BRIGHTNESS_SIGMA = 1e-3  # least standard deviation: a quarter of a step of 8 bits
-    _NEAREST = 0.1  # metres: no camera sees nearer, and 1/z stays finite
-    # Of a pixel's variance, Sobel's gradient has 12/64; the scale of a t-distribution is 3/4 of the variance it fits.
+    _MIN_RESIDUALS = 50
+    """Minimum number of valid residuals; with fewer, noise dominates the eight unknowns."""
+
+    _MIN_BRIGHTNESS_SIGMA = 1e-3
+    """Minimum standard deviation of brightness: a quarter of an 8-bit step."""
+
+    _MIN_DEPTH = 0.1
+    """Smallest depth of a point, metres, below the range of any RGB-D camera; keeps 1/z finite."""
+
     _GRADIENT_NOISE = 0.3
+    """Variance of the noise in brightness gradients over the squared scale of the residuals. The Sobel gradient has
+    12/64 of a pixel's variance; the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its
+    variance."""
 
     def __init__(
-        self, reference: Level, current: Level, start: State, inverse_depth_sigma: float, config: DenseOdometryConfig
+        self,
+        reference: Level,
+        current: Level,
+        initial_state: State,
+        inverse_depth_sigma: float,
+        config: DenseOdometryConfig,
     ) -> None:
-        self.anchors, self._current, self._config = reference.anchors, current, config
-        first = self.compare(start)
-        self._sigma = torch.tensor([[self._BRIGHTNESS_SIGMA], [inverse_depth_sigma]], dtype=torch.float64)
-        for sigma, residuals, compared in zip(self._sigma, first.residuals, first.compared, strict=True):
-            if compared.any():
-                sigma.clamp_(min=student_t_scale(residuals[compared].square(), config.degrees_of_freedom))
-        by_light = torch.zeros(2, len(self.anchors.points), 2, dtype=torch.float64)
-        by_light[0] = -torch.stack([self.anchors.values[0], torch.ones_like(self.anchors.values[0])], dim=-1)
-        gains = torch.stack([start[1][0], torch.ones_like(start[1][0])])
-        self._jacobian = torch.cat([gains[:, None, None] * self.anchors.slopes, by_light], dim=-1).flatten(0, 1)
+        self.reference, self._current = reference.reference_points, current
+        self._degrees_of_freedom = config.degrees_of_freedom
+        initial = self.residuals(initial_state)
+        self._sigma = torch.tensor([[self._MIN_BRIGHTNESS_SIGMA], [inverse_depth_sigma]], dtype=torch.float64)
+        for sigma, values, valid in zip(self._sigma, initial.values, initial.valid, strict=True):
+            if valid.any():
+                sigma.clamp_(min=student_t_scale(values[valid].square(), config.degrees_of_freedom))
+        brightness = self.reference.values[0]
+        by_gain_and_bias = torch.zeros(2, len(self.reference.points), 2, dtype=torch.float64)
+        by_gain_and_bias[0] = -torch.stack([brightness, torch.ones_like(brightness)], dim=-1)
+        gain = initial_state[1][0]
+        gains = torch.stack([gain, torch.ones_like(gain)])
+        by_motion = gains[:, None, None] * self.reference.jacobian
+        self._jacobian = torch.cat([by_motion, by_gain_and_bias], dim=-1).flatten(0, 1)
 
-    def compare(self, state: State) -> Comparison:
-        """Look up the reference's points in the current view."""
+    def residuals(self, state: State) -> Residuals:
+        """Compare the reference points with the current view."""
         T_ba, (gain, bias) = state[0].to(torch.float32), state[1].to(torch.float32)
-        camera = self._current.lens.camera
-        points = self.anchors.points @ T_ba[:3, :3].T + T_ba[:3, 3]
-        in_front = points[:, 2] > self._NEAREST
+        camera = self._current.level_camera.camera
+        points = self.reference.points @ T_ba[:3, :3].T + T_ba[:3, 3]
+        in_front = points[:, 2] > self._MIN_DEPTH
         pixels = camera.distort(camera.project(points.where(in_front[:, None], 1.0))).to(torch.float32)
         last = torch.tensor([camera.width - 1, camera.height - 1])
-        in_view = in_front & ((pixels >= 0) & (pixels <= last)).all(dim=1)
-        there = grid_sample(self._current.channels[None], (2 * pixels / last - 1)[None, None], align_corners=True)
-        inverse = 1 / points[:, 2]
-        residuals = there[0, :, 0] - torch.stack([gain * self.anchors.values[0] + bias, inverse])
-        known = residuals.isfinite() & in_view
-        limit = self._config.occlusion * inverse
-        hidden = known[1] & (residuals[1].abs() > limit)
-        residuals[1] = residuals[1].clamp(-limit, limit)
-        return Comparison(
-            residuals=residuals.where(known, 0.0).to(torch.float64),
-            compared=known & self.anchors.usable & ~hidden,
-            hidden=hidden,
-            seen=known[0],
+        in_image = in_front & ((pixels >= 0) & (pixels <= last)).all(dim=1)
+        sampled = grid_sample(self._current.channels[None], (2 * pixels / last - 1)[None, None], align_corners=True)
+        inverse_depth = 1 / points[:, 2]
+        values = sampled[0, :, 0] - torch.stack([gain * self.reference.values[0] + bias, inverse_depth])
+        known = values.isfinite() & in_image
+        limit = _OCCLUSION_RATIO * inverse_depth
+        occluded = known[1] & (values[1].abs() > limit)
+        values[1] = values[1].clamp(-limit, limit)
+        return Residuals(
+            values=values.where(known, 0.0).to(torch.float64),
+            valid=known & self.reference.usable & ~occluded,
+            occluded=occluded,
+            in_view=known[0],
         )
 
     def linearise(self, state: State) -> tuple[float, System]:
-        """Mean robust cost, infinite where there is too little to compare, and normal equations."""
-        now = self.compare(state)
-        if int(now.compared.sum()) < self._LEAST:
+        """Mean robust cost, infinite with too few valid residuals, and normal equations."""
+        residuals = self.residuals(state)
+        if int(residuals.valid.sum()) < self._MIN_RESIDUALS:
             return torch.inf, (torch.zeros(8, 8, dtype=torch.float64), torch.zeros(8, dtype=torch.float64))
-        costs, weights = student_t((now.residuals / self._sigma).square(), self._config.degrees_of_freedom)
-        weights = (weights * now.compared / self._sigma.square()).flatten()
+        costs, weights = student_t((residuals.values / self._sigma).square(), self._degrees_of_freedom)
+        weights = (weights * residuals.valid / self._sigma.square()).flatten()
         weighted = (self._jacobian * weights[:, None]).T
-        # A hidden point costs as much as one about to be: else a motion could gain by hiding what disagrees.
-        counted = torch.stack([now.compared[0], now.compared[1] | now.hidden])
-        return float(costs[counted].mean()), (weighted @ self._jacobian, weighted @ now.residuals.flatten())
+        # Occluded points keep their clamped cost; otherwise a motion could lower the cost by occluding outliers.
+        counted = torch.stack([residuals.valid[0], residuals.valid[1] | residuals.occluded])
+        return float(costs[counted].mean()), (weighted @ self._jacobian, weighted @ residuals.values.flatten())
 
-    def information(self, system: System, lit: Tensor) -> Tensor:
-        """What is known of ``xi``, gain and bias marginalised, (6, 6).
+    def information(self, system: System, valid_brightness: Tensor) -> Tensor:
+        """Information matrix of ``xi``, with gain and bias marginalised, shape (6, 6).
 
-        Noise in gradients looks like texture: on stripes it would claim to know the motion along them. It has been
-        measured, as it makes up the residuals, and is taken off. What remains may be indefinite.
+        Gradient noise looks like texture: on stripes, the motion along them would seem observable. Its contribution is
+        known from the residuals and subtracted. The result can be indefinite.
+
+        Args:
+            system: Normal equations.
+            valid_brightness: Mask of the valid brightness residuals, bool, shape (M,).
         """
         H, _ = system
-        flow = self.anchors.flow[lit].flatten(0, 1).to(torch.float64)
-        by_light = H[:6, 6:] @ torch.linalg.pinv(H[6:, 6:], hermitian=True) @ H[6:, :6]
-        return H[:6, :6] - by_light - self._GRADIENT_NOISE * (flow.T @ flow)
+        pixel_jacobian = self.reference.pixel_jacobian[valid_brightness].flatten(0, 1).to(torch.float64)
+        marginalised = H[:6, 6:] @ torch.linalg.pinv(H[6:, 6:], hermitian=True) @ H[6:, :6]
+        return H[:6, :6] - marginalised - self._GRADIENT_NOISE * (pixel_jacobian.T @ pixel_jacobian)
 
 
 def step(state: State, system: System, damping: float) -> State:
-    """The state after a damped Gauss-Newton step."""
+    """State after a damped Gauss-Newton step."""
     H, gradient = system
-    # The slopes are the reference's, not quite the current view's: with less damping a step that failed fails again.
-    diagonal = 1e3 * damping * H.diagonal() + 1e-9  # solvable even where nothing is seen
+    diagonal = _DAMPING_FACTOR * damping * H.diagonal() + _REGULARISATION
     change = -torch.linalg.solve(H + diagonal.diag(), gradient)
     return state[0] @ se3_exp(change[:6]), state[1] + change[6:]

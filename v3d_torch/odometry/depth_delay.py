@@ -1,9 +1,9 @@
-"""Depth that was measured at another time than colour was taken.
+"""Depth-delay compensation: the depth image was taken at another time than the colour image.
 
-The two cameras of a Kinect run freely: of a colour image and the depth image next to it one is up to 20 ms the older
-(Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012), in which a turn of 1 rad/s moves the
-image by some 10 pixels. So the depth of a feature is read where the feature was when depth was measured, and put to the
-time of colour.
+The colour and depth cameras of many RGB-D sensors are not synchronised; the images of a pair are up to half a frame
+period apart (Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012). Meanwhile a moving camera
+shifts the image by several pixels. The depth of a feature is therefore read where the feature was when depth was
+measured, and converted to the depth at the time of the colour image.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import Features, sample_depth
+from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 
 
 class DepthDelayCompensation:
-    """Gives features the depth that they had at the time of the colour image.
+    """Gives features their depth at the time of the colour image.
 
     Args:
-        config: whether, and how far depth counts.
-        camera: of both images; their rows are taken for read at the same pace.
+        config: Configuration of the whole system: whether compensation is enabled, maximum depth.
+        camera: Intrinsics of both images. The rows of both are assumed to be read at the same rate.
     """
 
     def __init__(self, config: Config, camera: PinholeCamera) -> None:
@@ -33,19 +33,24 @@ class DepthDelayCompensation:
         self._camera = camera
 
     def __call__(self, features: Features, depth: Tensor, velocity: Tensor, delay: float) -> Features:
-        """Features of a camera in motion.
+        r"""Sample the depth of features at the time of the depth image, and convert it to the time of the colour image.
+
+        With the inverse depth's rate :math:`\dot w` of the motion field, the delay :math:`\tau` and the sampled depth
+        :math:`z`, the depth at the time of the colour image is :math:`z / (1 - \tau \dot w z)`.
 
         Args:
-            features: of the colour image.
-            depth: metres, shape :math:`(1, H, W)`, 0 = none.
-            velocity: of the points in the camera, twist per second, float64, shape :math:`(6,)`.
-            delay: of the depth image, seconds after the colour image.
+            features: Features of the colour image.
+            depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+                :math:`(6,)`.
+            delay: Depth stamp minus colour stamp, seconds.
 
         Returns:
-            The same features with that depth; as they are, without a delay.
+            The features with the new depth; the same object if there is no delay or compensation is disabled.
         """
         if not delay or not self._enabled:
             return features
-        moves, rate = motion_field(features.uv, features.inverse_depth, velocity, self._camera)
-        z = sample_depth((features.pixel + delay * moves).round().to(torch.int64), depth, self._max_depth)
+        pixel_velocity, rate = motion_field(features.uv, features.inverse_depth, velocity, self._camera)
+        shifted = (features.pixel + delay * pixel_velocity).round().to(torch.int64)
+        z = sample_depth(shifted, depth, self._max_depth)
         return replace(features, depth=torch.where(z > 0, z / (1 - delay * rate * z), 0.0))

@@ -1,4 +1,4 @@
-"""Camera motion between two frames: match, epipolar RANSAC, PnP-RANSAC with depth (paper, Sec. III-E)."""
+"""Frame-to-frame registration: matching, epipolar RANSAC, PnP-RANSAC with depth (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
@@ -10,20 +10,31 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, OdometryConfig
+from v3d_torch.features.features import Features, select_evenly
 from v3d_torch.features.matching import match_descriptors
-from v3d_torch.features.orb import Features, select_evenly
 from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_log
 
+_EPIPOLAR_THRESHOLD = 2.0
+"""Maximum Sampson distance of epipolar inliers, pixels: twice the localisation error of a feature."""
+
+_PNP_THRESHOLD = 4.0
+"""Maximum reprojection error of inliers of PnP-RANSAC, pixels. Larger than the epipolar threshold, because the depth
+error of the points adds to the pixel error."""
+
+_MAX_ROTATION_RATE = 6.3
+"""Fastest plausible rotation of a camera in a hand or on a robot, rad/s: a full turn in a second."""
+
 
 @dataclass(frozen=True)
 class RelativeMotion:
-    """Rigid motion of the camera between a known view "a" and a new view "b".
+    """Rigid motion of the camera from view "a" to view "b".
 
     Attributes:
-        T_ba: maps points of camera a to camera b, float64, shape :math:`(4, 4)`.
-        pairs: inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`; none where pixels told it.
+        T_ba: Maps points from camera a to camera b, float64, shape :math:`(4, 4)`.
+        pairs: Inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`; K = 0 for a motion found by
+            dense alignment.
     """
 
     T_ba: Tensor
@@ -31,41 +42,53 @@ class RelativeMotion:
 
     @cached_property
     def twist(self) -> Tensor:
-        """Logarithm of ``T_ba``, float64, shape :math:`(6,)`."""
+        """Logarithm of ``T_ba``, ``[translation, rotation]``, metres and radians, float64, shape :math:`(6,)`."""
         return se3_log(self.T_ba)
 
     def velocity(self, elapsed: float) -> Tensor:
-        """Mean twist per second over the time between the views, in seconds, float64, shape :math:`(6,)`."""
-        return self.twist / elapsed
-
-    def is_plausible(self, elapsed: float, config: OdometryConfig) -> bool:
-        """Whether a camera in a hand or on a robot can move so in the time, given in seconds."""
-        distance, angle = float(self.twist[:3].norm()), float(self.twist[3:].norm())
-        return distance <= config.max_speed * elapsed and angle <= config.max_rotation_rate * elapsed
-
-    def propagate_landmarks(self, landmarks: Tensor, count: int) -> Tensor:
-        """Ids of the landmarks behind the features of b that the matches carry over from a.
+        """Mean twist per second.
 
         Args:
-            landmarks: id of the landmark behind each feature of a, -1 for none, int64, shape :math:`(N,)`.
-            count: of the features of b.
+            elapsed: Time between the views, seconds.
 
         Returns:
-            -1 where there is none, int64, shape ``(count,)``.
+            Metres and radians per second, float64, shape :math:`(6,)`.
         """
-        carried = torch.full((count,), -1, dtype=torch.int64)
-        carried[self.pairs[:, 1]] = landmarks[self.pairs[:, 0]]
-        return carried
+        return self.twist / elapsed
+
+    def is_plausible(self, elapsed: float, max_speed: float) -> bool:
+        """Check whether a camera in a hand or on a robot can move this fast.
+
+        Args:
+            elapsed: Time between the views, seconds.
+            max_speed: Maximum speed of a camera, m/s.
+        """
+        distance, angle = float(self.twist[:3].norm()), float(self.twist[3:].norm())
+        return distance <= max_speed * elapsed and angle <= _MAX_ROTATION_RATE * elapsed
+
+    def propagate_landmarks(self, landmarks: Tensor, count: int) -> Tensor:
+        """Landmark ids of the features of b, propagated from a by the inlier matches.
+
+        Args:
+            landmarks: Landmark id of each feature of a, int64, shape :math:`(N,)`; -1 = none.
+            count: Number of features of b.
+
+        Returns:
+            Landmark id of each feature of b, int64, shape ``(count,)``; -1 = none.
+        """
+        landmark_ids = torch.full((count,), -1, dtype=torch.int64)
+        landmark_ids[self.pairs[:, 1]] = landmarks[self.pairs[:, 0]]
+        return landmark_ids
 
 
 class MotionEstimator:
-    """Estimates the camera's motion from features that stand still.
+    """Estimates the camera motion between two views from their features.
 
     Args:
-        config: thresholds of matching and RANSAC.
-        features: grid of the features.
-        camera: gives ``K``.
-        seed: of both RANSACs.
+        config: Thresholds of matching and RANSAC.
+        features: Grid over which the features are spread.
+        camera: Intrinsics.
+        seed: Seed of both RANSACs.
     """
 
     def __init__(self, config: OdometryConfig, features: FeaturesConfig, camera: PinholeCamera, seed: int) -> None:
@@ -75,34 +98,34 @@ class MotionEstimator:
         self._seed = seed
 
     def __call__(
-        self, a: Features, b: Features, elapsed: float = math.inf, guess: Tensor | None = None
+        self, a: Features, b: Features, elapsed: float = math.inf, initial_guess: Tensor | None = None
     ) -> RelativeMotion | None:
-        """Motion from view ``a`` to view ``b``.
+        """Estimate the motion from view a to view b.
 
         Args:
-            a: known view; its features with depth take part.
-            b: new view.
-            elapsed: time between the views, seconds, which bounds how far a camera can have come.
-            guess: motion that the camera may have made, ``T_ba``, float64, shape :math:`(4, 4)`; None if unknown, as
-                where a place is seen again: then all features are matched, of which few show the same.
+            a: Features of the earlier view; only those with depth are used.
+            b: Features of the later view.
+            elapsed: Time between the views, seconds; bounds the plausible motion.
+            initial_guess: Predicted ``T_ba``, float64, shape :math:`(4, 4)`; None if unknown, as in loop detection.
+                Without a prediction all features of a are matched, because only few of them are expected in b.
 
         Returns:
-            None when fewer than ``min_inliers`` matches agree on one motion, or on one that no hand can make.
+            None if fewer than ``min_inliers`` matches agree on a motion, or if the motion is not plausible.
         """
         config = self._config
-        chosen = torch.nonzero(a.depth > 0)[:, 0]
-        if guess is not None:
-            chosen = chosen[select_evenly(a.pixel[chosen], config.max_features, self._cell)]
+        selected = torch.nonzero(a.depth > 0)[:, 0]
+        if initial_guess is not None:
+            selected = selected[select_evenly(a.pixel[selected], config.max_features, self._cell)]
         pairs = match_descriptors(
-            a.descriptors[chosen], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
+            a.descriptors[selected], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
         )
-        pairs = torch.stack([chosen[pairs[:, 0]], pairs[:, 1]], dim=1)
+        pairs = torch.stack([selected[pairs[:, 0]], pairs[:, 1]], dim=1)
         if pairs.shape[0] < config.min_inliers:
             return None
         epipolar = epipolar_inliers(
             a.uv[pairs[:, 0]],
             b.uv[pairs[:, 1]],
-            threshold=config.epipolar_threshold,
+            threshold=_EPIPOLAR_THRESHOLD,
             iterations=config.iterations,
             seed=self._seed,
         )
@@ -113,13 +136,13 @@ class MotionEstimator:
             self._camera.back_project(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]]),
             b.uv[pairs[:, 1]],
             self._camera,
-            threshold=config.pnp_threshold,
+            threshold=_PNP_THRESHOLD,
             iterations=config.iterations,
             seed=self._seed,
-            guess=guess,
+            initial_guess=initial_guess,
         )
         if pose is None or int(pose[1].sum()) < config.min_inliers:
             return None
         T_ba, inliers = pose
         motion = RelativeMotion(T_ba, pairs[inliers])
-        return motion if motion.is_plausible(elapsed, config) else None
+        return motion if motion.is_plausible(elapsed, config.max_speed) else None

@@ -1,4 +1,4 @@
-"""The camera's motion since the last frame: from features (paper, Sec. III-E), where they fail from all pixels."""
+"""Odometry: camera motion since the last frame, from features (paper, Sec. III-E) or, if they fail, from all pixels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.dense_aligner import DenseAligner
 from v3d_torch.odometry.dense_view import DenseView
@@ -19,14 +19,14 @@ from v3d_torch.types import RGBDFrame
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """What a frame saw, and what of it stood still.
+    """Observations of a frame, restricted to its static pixels as soon as these are known.
 
     Attributes:
-        frame: as it came.
-        depth: re-estimated, metres, shape :math:`(1, H, W)`.
-        features: of what stood still; of all, while that is not known.
-        static: pixels that stood still, bool, shape :math:`(H, W)`; None while that is not known.
-        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
+        frame: The frame as it was recorded.
+        depth: Re-estimated depth, metres, shape :math:`(1, H, W)`.
+        features: Features on static pixels; all features while the static pixels are unknown.
+        static_mask: Mask of the static pixels, bool, shape :math:`(H, W)`; None while unknown.
+        landmark_ids: Landmark id of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
     """
 
     frame: RGBDFrame
@@ -36,55 +36,70 @@ class TrackedFrame:
     landmarks: Tensor | None = None
 
     def matched(self, motion: RelativeMotion | None) -> Tensor:
-        """Which features a motion to this view was seen on, bool, shape :math:`(N,)`; none where there is none."""
-        matched = torch.zeros(len(self.features), dtype=torch.bool)
-        if motion is not None:
-            matched[motion.pairs[:, 1]] = True
-        return matched
+        """Mask of the features that are inliers of a motion to this frame.
 
-    def carried(self, motion: RelativeMotion | None, then: TrackedFrame | None) -> Tensor:
-        """Ids of the landmarks that the motion's matches carry over from a view, -1 for none, :math:`(N,)`."""
-        if motion is None or then is None or then.landmarks is None:
+        Args:
+            motion: Motion from another frame to this one; None if it is unknown.
+
+        Returns:
+            Bool, shape :math:`(N,)`; all false without a motion.
+        """
+        mask = torch.zeros(len(self.features), dtype=torch.bool)
+        if motion is not None:
+            mask[motion.pairs[:, 1]] = True
+        return mask
+
+    def carried(self, motion: RelativeMotion | None, previous: TrackedFrame | None) -> Tensor:
+        """Landmark ids of the features, propagated from another frame by the matches of a motion.
+
+        Args:
+            motion: Motion from the other frame to this one; None if it is unknown.
+            previous: The other frame; None if there is none.
+
+        Returns:
+            Landmark id of each feature, int64, shape :math:`(N,)`; -1 = none.
+        """
+        if motion is None or previous is None or previous.landmarks is None:
             return torch.full((len(self.features),), -1, dtype=torch.int64)
-        return motion.propagate_landmarks(then.landmarks, len(self.features))
+        return motion.propagate_landmarks(previous.landmarks, len(self.features))
 
 
 class Odometry:
-    """Finds the motion between two frames.
+    """Estimates the camera motion between two frames: features first, dense alignment if they fail.
 
     Args:
-        config: of the whole system.
-        camera: of the frames.
-        by_features: registers two views by their features.
+        config: Configuration of the whole system.
+        camera: Intrinsics.
+        estimate_motion: Registration of two views by their features.
     """
 
-    def __init__(self, config: Config, camera: PinholeCamera, by_features: MotionEstimator) -> None:
-        self._config = config
-        self._by_features = by_features
+    def __init__(self, config: Config, camera: PinholeCamera, estimate_motion: MotionEstimator) -> None:
+        self._max_speed = config.odometry.max_speed
+        self._estimate_motion = estimate_motion
         self._align = DenseAligner(config.dense_odometry, camera)
 
-    def __call__(self, then: TrackedFrame, now: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
-        """Motion of the camera from an earlier view to the newest one.
+    def __call__(self, previous: TrackedFrame, current: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
+        """Estimate the motion from an earlier frame "a" to the newest frame "b".
 
         Args:
-            then: of which it is known what stood still.
-            now: newest.
-            T_ba: prediction, float64, shape :math:`(4, 4)`.
+            previous: Earlier frame, whose static pixels are known.
+            current: Newest frame.
+            T_ba: Predicted motion, float64, shape :math:`(4, 4)`.
 
         Returns:
-            None when neither features nor pixels tell, or what they tell is no motion that a camera can make.
+            None if neither features nor dense alignment give a plausible motion.
         """
-        elapsed = now.frame.stamp - then.frame.stamp
-        motion = self._by_features(then.features, now.features, elapsed, T_ba)
+        elapsed = current.frame.stamp - previous.frame.stamp
+        motion = self._estimate_motion(previous.features, current.features, elapsed, T_ba)
         if motion is not None:
             return motion
-        aligned = self._align(self._dense(then), self._dense(now), T_ba)
-        if aligned is None:
+        alignment = self._align(self._dense_view(previous), self._dense_view(current), T_ba)
+        if alignment is None:
             return None
-        motion = RelativeMotion(aligned.T_ba, torch.zeros(0, 2, dtype=torch.int64))
-        return motion if motion.is_plausible(elapsed, self._config.odometry) else None
+        motion = RelativeMotion(alignment.T_ba, torch.zeros(0, 2, dtype=torch.int64))
+        return motion if motion.is_plausible(elapsed, self._max_speed) else None
 
-    def _dense(self, view: TrackedFrame) -> DenseView:
-        grey = rgb_to_grayscale(view.frame.image.to(torch.float32) / 255)
-        everywhere = torch.ones(grey.shape[-2:], dtype=torch.bool)
-        return self._align.view(grey, view.depth, everywhere if view.static is None else view.static)
+    def _dense_view(self, tracked: TrackedFrame) -> DenseView:
+        grey = rgb_to_grayscale(tracked.frame.image.to(torch.float32) / 255)
+        all_pixels = torch.ones(grey.shape[-2:], dtype=torch.bool)
+        return self._align.view(grey, tracked.depth, all_pixels if tracked.static is None else tracked.static)

@@ -1,10 +1,9 @@
-"""The rolling shutter: the rows of an image are read one after the other, while the camera moves on.
+"""Rolling-shutter compensation: the rows of an image are read one after the other while the camera moves.
 
-A Kinect takes most of the 33 ms between two frames to read its colour image, and a turn of 1 rad/s moves the image by
-some 13 pixels meanwhile, more than any other error (Hedborg et al., Rolling Shutter Bundle Adjustment, CVPR 2012).
-Features are put where they would have been seen at the time of the middle row. How far a feature has to go is its
-drift, the motion field times the share of the readout by which its row is late; how long the readout takes, the map
-tells.
+Features are moved to where they would have been observed at the time of the middle row (cf. Hedborg et al., Rolling
+Shutter Bundle Adjustment, CVPR 2012). The shift of a feature is its readout Jacobian times the readout: the readout is
+the time from the first to the last row, and the readout Jacobian is the motion field times the feature's row, from -1/2
+to 1/2, with opposite sign. An unknown readout is calibrated while mapping.
 """
 
 from __future__ import annotations
@@ -17,18 +16,19 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import RollingShutterConfig
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 
 
 @dataclass(frozen=True)
 class Readout:
-    """How long a camera takes to read the rows of its colour image, as far as is known.
+    """Estimate of the readout, the time that a camera takes to read the rows of its colour image.
 
     Attributes:
-        seconds: from the first row to the last; 0 is a global shutter, less than 0 one that is read from below.
-        information: inverse variance of that, 1/s^2.
+        seconds: Time from the first to the last row, seconds; 0 for a global shutter, negative if the rows are read
+            from the bottom up.
+        information: Inverse variance of ``seconds``, 1/s^2; infinite if the readout is known exactly.
     """
 
     seconds: float
@@ -36,56 +36,65 @@ class Readout:
 
     @property
     def is_certain(self) -> bool:
-        """Whether no image can tell another."""
+        """True if the readout is known exactly and needs no calibration."""
         return math.isinf(self.information)
 
     @classmethod
-    def from_camera(cls, camera: PinholeCamera, expected: RollingShutterConfig) -> Readout:
-        """What the camera says of itself, for sure; what is to be expected, where it says nothing."""
+    def from_camera(cls, camera: PinholeCamera, prior: RollingShutterConfig) -> Readout:
+        """The camera's readout if it is known, else the prior.
+
+        Args:
+            camera: Camera, with or without a readout.
+            prior: Expected readout and its standard deviation.
+        """
         if camera.readout is not None:
             return cls(camera.readout, math.inf)
-        return cls(expected.readout, expected.readout_sigma**-2)
+        return cls(prior.readout, prior.readout_sigma**-2)
 
     @classmethod
-    def from_dict(cls, about: Mapping[str, float]) -> Readout:
-        """From the attributes by their names.
+    def from_dict(cls, attributes: Mapping[str, float]) -> Readout:
+        """Create a readout from its attributes by name.
+
+        Args:
+            attributes: ``seconds`` and ``information``.
 
         Raises:
-            ValueError: there is no such camera.
+            ValueError: If the readout is out of range or not a number.
         """
-        seconds, information = float(about["seconds"]), float(about["information"])
+        seconds, information = float(attributes["seconds"]), float(attributes["information"])
         if not (abs(seconds) <= MAX_READOUT and information >= 0):
-            raise ValueError(f"a readout of {seconds} s")
+            raise ValueError(f"the readout is {seconds} s; expected at most {MAX_READOUT} s")
         return cls(seconds, information)
 
 
 GLOBAL_SHUTTER = Readout(0.0, math.inf)
-"""All rows at once, for sure."""
+"""Readout of a camera that reads all rows at once."""
 
 
 class RollingShutterCompensation:
-    """Puts features where they would have been seen at the time of the middle row.
+    """Moves features to where they would have been observed at the time of the middle row.
 
     Args:
-        camera: that read them.
+        camera: Intrinsics of the camera that observed the features.
     """
 
     def __init__(self, camera: PinholeCamera) -> None:
         self._camera = camera
 
     def __call__(self, features: Features, velocity: Tensor, readout: Readout) -> Features:
-        """Features of a camera in motion.
+        """Compensate the rolling shutter of a moving camera.
 
         Args:
-            features: as they were read, or as they were put with the same readout for another velocity.
-            velocity: of the points in the camera, twist per second, float64, shape :math:`(6,)`.
-            readout: of the camera.
+            features: Features as observed, or compensated with the same readout and another velocity.
+            velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+                :math:`(6,)`.
+            readout: Readout of the camera.
 
         Returns:
-            The same features with ``uv`` and ``readout_jacobian`` for that velocity.
+            The features with ``uv`` and ``readout_jacobian`` for this velocity.
         """
-        read = features.uv - readout.seconds * features.readout_jacobian
-        field, _ = motion_field(read, features.inverse_depth, velocity, self._camera)
-        late = features.pixel[:, 1:].to(torch.float64) / (self._camera.height - 1) - 0.5
-        drift = -late * field
-        return replace(features, uv=read + readout.seconds * drift, readout_jacobian=drift)
+        observed = features.uv - readout.seconds * features.readout_jacobian
+        pixel_velocity, _ = motion_field(observed, features.inverse_depth, velocity, self._camera)
+        row = features.pixel[:, 1:].to(torch.float64) / (self._camera.height - 1) - 0.5  # from -0.5 to 0.5
+        readout_jacobian = -row * pixel_velocity
+        return replace(features, uv=observed + readout.seconds * readout_jacobian, readout_jacobian=readout_jacobian)

@@ -1,1 +1,1 @@
-"""Least-squares solvers and the reprojection errors that they minimise."""
+"""Least-squares solvers and reprojection residuals."""

@@ -1,7 +1,7 @@
-"""Pose of one camera from landmarks it sees: robust least squares on pixels and depth (paper, Sec. III-E).
+"""Motion-only bundle adjustment: the pose of one camera from landmarks and their measurements (paper, Sec. III-E).
 
-The motion-only bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos, T-RO 2017). The errors (`reprojection`) are those
-that the bundle adjustment of the map minimises as well.
+Robust least squares on whitened pixel and inverse-depth residuals (`v3d_torch.optim.reprojection`), as in ORB-SLAM2
+(Mur-Artal and Tardos, T-RO 2017). The bundle adjustment of the map minimises the same residuals.
 
 Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with ``xi = [translation, rotation]``.
 """
@@ -20,37 +20,44 @@ from v3d_torch.geometry.se3 import rigid, se3_exp
 from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
 from v3d_torch.optim.reprojection import Measurements, chi_square, perspective, perspective_jacobian, whitened
 
+_TOLERANCE = 1e-3
+"""Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
+
+_REGULARISATION = 1e-9
+"""Added to the diagonal of the normal equations, which are singular without measurements."""
+
 
 @dataclass(frozen=True)
-class _View:
-    """A camera's pose, and the errors there. The N observations come last."""
+class _Linearisation:
+    """A camera pose and the residuals of N measurements there."""
 
     T_cw: Tensor  # (4, 4)
-    in_camera: Tensor  # (3, N), metres
-    seen: Tensor  # (3, N), as `perspective` gives it
-    errors: Tensor  # (3, N), sigmas
-    squared: Tensor  # (N,)
+    in_camera: Tensor  # (3, N), landmarks in the camera frame, metres
+    projected: Tensor  # (3, N), as returned by `perspective`
+    residuals: Tensor  # (3, N), whitened
+    squared: Tensor  # (N,), sum of squared residuals
 
 
 @dataclass(frozen=True)
 class PoseRefinement:
-    """A pose and what supports it.
+    """Result of a pose refinement.
 
     Attributes:
-        T_cw: world to camera, float64, shape :math:`(4, 4)`.
-        inliers: observations that agree with it, bool, shape :math:`(N,)`.
-        chi2: squared error of each in sigmas, float64, shape :math:`(N,)`; infinite behind the camera.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+        inliers: Mask of the measurements below their chi-square threshold, bool, shape :math:`(N,)`.
+        chi2: Squared whitened residual of each measurement, float64, shape :math:`(N,)`; infinite for landmarks behind
+            the camera.
     """
 
     T_cw: Tensor
     inliers: Tensor
     chi2: Tensor
-    _system: Callable[[], tuple[Tensor, Tensor]]
+    _normal_equations: Callable[[], tuple[Tensor, Tensor]]
 
     @property
     def information(self) -> Tensor:
-        """Inverse covariance of the pose's left perturbation, float64, shape :math:`(6, 6)`."""
-        return self._system()[0]
+        """Information matrix (inverse covariance) of the pose's left perturbation, float64, shape :math:`(6, 6)`."""
+        return self._normal_equations()[0]
 
 
 @torch.no_grad()
@@ -63,49 +70,51 @@ def refine_pose(
     rounds: int = 4,
     iterations: int = 5,
 ) -> PoseRefinement:
-    """Refine a predicted pose; observations are judged inliers or outliers anew after each round.
+    """Refine a predicted pose, and classify the measurements into inliers and outliers.
+
+    Each round optimises the pose on the current inliers, then classifies all measurements anew. The first half of the
+    rounds uses Huber's kernel; the other half uses plain least squares.
 
     Args:
-        T_cw: predicted world-to-camera pose, shape :math:`(4, 4)`.
-        points: landmarks, world frame, metres, float64, shape :math:`(N, 3)`.
-        measured: where each is seen.
-        camera: intrinsics.
-        rounds: of optimisation and judgement; Huber's kernel guards the first half, the rest polishes the inliers.
-        iterations: most steps in a round.
+        T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
+        points: Landmark of each measurement, world frame, metres, float64, shape :math:`(N, 3)`.
+        measured: Measured pixels and inverse depths of the landmarks.
+        camera: Intrinsics.
+        rounds: Maximum number of rounds.
+        iterations: Maximum number of Levenberg-Marquardt steps in a round.
 
     Returns:
-        The pose; the prediction itself, without inliers, where nothing supports any pose.
+        The refined pose and its inliers. Without measurements, the prediction.
     """
-    target, limits = whitened(measured, camera), measured.limit
+    target, thresholds = whitened(measured, camera), measured.limit
 
-    def view(T_cw: Tensor) -> _View:
+    def linearise(T_cw: Tensor) -> _Linearisation:
         in_camera = torch.addmm(T_cw[:3, 3:], T_cw[:3, :3], points.T)
-        seen = perspective(in_camera)
-        errors = target.errors(seen)
-        return _View(T_cw, in_camera, seen, errors, (errors * errors).sum(dim=0))
+        projected = perspective(in_camera)
+        residuals = target.errors(projected)
+        return _Linearisation(T_cw, in_camera, projected, residuals, (residuals * residuals).sum(dim=0))
 
-    def weigh(at: _View, kept: Tensor, limit: Tensor | float) -> tuple[float, Tensor]:
-        costs, weights = huber(at.squared, limit)
-        return float(costs @ kept), weights * kept
+    def robust_cost(at: _Linearisation, active: Tensor, threshold: Tensor | float) -> tuple[float, Tensor]:
+        costs, weights = huber(at.squared, threshold)
+        return float(costs @ active), weights * active
 
-    def normal_equations(at: _View, weights: Tensor) -> tuple[Tensor, Tensor]:
-        J, weighted = perspective_jacobian(at.seen).flatten(1), weights * target.scale
-        return (J * (weighted * target.scale).flatten()) @ J.T, J @ (weighted * at.errors).flatten()
+    def normal_equations(at: _Linearisation, weights: Tensor) -> tuple[Tensor, Tensor]:
+        J, weighted = perspective_jacobian(at.projected).flatten(1), weights * target.scale
+        return (J * (weighted * target.scale).flatten()) @ J.T, J @ (weighted * at.residuals).flatten()
 
-    def step(at: _View, weights: Tensor, damping: float) -> _View:
+    def step(at: _Linearisation, weights: Tensor, damping: float) -> _Linearisation:
         H, gradient = normal_equations(at, weights)
-        H.diagonal().mul_(1 + damping).add_(1e-9)  # solvable even where nothing is seen
-        return view(se3_exp(-torch.linalg.solve(H, gradient)) @ at.T_cw)
+        H.diagonal().mul_(1 + damping).add_(_REGULARISATION)
+        return linearise(se3_exp(-torch.linalg.solve(H, gradient)) @ at.T_cw)
 
-    at, inliers = view(T_cw), torch.ones(points.shape[0], dtype=torch.bool)
-    for turn in range(rounds):
-        robust = 2 * turn < rounds
-        problem = partial(weigh, kept=inliers.to(points.dtype), limit=limits if robust else torch.inf)
-        # Convergence is quadratic: after a step that gained a thousandth nothing worth a step is left.
-        found = levenberg_marquardt(at, problem, step, iterations, tolerance=1e-3)
-        at, before = found.state, inliers
-        chi2 = chi_square(at.in_camera.T, at.errors.T)
-        inliers = chi2 <= limits
-        if not robust and torch.equal(inliers, before):
+    at, inliers = linearise(T_cw), torch.ones(points.shape[0], dtype=torch.bool)
+    for index in range(rounds):
+        robust = 2 * index < rounds
+        problem = partial(robust_cost, active=inliers.to(points.dtype), threshold=thresholds if robust else torch.inf)
+        result = levenberg_marquardt(at, problem, step, iterations, tolerance=_TOLERANCE)
+        at, previous = result.state, inliers
+        chi2 = chi_square(at.in_camera.T, at.residuals.T)
+        inliers = chi2 <= thresholds
+        if not robust and torch.equal(inliers, previous):
             break
-    return PoseRefinement(rigid(at.T_cw), inliers, chi2, partial(normal_equations, at, found.system))
+    return PoseRefinement(rigid(at.T_cw), inliers, chi2, partial(normal_equations, at, result.system))

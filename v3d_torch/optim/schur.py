@@ -1,7 +1,13 @@
-"""The normal equations of a bundle adjustment, solved by the Schur complement.
+r"""Normal equations of a bundle adjustment, solved by the Schur complement.
 
-Landmarks, three unknowns each, are eliminated; what is left, 6 unknowns per pose, is solved densely (Triggs et al.,
-"Bundle Adjustment - A Modern Synthesis", 2000).
+With the free poses first and the points second, :math:`H = J^T W J` has the block structure
+
+.. math::
+    \begin{pmatrix} U & W^T \\ W & V \end{pmatrix}
+    \begin{pmatrix} \xi \\ \delta \end{pmatrix} = - \begin{pmatrix} g_{pose} \\ g_{point} \end{pmatrix}
+
+with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points are eliminated; the reduced camera
+system, 6 unknowns per pose, is solved densely (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
 """
 
 from __future__ import annotations
@@ -11,17 +17,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+_REGULARISATION = 1e-6
+"""Added to all diagonals: makes blocks without observations solvable. Small beside the information of an observation,
+which is 1e4 per square metre and more."""
+
 
 @dataclass(frozen=True)
 class NormalEquations:
-    r"""Blocks of :math:`J^T W J` and, behind the last column of the square ones, of :math:`J^T W r`.
+    r"""Blocks of the normal equations of F free poses, P points and N observations by free poses.
 
     Attributes:
-        U: pose by pose, for F free poses, shape :math:`(F, 6, 7)`.
-        V: point by point, shape :math:`(3, 4, P)`.
-        W: point by pose, for each of the N observations by free poses, shape :math:`(3, 6, N)`.
-        pose: which of the free poses that is, int64, shape :math:`(N,)`.
-        point: which point, int64, shape :math:`(N,)`.
+        U: Diagonal blocks of the poses, with the gradient :math:`g_{pose}` as last column, shape :math:`(F, 6, 7)`.
+        V: Diagonal blocks of the points, with the gradient :math:`g_{point}` as last column, shape :math:`(3, 4, P)`.
+        W: Point-by-pose block of each observation, shape :math:`(3, 6, N)`.
+        pose: Index of the free pose of each observation, int64, shape :math:`(N,)`.
+        point: Index of the point of each observation, int64, shape :math:`(N,)`.
     """
 
     U: Tensor
@@ -32,19 +42,28 @@ class NormalEquations:
 
 
 def columns(rows: Tensor, index: Tensor) -> Tensor:
-    """Columns of (n, K) chosen by (M,), shape (n, M); to gather by an index for each takes a quarter of indexing."""
+    """Gather columns of a matrix; faster than indexing.
+
+    Args:
+        rows: Matrix, shape :math:`(n, K)`.
+        index: Indices of the columns, int64, shape :math:`(M,)`.
+
+    Returns:
+        Shape :math:`(n, M)`.
+    """
     return rows.gather(1, index.expand(len(rows), -1))
 
 
 def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Tensor, Tensor]:
-    r"""Minimise the quadratic model with :math:`\lambda` times its diagonal added, by the Schur complement.
+    r"""Solve damped normal equations by the Schur complement.
 
-    With :math:`V = L L^T` and :math:`Y = L^{-1} W`, the points are gone from
+    With :math:`V = L L^T` and :math:`Y = L^{-1} W`, elimination of the points gives the reduced camera system
     :math:`(U - Y^T Y)\, \xi = -g_{pose} + Y^T L^{-1} g_{point}`.
 
     Args:
-        system: of F poses and P points.
-        damping: :math:`\lambda`; keeps directions that nothing observes (a point seen once, without depth) in place.
+        system: Normal equations of F poses and P points.
+        damping: Factor :math:`\lambda`; :math:`\lambda` times the diagonal is added. The damping keeps unobservable
+            directions in place, such as the depth of a point that was observed once without depth.
 
     Returns:
         Steps of the poses, shape :math:`(F, 6)`, and of the points, shape :math:`(P, 3)`.
@@ -54,29 +73,29 @@ def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Ten
     L = _cholesky(V)
     h = _forward(L, system.V[:, 3])
     blocks = _forward(columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
-    # Y is dense, as a local map is small and most poses see much of it; transposed, so that its blocks lie apart.
-    place = (
+    # Y is dense: a local map is small, and most of its poses observe many of its points. It is stored transposed, poses
+    # by points, with the points ordered by coordinate first, like h.
+    index = (
         (18 * P * system.pose + system.point) + P * torch.arange(3)[:, None, None] + 3 * P * torch.arange(6)[:, None]
     )
-    Yt = blocks.new_zeros(18 * F * P).scatter_add_(0, place.flatten(), blocks.flatten()).view(6 * F, 3 * P)
+    Yt = blocks.new_zeros(18 * F * P).scatter_add_(0, index.flatten(), blocks.flatten()).view(6 * F, 3 * P)
     S = -(Yt @ Yt.T)
     S.view(F, 6, F, 6).diagonal(dim1=0, dim2=2).add_(U)
     xi = torch.linalg.solve(S, Yt @ h.flatten() - system.U[..., 6].flatten())
-    moved = _backward(L, -(h + (Yt.T @ xi).view(3, P)))
-    return xi.view(F, 6), moved.T
+    delta = _backward(L, -(h + (Yt.T @ xi).view(3, P)))
+    return xi.view(F, 6), delta.T
 
 
 def _damp(blocks: Tensor, damping: float) -> Tensor:
-    """Blocks (n, n, count) with more on their diagonals."""
-    # Next to information of 1e4 per square metre and more, 1e-6 is nothing; a block that nothing observes needs it.
+    """Blocks (n, n, count) with damped diagonals."""
     blocks = blocks.clone()
     diagonal = blocks.diagonal(dim1=0, dim2=1)
-    diagonal.mul_(1 + damping).add_(1e-6)
+    diagonal.mul_(1 + damping).add_(_REGULARISATION)
     return blocks
 
 
 def _cholesky(V: Tensor) -> Tensor:
-    """Lower triangles of positive definite 3x3 blocks, both :math:`(3, 3, P)`: LAPACK takes longer for small ones."""
+    """Cholesky factors L of positive definite 3x3 blocks, both (3, 3, P); faster than LAPACK for small blocks."""
     L = torch.zeros_like(V)
     for row in range(3):
         for column in range(row + 1):
@@ -86,7 +105,7 @@ def _cholesky(V: Tensor) -> Tensor:
 
 
 def _forward(L: Tensor, b: Tensor) -> Tensor:
-    """Solve L x = b, block by block, for :math:`(3, 3, N)` and :math:`(3, ..., N)`."""
+    """Solve L x = b for each block, with L of shape (3, 3, N) and b of shape (3, ..., N)."""
     x = torch.empty_like(b)
     for row in range(3):
         x[row] = b[row]
@@ -97,5 +116,5 @@ def _forward(L: Tensor, b: Tensor) -> Tensor:
 
 
 def _backward(L: Tensor, b: Tensor) -> Tensor:
-    """Solve L^T x = b."""
+    """Solve L^T x = b for each block, with shapes as in `_forward`."""
     return _forward(L.transpose(0, 1).flip(0, 1), b.flip(0)).flip(0)

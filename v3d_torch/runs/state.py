@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from v3d_torch.config import Config, TrackerConfig
 from v3d_torch.errors import InputError
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.files import StrPath
 from v3d_torch.io.state_file import read_state, write_state

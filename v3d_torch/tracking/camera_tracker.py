@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from v3d_torch.features.orb import Features
+from v3d_torch.features.features import Features
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.odometry import CameraMotion

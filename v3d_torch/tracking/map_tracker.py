@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, TrackingConfig
-from v3d_torch.features.orb import Features, measurements, sample_depth
+from v3d_torch.features.features import Features, measurements, sample_depth
 from v3d_torch.features.projection_matcher import LocalMap, Projection, ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose

@@ -1,0 +1,26 @@
+"""Depth sampling and even selection of features."""
+
+from __future__ import annotations
+
+import torch
+
+from v3d_torch.features.features import sample_depth, select_evenly
+
+
+def test_sampled_depth_outside_the_image_is_zero() -> None:
+    depth = torch.arange(12, dtype=torch.float32).reshape(1, 3, 4)
+    pixel = torch.tensor([[0, 0], [3, 1], [-1, 1], [4, 1], [1, 3], [1, -1], [3, 2]])
+    assert sample_depth(pixel, depth, max_depth=10).tolist() == [0, 7, 0, 0, 0, 0, 0]
+
+
+def test_select_evenly_prefers_sparse_cells() -> None:
+    generator = torch.Generator().manual_seed(0)
+    crowded = torch.randint(0, 32, (500, 2), generator=generator)
+    sparse = torch.randint(0, 640, (60, 2), generator=generator)
+    pixel = torch.cat([crowded, sparse])
+    selected = select_evenly(pixel, 80, 32)
+    assert len(selected) == 80
+    assert (selected >= 500).sum() >= 55  # nearly all of the sparse pixels; a few share a cell
+    assert torch.equal(selected, selected.sort().values)
+    assert torch.equal(select_evenly(pixel, 1000, 32), torch.arange(560))
+    assert len(select_evenly(pixel, 0, 32)) == 0

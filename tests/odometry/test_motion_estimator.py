@@ -1,0 +1,43 @@
+"""Frame-to-frame registration of two views whose motion is known."""
+
+from __future__ import annotations
+
+import torch
+from helpers.two_views import CAMERA, two_views
+
+from v3d_torch.config import Config
+from v3d_torch.features.features import Features
+from v3d_torch.odometry.motion_estimator import MotionEstimator
+
+
+def test_convention_motion_maps_points_of_a_to_b() -> None:
+    a, b, T_ba = two_views()
+    motion = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
+    assert motion is not None
+    assert torch.allclose(motion.T_ba, T_ba, atol=1e-6)
+    assert motion.pairs.shape == (400, 2)
+
+
+def test_motion_is_correct_with_a_third_of_outliers() -> None:
+    a, b, T_ba = two_views(outliers=130, noise=0.3)
+    motion = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
+    assert motion is not None
+    assert torch.allclose(motion.T_ba, T_ba, atol=5e-3)
+    assert (motion.pairs[:, 0] >= 270).sum() < 10
+
+
+def test_motion_is_deterministic() -> None:
+    a, b, _ = two_views(outliers=130, noise=0.5)
+    estimate = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=7)
+    first, second = estimate(a, b), estimate(a, b)
+    assert first is not None
+    assert second is not None
+    assert torch.equal(first.T_ba, second.T_ba)
+
+
+def test_no_motion_without_depth_or_matches() -> None:
+    a, b, _ = two_views()
+    estimate = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)
+    without_depth = Features(a.uv, a.pixel, torch.zeros_like(a.depth), a.octave, a.descriptors)
+    assert estimate(without_depth, b) is None
+    assert estimate(a, b[:5]) is None

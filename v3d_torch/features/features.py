@@ -1,0 +1,134 @@
+"""Features of a frame: positions, depth, descriptors, and their measurement noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from v3d_torch.config import FeaturesConfig, TrackingConfig
+from v3d_torch.optim.reprojection import Measurements
+
+_NOT_GIVEN = torch.zeros(0, 2, dtype=torch.float64)
+
+_MIN_DEPTH = 1e-6
+"""Keeps 1/z finite for pixels without depth, metres."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """ORB features of a frame, with the depth of each.
+
+    Attributes:
+        uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
+        pixel: Nearest (column, row) in the recorded (distorted) image, int64, shape :math:`(N, 2)`.
+        depth: Depth along z, metres, float64, shape :math:`(N,)`; 0 = no measurement.
+        octave: Level of the scale pyramid, int64, shape :math:`(N,)`.
+        descriptors: 256-bit descriptors, uint8, shape :math:`(N, 32)`.
+        readout_jacobian: Derivative of ``uv`` by the readout time of a rolling shutter, pixels per second, float64,
+            shape :math:`(N, 2)`; 0 if not given, as for a camera at rest.
+    """
+
+    uv: Tensor
+    pixel: Tensor
+    depth: Tensor
+    octave: Tensor
+    descriptors: Tensor
+    readout_jacobian: Tensor = _NOT_GIVEN
+
+    def __post_init__(self) -> None:
+        if self.readout_jacobian is _NOT_GIVEN:
+            object.__setattr__(self, "readout_jacobian", torch.zeros_like(self.uv))
+
+    def __len__(self) -> int:
+        return self.uv.shape[0]
+
+    def __getitem__(self, keep: Tensor) -> Features:
+        """Select features by a boolean mask or by indices."""
+        return Features(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
+
+    @property
+    def inverse_depth(self) -> Tensor:
+        """Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement."""
+        return torch.where(self.depth > 0, 1.0 / self.depth.clamp(min=_MIN_DEPTH), 0.0)
+
+    def in_mask(self, mask: Tensor) -> Tensor:
+        """Check which features lie on the true pixels of a mask.
+
+        Args:
+            mask: Mask of the recorded image, bool, shape :math:`(H, W)`.
+
+        Returns:
+            Bool, shape :math:`(N,)`.
+        """
+        return mask[self.pixel[:, 1], self.pixel[:, 0]]
+
+
+def sample_depth(pixel: Tensor, depth: Tensor, max_depth: float) -> Tensor:
+    """Sample a depth image at pixels, without interpolation.
+
+    Args:
+        pixel: (column, row), int64, shape :math:`(N, 2)`; pixels outside the image have no depth.
+        depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+        max_depth: Depth beyond this counts as missing, metres.
+
+    Returns:
+        Depth, metres, float64, shape :math:`(N,)`; 0 = no measurement.
+    """
+    column, row = pixel.unbind(dim=1)
+    height, width = depth.shape[-2:]
+    z = depth[0, row.clamp(0, height - 1), column.clamp(0, width - 1)].to(torch.float64)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return torch.where(inside & (z <= max_depth), z, 0.0)
+
+
+def select_evenly(pixel: Tensor, count: int, cell: int) -> Tensor:
+    """Select pixels evenly over the cells of a grid: one of each cell first, then a second of each cell, and so on.
+
+    Args:
+        pixel: (column, row), int64, shape :math:`(N, 2)`.
+        count: Maximum number of selected pixels.
+        cell: Side of a cell, pixels.
+
+    Returns:
+        Indices of the selected pixels, int64, ascending, shape (min(N, count),).
+    """
+    if pixel.shape[0] <= count:
+        return torch.arange(pixel.shape[0])
+    columns = int(pixel[:, 0].max()) // cell + 1
+    key = (pixel[:, 1] // cell) * columns + pixel[:, 0] // cell
+    order = torch.argsort(key, stable=True)
+    rank = torch.empty_like(key)  # position of each pixel within its cell
+    rank[order] = torch.arange(key.shape[0]) - torch.searchsorted(key[order], key[order], side="left")
+    return torch.argsort(rank, stable=True)[:count].sort().values
+
+
+def pixel_sigma(octave: Tensor, config: TrackingConfig, pyramid: FeaturesConfig) -> Tensor:
+    """Standard deviation of feature positions: proportional to the pixel size of the feature's pyramid level.
+
+    Args:
+        octave: Level of the scale pyramid of each feature, int64, shape :math:`(N,)`.
+        config: Standard deviation at level 0.
+        pyramid: Scale factor between pyramid levels.
+
+    Returns:
+        Standard deviation of u and of v, pixels, float64, shape :math:`(N,)`.
+    """
+    return config.pixel_sigma * pyramid.scale ** octave.to(torch.float64)
+
+
+def measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
+    """Convert features to measurements with their noise.
+
+    Args:
+        features: Features of one frame.
+        config: Standard deviations of pixels and inverse depth.
+        pyramid: Scale factor between pyramid levels.
+    """
+    return Measurements(
+        uv=features.uv,
+        inverse_depth=features.inverse_depth,
+        pixel_sigma=pixel_sigma(features.octave, config, pyramid),
+        inverse_depth_sigma=config.inverse_depth_sigma,
+    )
