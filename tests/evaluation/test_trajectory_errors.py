@@ -23,11 +23,11 @@ from torch import Tensor
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
+from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, scale_error, spans_plane
-from v3d_torch.evaluation.pose_association import match
+from v3d_torch.evaluation.paper_tables import paper_scores, paper_sequence, paper_table
 from v3d_torch.evaluation.rpe import drift, pairs_apart, relative_errors, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
-from v3d_torch.evaluation.tables import paper_scores, paper_sequence, paper_table
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.types import Trajectory
 

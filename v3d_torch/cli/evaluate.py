@@ -43,7 +43,7 @@ def main(
     from v3d_torch.datasets.tum_trajectory import read_trajectory
     from v3d_torch.errors import InputError, V3DError
     from v3d_torch.evaluation import evaluate
-    from v3d_torch.evaluation.tables import paper_sequence, paper_table
+    from v3d_torch.evaluation.paper_tables import paper_sequence, paper_table
 
     try:
         truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)

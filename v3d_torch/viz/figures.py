@@ -17,9 +17,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from torch import Tensor
 
+from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.ate import absolute_errors, align
-from v3d_torch.evaluation.pose_association import match
-from v3d_torch.evaluation.report import is_oriented
+from v3d_torch.evaluation.evaluation import is_oriented
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.io.files import atomic_write
 from v3d_torch.types import Trajectory

@@ -14,9 +14,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.evaluation.association import match
 from v3d_torch.evaluation.ate import absolute_errors
-from v3d_torch.evaluation.pose_association import match
-from v3d_torch.evaluation.report import Evaluation
+from v3d_torch.evaluation.evaluation import Evaluation
 from v3d_torch.evaluation.rpe import drift
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figures import with_gaps

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import OutputError
-from v3d_torch.evaluation.pose_association import match
-from v3d_torch.evaluation.report import is_oriented
+from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.evaluation import is_oriented
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses

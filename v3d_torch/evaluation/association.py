@@ -1,4 +1,4 @@
-"""Which pose of the estimate belongs to which of the ground truth."""
+"""Association of estimated poses with ground-truth poses by timestamp."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from v3d_torch.io.timestamps import associate
 from v3d_torch.types import Trajectory
 
 MAX_TIME_DIFFERENCE = 0.02
-"""Stamps farther apart than this are no pair, seconds (the benchmark's own choice)."""
+"""Maximum difference between the timestamps of a pair, seconds. The default of the TUM benchmark's tools."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Poses of the same time, one to one, in order of the estimate.
+    """Pairs of ground-truth and estimated poses, one to one, in the order of the estimate.
 
     Attributes:
-        groundtruth: indices into the ground truth, int64, shape :math:`(M,)`.
-        estimate: indices into the estimate, int64, shape :math:`(M,)`.
+        groundtruth: Indices into the ground truth, int64, shape :math:`(M,)`.
+        estimate: Indices into the estimate, int64, shape :math:`(M,)`.
     """
 
     groundtruth: Tensor
@@ -31,12 +31,12 @@ class Matches:
 
 
 def match(groundtruth: Trajectory, estimate: Trajectory, max_time_difference: float = MAX_TIME_DIFFERENCE) -> Matches:
-    """Pair poses by nearest stamps, the nearest pair first, as the TUM benchmark's ``associate.py`` does.
+    """Associate poses by nearest timestamps, the nearest pair first, as the TUM benchmark's ``associate.py`` does.
 
     Args:
-        groundtruth: poses of the reference.
-        estimate: poses to be judged.
-        max_time_difference: farther stamps are no pair, seconds.
+        groundtruth: Ground-truth poses.
+        estimate: Estimated poses.
+        max_time_difference: Maximum difference between the timestamps of a pair, seconds.
     """
     pairs = associate(estimate.stamps.tolist(), groundtruth.stamps.tolist(), max_time_difference)
     indices = torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2)
