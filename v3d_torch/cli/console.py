@@ -29,8 +29,8 @@ from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.logged_run import describe_motion, log_to, run_logged
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import prepare_folder
+from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
-from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
 
 
 @contextmanager
