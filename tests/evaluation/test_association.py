@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.types import Trajectory
 
 
@@ -25,5 +25,5 @@ def test_association_is_one_to_one_and_nearest_first(seed: int) -> None:
             used_a.add(i)
             used_b.add(j)
     estimate, groundtruth = (Trajectory(torch.from_numpy(s), torch.eye(4).expand(len(s), 4, 4)) for s in (a, b))
-    matches = match(groundtruth, estimate, 0.0205)
+    matches = associate_trajectories(groundtruth, estimate, 0.0205)
     assert list(zip(matches.estimate.tolist(), matches.groundtruth.tolist(), strict=True)) == sorted(expected)

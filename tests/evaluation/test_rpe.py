@@ -11,7 +11,7 @@ from helpers.trajectories import assert_statistics, noisy, random_walk
 from torch import Tensor
 
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.rpe import motion_errors, pairs_apart, relative_errors, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.se3 import se3_exp
@@ -63,7 +63,7 @@ def test_convention_rpe_pair_deviates_by_at_most_half_of_delta(second: float, pa
 def test_rpe_default_delta_is_one_second() -> None:
     groundtruth = random_walk(90, seed=16)
     estimate = noisy(groundtruth, seed=17)
-    matches = match(groundtruth, estimate)
+    matches = associate_trajectories(groundtruth, estimate)
     by_default = relative_pose_error(groundtruth, estimate, matches)
     assert by_default is not None and by_default.delta == 1.0
     assert by_default == relative_pose_error(groundtruth, estimate, matches, 1.0)
@@ -80,8 +80,8 @@ def test_rpe_skips_poses_without_ground_truth() -> None:
     groundtruth = random_walk(60, seed=18)
     estimate = noisy(groundtruth, seed=19)
     late = Trajectory(groundtruth.stamps[10:], groundtruth.T_wc[10:])
-    errors = motion_errors(late, estimate, match(late, estimate), 0.5)
-    all_errors = motion_errors(groundtruth, estimate, match(groundtruth, estimate), 0.5)
+    errors = motion_errors(late, estimate, associate_trajectories(late, estimate), 0.5)
+    all_errors = motion_errors(groundtruth, estimate, associate_trajectories(groundtruth, estimate), 0.5)
     assert errors.first.tolist() == [first for first in all_errors.first.tolist() if first >= 10]
     torch.testing.assert_close(errors.trans, all_errors.trans[10:])
 

@@ -21,11 +21,11 @@ def make_cluster(rejected: int, label: str = "person 3") -> Cluster:
 
 def test_rejected_points_are_black(tmp_path: Path) -> None:
     save_clusters_figure([make_cluster(0)], tmp_path / "none.png")
-    save_clusters_figure([make_cluster(150)], tmp_path / "most.png")
-    none, most = read_picture(tmp_path / "none.png"), read_picture(tmp_path / "most.png")
+    save_clusters_figure([make_cluster(150)], tmp_path / "many.png")
+    none, many = read_picture(tmp_path / "none.png"), read_picture(tmp_path / "many.png")
     half = none.shape[1] // 2
-    assert count_pixels(most[150:600, :half], BLACK) > count_pixels(none[150:600, :half], BLACK) + 100
-    assert count_pixels(none[:, :half], BLUE) > 150 > count_pixels(most[:, :half], BLUE)
+    assert count_pixels(many[150:600, :half], BLACK) > count_pixels(none[150:600, :half], BLACK) + 100
+    assert count_pixels(none[:, :half], BLUE) > 150 > count_pixels(many[:, :half], BLUE)
     save_clusters_figure([make_cluster(150), make_cluster(10, "chair 4")], tmp_path / "both.svg")
     words = re.findall(r"<!-- (.+?) -->", (tmp_path / "both.svg").read_text())
     assert {

@@ -72,8 +72,8 @@ def test_few_poses_and_static_camera_are_drawn(tmp_path: Path, poses: int, groun
 
 
 def test_curve_has_gap_where_poses_are_missing(tmp_path: Path) -> None:
-    kept = torch.cat([torch.arange(0, 20), torch.arange(40, 60)])
-    estimate = Trajectory(arc().stamps[kept], arc().T_wc[kept])
+    present = torch.cat([torch.arange(0, 20), torch.arange(40, 60)])
+    estimate = Trajectory(arc().stamps[present], arc().T_wc[present])
     save_trajectory_figure(None, estimate, tmp_path / "figure.svg")
     line = re.findall(r'<path d="([^"]+)"[^>]*stroke: #1f77b4', (tmp_path / "figure.svg").read_text())[0]
     assert line.count("M") == 2

@@ -46,13 +46,13 @@ PAPER_SAYS = (
 """Results of the paper's ablation study."""
 
 PAPER_RATIOS: Mapping[str, float] = {"baseline": 4 / 0.92, "no_voting": 4.0, "no_chamfer": 1.06, FULL: 1.0}
-"""ATE of a variant divided by the full system's ATE, from `PAPER_SAYS`."""
+"""ATE of a variant divided by the full system's ATE, from `PAPER_RESULTS`."""
 
 TIMES_FULL = (
     "Ratio to full: ATE divided by the full system's ATE, geometric mean over the sequences on which both were run;"
     " (paper): according to the paper's text."
 )
-"""Explanation of the last rows of `overview`."""
+"""Explanation of the last rows of `make_overview_table`."""
 
 _RATIO_ROW = "ratio to full"
 

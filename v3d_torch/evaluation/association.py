@@ -30,7 +30,9 @@ class Matches:
         return self.estimate.shape[0]
 
 
-def match(groundtruth: Trajectory, estimate: Trajectory, max_time_difference: float = MAX_TIME_DIFFERENCE) -> Matches:
+def associate_trajectories(
+    groundtruth: Trajectory, estimate: Trajectory, max_time_difference: float = MAX_TIME_DIFFERENCE
+) -> Matches:
     """Associate poses by nearest timestamps, the nearest pair first, as the TUM benchmark's ``associate.py`` does.
 
     Args:

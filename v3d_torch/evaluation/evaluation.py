@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, match
+from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
 from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align, scale_error
 from v3d_torch.evaluation.rpe import RPE, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
@@ -84,7 +84,7 @@ def evaluate(
                 f"the {name} is a {type(value).__name__}, not a Trajectory; read a file with read_trajectory, or build"
                 " a Trajectory from arrays"
             )
-    matches = match(groundtruth, estimate, max_time_difference)
+    matches = associate_trajectories(groundtruth, estimate, max_time_difference)
     if len(matches) < MIN_PAIRS:
         raise InputError(
             f"only {len(matches)} poses of the estimate {_time_range(estimate)} are within {max_time_difference:g} s of"

@@ -28,8 +28,8 @@ class Outcome:
     def figure(self, place: str) -> float | None:
         """Return a metric by its dotted key, such as ``ate.rmse``; None if it was not measured."""
         value: Any = self.metrics
-        for key in place.split("."):
-            value = (value or {}).get(key)
+        for name in place.split("."):
+            value = (value or {}).get(name)
         return value
 
     def __str__(self) -> str:

@@ -64,7 +64,7 @@ def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
     """Return a table of the paper's methods and a result on the same sequence, the best RMSE of each column in green.
 
     Args:
-        sequence: Name of the sequence, in any notation accepted by `paper_sequence`.
+        sequence: Name of the sequence, in any notation accepted by `find_paper_sequence`.
         evaluation: Evaluation of the result.
 
     Returns:

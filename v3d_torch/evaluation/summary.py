@@ -56,7 +56,7 @@ def error_tables(
 
 
 def markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return a Markdown document with all tables and the runs that failed; see `error_tables`."""
+    """Return a Markdown document with all tables and the runs that failed; see `make_error_tables`."""
     lines = ["# Summary", "", LEGEND]
     tables = error_tables(outcomes, absent=absent)
     if any(method.endswith(_PAPER_SUFFIX) for table in tables for method in table.methods):
@@ -68,14 +68,14 @@ def markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
 
 
 def latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return all tables as LaTeX, which requires the package booktabs; see `error_tables`."""
+    """Return all tables as LaTeX, which requires the package booktabs; see `make_error_tables`."""
     tables = error_tables(outcomes, absent=absent)
     lines = [PACKAGES, *(line for table in tables for line in latex_table(table, LEGEND))]
     return "\n".join(lines) + "\n"
 
 
 def csv_text(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return all values as CSV, unrounded, one line per metric, sequence and method; see `error_tables`.
+    """Return all values as CSV, unrounded, one line per metric, sequence and method; see `make_error_tables`.
 
     The last column is the standard deviation of the errors, as in the paper's tables: the median over the seeds.
     """
@@ -93,7 +93,7 @@ def csv_text(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
 
 
 def screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[Table]:
-    """Return the tables for the screen, with only the first and the last method of the paper; see `error_tables`."""
+    """Return the tables for the screen, with the first and the last method of the paper; see `make_error_tables`."""
     return [screen_table(table) for table in error_tables(outcomes, _SCREEN_METHODS, absent)]
 
 

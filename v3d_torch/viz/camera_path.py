@@ -48,7 +48,7 @@ def camera_path(
 
     Args:
         trajectory: Poses of all frames.
-        statuses: Tracking status of each frame: "tracked", or a key of `STATUS_COLOURS`.
+        statuses: Tracking status of each frame: "tracked", or a key of `PATH_COLOURS`.
         T_wk: Camera-to-world poses of the keyframes, float64, shape :math:`(K, 4, 4)`.
         frames: Frame index of each keyframe, -1 for a keyframe of an earlier run.
         camera: Camera, which determines the shape of the frustums.

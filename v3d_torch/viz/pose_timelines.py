@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from v3d_torch.evaluation import Evaluation
-from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors
 from v3d_torch.evaluation.rpe import motion_errors
 from v3d_torch.types import Trajectory
@@ -57,7 +57,7 @@ def draw_errors(
         evaluation: Evaluation of the estimate.
         statuses: Tracking status of each frame. Frames that were not tracked are shaded.
     """
-    matches = match(groundtruth, estimate)
+    matches = associate_trajectories(groundtruth, estimate)
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
     seconds = estimate.stamps - estimate.stamps[0]
     curves = [

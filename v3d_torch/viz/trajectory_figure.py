@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
 from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.evaluation.statistics import Statistics
@@ -62,7 +62,7 @@ def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title:
     p_e = estimate.T_wc[:, :3, 3]
     curves: list[tuple[Tensor, Tensor, str, str]] = [(estimate.stamps, p_e, "tab:blue", "estimate")]
     segments, error = torch.zeros(0, 2, 3), 0.0
-    matches = match(groundtruth, estimate) if groundtruth is not None else None
+    matches = associate_trajectories(groundtruth, estimate) if groundtruth is not None else None
     if groundtruth is not None and matches:
         T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
         alignment = align(T_gc, T_ec, oriented=has_orientations(groundtruth))

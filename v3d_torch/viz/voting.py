@@ -108,7 +108,7 @@ def _legend_handles(objects: Mapping[int, Overlay], *, ineffective: bool) -> lis
     states = [(name, colour) for name, colour in MOTION_STATE_COLOURS.items() if name in present]
     thin_line = [Line2D([], [], color=VOTE_COLOUR, alpha=0.5, linewidth=0.7, label="vote without effect")]
     return [
-        Line2D([], [], color=VOTE_COLOUR, linewidth=2.0, label="vote (distance changed)"),
+        Line2D([], [], color=VOTE_COLOUR, linewidth=2.0, label="vote"),
         *(thin_line if ineffective else []),
         *(Line2D([], [], color=colour, label=name, marker="o", linestyle="none") for name, colour in states),
     ]

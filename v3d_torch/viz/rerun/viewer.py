@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import OutputError
-from v3d_torch.evaluation.association import match
+from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
@@ -149,7 +149,7 @@ class RerunViewer:
         if self._unaligned is None or status is TrackingStatus.LOST:
             return
         truth = self._unaligned
-        matches = match(truth, Trajectory(torch.tensor([stamp], dtype=torch.float64), T_ec[None]))
+        matches = associate_trajectories(truth, Trajectory(torch.tensor([stamp], dtype=torch.float64), T_ec[None]))
         if not len(matches):
             return
         T_eg = T_ec @ invert(truth.T_wc[matches.groundtruth[0]])
