@@ -29,8 +29,8 @@ from sequences import listed, located, trained_vocabulary
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.cells import row, spread
-from v3d_torch.evaluation.tables import paper_scores, paper_sequence
+from v3d_torch.evaluation.paper_tables import paper_scores, paper_sequence
+from v3d_torch.evaluation.tables import row, spread
 from v3d_torch.types import TrackingStatus
 
 CONFIGURATIONS = {

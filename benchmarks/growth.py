@@ -28,7 +28,7 @@ from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import Config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
-from v3d_torch.evaluation.cells import row
+from v3d_torch.evaluation.tables import row
 from v3d_torch.geometry.se3 import invert, se3_exp
 
 BLOCKS = 10

@@ -23,9 +23,9 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import InputError, V3DError
+from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
-from v3d_torch.evaluation.cells import row
-from v3d_torch.evaluation.pose_association import match
+from v3d_torch.evaluation.tables import row
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import MaskFolder, NoSegmentation
@@ -234,7 +234,7 @@ def true_poses(sequence: RGBDSequence) -> Tensor:
     if sequence.groundtruth is None:
         raise InputError(f"{sequence.name}: has no ground truth; name another sequence")
     T_gc = torch.full((len(sequence), 4, 4), torch.nan, dtype=torch.float64)
-    matches = match(sequence.groundtruth, Trajectory(sequence.stamps, T_gc))
+    matches = associate_trajectories(sequence.groundtruth, Trajectory(sequence.stamps, T_gc))
     T_gc[matches.estimate] = sequence.groundtruth.T_wc[matches.groundtruth]
     return T_gc
 

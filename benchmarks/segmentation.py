@@ -22,7 +22,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.cells import row
+from v3d_torch.evaluation.tables import row
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter

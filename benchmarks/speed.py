@@ -21,7 +21,7 @@ from sequences import located, trained_vocabulary
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import V3DError
-from v3d_torch.evaluation.cells import row, spread
+from v3d_torch.evaluation.tables import row, spread
 
 REFERENCE = "pyorbslam3"
 CONTENDERS = (*OURS, *PEERS)

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.paper_tables import paper_scores
 from v3d_torch.evaluation.summary import csv_text, error_tables, latex, markdown, screen_tables
-from v3d_torch.evaluation.tables import paper_scores
 
 
 def runs(sequence: str, config: str, *ates: float | None) -> list[Outcome]:

@@ -1,4 +1,4 @@
-"""``python -m v3d_torch evaluate`` as a user calls it."""
+"""``python -m v3d_torch evaluate`` as called by a user."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from v3d_torch.types import Trajectory
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[str, str]:
-    """A ground truth and an estimate that is 1 cm off now and then."""
+    """A ground truth, and an estimate with an error of 1 cm in every ninth pose."""
     generator = torch.Generator().manual_seed(0)
     stamps = torch.arange(90, dtype=torch.float64) / 30
     T_wc = se3_exp(torch.randn(90, 6, dtype=torch.float64, generator=generator))
@@ -36,7 +36,7 @@ def call(*arguments: str) -> Result:
     return CliRunner().invoke(app, list(arguments), env={"COLUMNS": "120", "NO_COLOR": "1"})
 
 
-def test_from_the_shell(files: tuple[str, str]) -> None:
+def test_json_from_the_shell(files: tuple[str, str]) -> None:
     command = [sys.executable, "-m", "v3d_torch", "evaluate", *files, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
     values = json.loads(done.stdout)
@@ -44,15 +44,15 @@ def test_from_the_shell(files: tuple[str, str]) -> None:
     assert values["rpe"]["rot"]["max"] < 1e-4 and values["coverage"] is None
 
 
-def test_help_loads_nothing_heavy() -> None:
-    """What takes seconds to import is imported when there is work to do."""
+def test_import_of_command_loads_no_heavy_library() -> None:
+    """Libraries that take seconds to import are imported after the options are parsed."""
     heavy = {"torch", "scipy", "cv2", "numpy"}
     probe = f"import sys, v3d_torch.cli.evaluate; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "[]"
 
 
-def test_tables(files: tuple[str, str]) -> None:
+def test_tables_have_coverage_units_and_the_papers_methods(files: tuple[str, str]) -> None:
     result = call(*files, "--sequence", "fr3/w/rpy", "--frames", "100")
     assert result.exit_code == 0
     assert "90 of 90 poses have ground truth, 90.0% of the frames" in result.stdout
@@ -60,23 +60,23 @@ def test_tables(files: tuple[str, str]) -> None:
         assert words in result.stdout
 
 
-def test_the_sequence_is_guessed_from_a_path(files: tuple[str, str], tmp_path: Path) -> None:
+def test_sequence_is_guessed_from_path(files: tuple[str, str], tmp_path: Path) -> None:
     assert "DynaSLAM" not in call(*files).stdout
     named = tmp_path / "rgbd_dataset_freiburg3_walking_rpy.txt"
     named.write_bytes(Path(files[0]).read_bytes())
     assert "0.0354" in call(str(named), files[1]).stdout
 
 
-def test_another_delta_is_named_in_the_unit(files: tuple[str, str]) -> None:
+def test_unit_of_rpe_contains_other_delta(files: tuple[str, str]) -> None:
     assert "RPE, m/0.5 s" in call(*files, "--delta", "0.5").stdout
 
 
-def test_notes_are_shown(files: tuple[str, str]) -> None:
+def test_notes_are_printed(files: tuple[str, str]) -> None:
     assert "note: no two poses with ground truth are 10 s apart: no RPE" in call(*files, "--delta", "10").stdout
 
 
 @pytest.mark.parametrize("case", ["missing", "broken", "elsewhere", "sequence"])
-def test_bad_input_is_one_sentence_and_exit_code_2(case: str, files: tuple[str, str], tmp_path: Path) -> None:
+def test_bad_input_is_one_line_and_exit_code_2(case: str, files: tuple[str, str], tmp_path: Path) -> None:
     bad = tmp_path / "bad.txt"
     arguments = [files[0], str(bad)]
     if case == "broken":
@@ -92,7 +92,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(case: str, files: tuple[str, 
     assert result.stderr.startswith("error: ") and "bad.txt" in result.stderr and result.stderr.count("\n") == 1
 
 
-def test_the_commands_defaults_are_the_functions() -> None:
+def test_defaults_of_command_equal_those_of_function() -> None:
     command, function = (inspect.signature(f).parameters for f in (main, evaluate))
     assert command["max_difference"].default == function["max_time_difference"].default
     assert command["delta"].default == function["rpe_delta"].default

@@ -1,4 +1,4 @@
-"""``python -m v3d_torch report`` as a user calls it: one page with everything in it, whatever the run left behind."""
+"""``python -m v3d_torch report`` as called by a user: one self-contained page, also from incomplete results."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ from v3d_torch.types import Instances, RGBDFrame
 from v3d_torch.viz.report_page import render_page
 
 VOID = {"meta", "link", "img", "br", "hr", "input"}
-OPTIONAL = {"tr", "td", "th", "p", "li"}  # HTML closes them itself
+OPTIONAL = {"tr", "td", "th", "p", "li"}  # their end tags are optional in HTML
 
 
 class Page(HTMLParser):
-    """What is in a page: its words, its addresses, and whether it is well formed."""
+    """Parsed page: its text and its URLs. The constructor checks that it is well formed."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
-        self.words = ""
-        self.addresses: list[str] = []
+        self.text = ""
+        self.urls: list[str] = []
         self.images = 0
         self._open: list[str] = []
         self.feed(html)
         assert [tag for tag in self._open if tag not in OPTIONAL] == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "xlink:href")]
+        self.urls += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "xlink:href")]
         self.images += tag == "img"
         if tag not in VOID:
             self._open.append(tag)
@@ -67,7 +67,7 @@ class Page(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self._open and self._open[-1] not in ("style", "script"):
-            self.words += data + " "
+            self.text += data + " "
 
 
 def run_into(folder: Path, sequence: Wall, segment: Callable[[RGBDFrame], Instances], *overrides: str) -> None:
@@ -79,7 +79,7 @@ def run_into(folder: Path, sequence: Wall, segment: Callable[[RGBDFrame], Instan
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of a run by the paper's literal rules over three things, with masks saved."""
+    """Results of a run without the free-space check over three objects, with saved masks."""
     folder = tmp_path_factory.mktemp("results")
     run_into(folder, Wall(), squares, "objects.free_space.enabled=false")
     return folder
@@ -96,7 +96,7 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def call_here(*arguments: str | Path) -> Result:
-    """In this process, which has loaded everything already."""
+    """Call the command in this process, which has loaded the libraries already."""
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
@@ -107,48 +107,55 @@ def page_of(folder: Path, groundtruth: Path | None = None) -> Page:
 # --- a page
 
 
-def test_the_command_makes_one_page_with_everything_in_it(copy: Path) -> None:
+def test_command_writes_one_self_contained_page(copy: Path) -> None:
     done = call(copy)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == f"report: {copy / 'report.html'}\n"
     html = (copy / "report.html").read_text(encoding="utf-8")
     page = Page(html)
     assert html.startswith("<!doctype html>")
-    assert all(address.startswith(("data:image/", "#")) for address in page.addresses), page.addresses
+    assert all(url.startswith(("data:image/", "#")) for url in page.urls), page.urls
     assert "<script" not in html and "@import" not in html and "<link" not in html
     assert not re.search(r"url\((?!#)", html)
     assert page.images == 3  # masks, votes, clusters
-    assert "copy <b>& " in page.words  # not markup
+    assert "copy <b>& " in page.text  # escaped, so not parsed as markup
     metrics = json.loads((copy / "metrics.json").read_text())
     for number in (f"{metrics['ate']['rmse']:.4f} m", f"{metrics['rpe']['trans']['rmse']:.4f} m/s", f"{FRAMES} of"):
-        assert number in page.words
-    for words in ("person 1", "chair 2", "tv 3", "segmentation", "objects.free_space.enabled", "left out", "torch"):
-        assert words in page.words
-    assert (
-        "mapping.max_keyframe_interval" in page.words and "features.count" not in page.words
-    )  # only what is not the default
+        assert number in page.text
+    for words in (
+        "person 1",
+        "chair 2",
+        "tv 3",
+        "segmentation",
+        "objects.free_space.enabled",
+        "left out of tracking",
+        "torch",
+    ):
+        assert words in page.text
+    # Only values that differ from the default are listed.
+    assert "mapping.max_keyframe_interval" in page.text and "features.count" not in page.text
     assert "prefers-color-scheme: dark" in html and "@media print" in html
 
 
-def test_the_page_names_the_folder_itself(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_has_name_of_resolved_folder(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "latest").symlink_to(copy.name)
     monkeypatch.chdir(copy)
     for folder in (Path(), tmp_path / "latest"):
-        assert "A run of V3D-SLAM, copy <b>&" in page_of(folder).words
+        assert "A run of V3D-SLAM, copy <b>&" in page_of(folder).text
 
 
-def test_plots_are_drawings_and_the_same_again(results: Path) -> None:
+def test_plots_are_valid_svg_and_reproducible(results: Path) -> None:
     html = render_page(read_run(results))
-    drawings = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)
-    assert len(drawings) == 8  # way, axes, errors, statuses, masks, objects, bars, stages over time
-    for drawing in drawings:
-        ET.fromstring(drawing)  # noqa: S314
+    plots = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)
+    assert len(plots) == 8  # trajectory, positions, errors, statuses, masks, objects, stage bars, stages over time
+    for plot in plots:
+        ET.fromstring(plot)  # noqa: S314
     references, ids = set(re.findall(r'href="#([^"]+)"', html)), set(re.findall(r' id="([^"]+)"', html))
     assert references <= ids
     assert render_page(read_run(results)) == html
 
 
-def test_the_scores_are_those_of_the_run(results: Path) -> None:
+def test_errors_equal_those_of_the_run(results: Path) -> None:
     evaluation = read_run(results).evaluation
     metrics = json.loads((results / "metrics.json").read_text())
     assert evaluation is not None and evaluation.rpe is not None
@@ -157,74 +164,80 @@ def test_the_scores_are_those_of_the_run(results: Path) -> None:
     assert evaluation.coverage == 1.0
 
 
-def test_help_is_instant() -> None:
+def test_help_takes_little_processor_time() -> None:
     before = os.times()
     assert "--groundtruth" in call("--help").stdout
-    assert os.times().children_user - before.children_user < 3  # of the processor, which others may use too
+    assert os.times().children_user - before.children_user < 3  # processor time, independent of the load of the machine
 
 
-# --- results that are not whole
+# --- incomplete results
 
 
-def test_a_run_that_ended_early_says_so(tmp_path: Path) -> None:
+def test_page_reports_run_that_ended_early(tmp_path: Path) -> None:
     for broken, poses in ((0, 0), (1, 1), (6, 6)):
         run_into(tmp_path / str(broken), Wall(broken=broken), square)
         page = page_of(tmp_path / str(broken))
-        assert f"ended early, after {poses} of {FRAMES} frames: rgb/x.png: is truncated" in " ".join(page.words.split())
-        assert ("There are no poses" in page.words) == (poses == 0)
-        assert ("ATE RMSE" in page.words) == (poses >= 3)
+        assert f"ended early, after {poses} of {FRAMES} frames: rgb/x.png: is truncated" in " ".join(page.text.split())
+        assert ("There are no poses" in page.text) == (poses == 0)
+        assert ("ATE RMSE" in page.text) == (poses >= 3)
 
 
 @pytest.mark.parametrize(
-    ("missing", "said", "images"),
+    ("missing", "texts", "images"),
     [
-        (["dynamics.parquet", "groundtruth.txt"], ["There is no dynamics.parquet", "There is no ground truth"], 3),
+        (
+            ["dynamics.parquet", "groundtruth.txt"],
+            ["not known: dynamics.parquet is missing", "There is no ground truth"],
+            3,
+        ),
         (["frames.parquet", "config.yaml", "keyframes.txt"], ["There is no config.yaml", "0 keyframes"], 3),
         (["trajectory.txt", "figures"], ["trajectory.txt is missing", "person 1"], 0),
     ],
 )
-def test_a_file_that_is_not_there_leaves_a_gap_and_the_rest(
-    copy: Path, missing: list[str], said: list[str], images: int
+def test_missing_file_is_reported_and_the_rest_is_shown(
+    copy: Path, missing: list[str], texts: list[str], images: int
 ) -> None:
     for name in missing:
         (shutil.rmtree if (copy / name).is_dir() else os.unlink)(copy / name)
     page = page_of(copy)
-    assert all(words in page.words for words in [*said, "Who moves", "Mean time of each stage", "Versions"])
+    assert all(text in page.text for text in [*texts, "Objects", "Mean time of each stage", "Versions"])
     assert page.images == images
 
 
 @pytest.mark.parametrize(
-    ("moving", "static", "said"),
+    ("moving", "static", "expected"),
     [
         (0.5, 0.25, "50.0 % of the moving and 25.0 % of the static pixels"),
         (None, 0.25, "25.0 % of the static pixels"),
         (0.5, None, "50.0 % of the moving pixels"),
     ],
 )
-def test_what_the_true_masks_say(copy: Path, moving: float | None, static: float | None, said: str) -> None:
+def test_masked_percentages_are_shown_as_far_as_measured(
+    copy: Path, moving: float | None, static: float | None, expected: str
+) -> None:
     metrics = json.loads((copy / "metrics.json").read_text())
     metrics["masks"] = {"moving_left_out": moving, "static_left_out": static}
     write_text(copy / "metrics.json", json.dumps(metrics))
-    assert f"Against the true masks: {said} were left out of tracking." in page_of(copy).words
+    assert f"Compared with the ground-truth masks, {expected} were left out of tracking." in page_of(copy).text
 
 
-def test_without_objects(tmp_path: Path) -> None:
+def test_page_of_run_without_objects(tmp_path: Path) -> None:
     run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
     page = page_of(tmp_path)
-    assert "No object was found in any frame" in page.words
+    assert "No object was detected in any frame" in page.text
     assert page.images == 1
 
 
-def test_ground_truth_from_elsewhere(copy: Path, tmp_path: Path) -> None:
+def test_ground_truth_from_other_file_is_used(copy: Path, tmp_path: Path) -> None:
     (copy / "groundtruth.txt").rename(tmp_path / "truth.txt")
     assert read_run(copy).evaluation is None
-    assert "ATE RMSE" in page_of(copy, tmp_path / "truth.txt").words
+    assert "ATE RMSE" in page_of(copy, tmp_path / "truth.txt").text
 
 
-# --- what is wrong is said in a sentence
+# --- errors
 
 
-def test_no_results_and_broken_ones_are_a_sentence_each(copy: Path, tmp_path: Path) -> None:
+def test_missing_results_and_unusable_ground_truth_are_one_line_each(copy: Path, tmp_path: Path) -> None:
     write_text(tmp_path / "late.txt", "9000.0 0 0 0 0 0 0 1\n9000.1 0 0 0 0 0 0 1\n")
     for arguments, words in (
         ([tmp_path / "nowhere"], "nowhere: holds no results of a run"),
@@ -247,26 +260,26 @@ def halve(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def test_the_folder_above_runs_names_the_newest(tmp_path: Path) -> None:
+def test_folder_above_runs_is_an_error_that_suggests_the_newest(tmp_path: Path) -> None:
     names = ("demo/2026-01-01", "demo/2026-01-02", "study/desk/full/seed0")
     for age, name in enumerate(names):
         write_text(tmp_path / name / "metrics.json", "{}")
         os.utime(tmp_path / name / "metrics.json", ns=(0, 10**9 * (10 - age)))
-    for above, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
+    for parent, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
         with pytest.raises(InputError, match=re.escape(f"; give the newest of the runs in it, {tmp_path / newest}")):
-            read_run(tmp_path / above)
+            read_run(tmp_path / parent)
     (tmp_path / "demo/latest").symlink_to("2026-01-01")
     with pytest.raises(InputError, match=r"in it, .*latest$"):
         read_run(tmp_path / "demo")
 
 
-def test_a_file_of_a_run_names_its_folder(copy: Path) -> None:
+def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
     with pytest.raises(InputError, match=re.escape(f"; give the folder that map.ply is in, {copy}")):
         read_run(copy / "map.ply")
 
 
 @pytest.mark.parametrize(
-    ("name", "spoil", "message"),
+    ("name", "damage", "message"),
     [
         ("metrics.json", halve, r"metrics\.json: is no JSON"),
         ("metrics.json", lambda path: without(path, "status"), r"metrics\.json: status: field required"),
@@ -279,25 +292,27 @@ def test_a_file_of_a_run_names_its_folder(copy: Path) -> None:
             lambda path: pq.write_table(pq.read_table(path).drop(["stamp"]), path),
             "lacks the columns stamp",
         ),
-        ("figures/masks.png", halve, r"masks\.png: is truncated"),
-        ("masks/0.100000.png", lambda path: path.write_bytes(b"x"), r"0\.100000\.png: is truncated"),
+        ("figures/masks.png", halve, r"masks\.png: is truncated or not an image"),
+        ("masks/0.100000.png", lambda path: path.write_bytes(b"x"), r"0\.100000\.png: is truncated or not an image"),
     ],
 )
-def test_a_broken_file_is_named(copy: Path, name: str, spoil: Callable[[Path], object], message: str) -> None:
-    spoil(copy / name)
+def test_damaged_file_is_an_error_with_its_path(
+    copy: Path, name: str, damage: Callable[[Path], object], message: str
+) -> None:
+    damage(copy / name)
     with pytest.raises(InputError, match=message):
         render_page(read_run(copy))
 
 
-def test_a_configuration_of_another_version_is_shown_but_not_compared(copy: Path) -> None:
+def test_configuration_of_other_version_is_shown_but_not_compared(copy: Path) -> None:
     write_text(copy / "config.yaml", "seed: 3\nno_longer_there: true\n")
     page = page_of(copy)
-    assert "cannot be compared" in page.words and "no_longer_there: true" in page.words
+    assert "cannot be compared" in page.text and "no_longer_there: true" in page.text
 
 
-def test_other_stamps_in_the_tables_do_no_harm(copy: Path) -> None:
-    """Tables of two runs in one folder: rows are drawn at the times that they say."""
+def test_objects_with_other_timestamps_than_frames_are_drawn(copy: Path) -> None:
+    """Tables of two runs in one folder: objects are drawn at their own timestamps."""
     table = pq.read_table(copy / "dynamics.parquet")
     stamps: Tensor = torch.tensor(table.column("stamp").to_pylist(), dtype=torch.float64) + 0.05
     late = table.set_column(1, "stamp", [stamps.tolist()])
-    assert "person 1" in Page(render_page(replace(read_run(copy), dynamics=late))).words
+    assert "person 1" in Page(render_page(replace(read_run(copy), dynamics=late))).text

@@ -25,8 +25,8 @@ from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets import PAPER_SEQUENCES, locate, short_name
 from v3d_torch.evaluation.ablation import VARIANTS, overview
 from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.paper_tables import paper_scores
 from v3d_torch.evaluation.summary import csv_text, latex, markdown
-from v3d_torch.evaluation.tables import paper_scores
 
 SHORT = [short_name(name) for name in PAPER_SEQUENCES]
 SERVED = [name for name in PAPER_SEQUENCES if name.endswith(("walking_xyz", "sitting_rpy"))]
@@ -180,12 +180,12 @@ def test_the_study_has_all_variants_and_the_tables_the_three_that_were_asked_for
     assert ours == ["sequence", "full", "paper", "baseline"]
 
     study = table_in((out / "ablation.md").read_text(), "Ablation: ATE, m")
-    assert list(study) == [*SHORT, "times full", "times full (paper)"]
+    assert list(study) == [*SHORT, "ratio to full", "ratio to full (paper)"]
     assert [method for method in study["fr3/w/xyz"] if method != "sequence"] == list(VARIANTS)
     assert study["fr3/w/xyz"]["no_voting"] == "0.0200" and study["fr3/s/xyz"]["no_voting"] == "not here"
     full = 1 + VARIANTS.index("full")
-    assert study["times full"]["no_voting"] == f"{2 / full:.2f}" and study["times full"]["full"] == "1.00"
-    assert (study["times full (paper)"]["no_voting"], study["times full (paper)"]["not_upright"]) == ("4.00", "-")
+    assert study["ratio to full"]["no_voting"] == f"{2 / full:.2f}" and study["ratio to full"]["full"] == "1.00"
+    assert (study["ratio to full (paper)"]["no_voting"], study["ratio to full (paper)"]["not_upright"]) == ("4.00", "-")
     for name in ("summary.tex", "ablation.tex"):
         text = (out / name).read_text()
         assert text.startswith("% \\usepackage{booktabs}") and "not here" in text
@@ -194,7 +194,7 @@ def test_the_study_has_all_variants_and_the_tables_the_three_that_were_asked_for
     )
     rows = list(csv.DictReader((out / "ablation.csv").open(newline="")))
     assert len(rows) == len(pretended) and {row["variant"] for row in rows} == set(VARIANTS)
-    assert "times full" in result.stdout
+    assert "ratio to full" in result.stdout
     assert len(pd.read_parquet(out / "runs.parquet")) == len(pretended)
 
 
@@ -253,7 +253,7 @@ def test_without_any_run_there_is_no_overview_and_a_variant_without_its_like_has
     runs = [Outcome("fr3/w/xyz", "no_voting", 0, metrics_of(0.04)), Outcome("fr3/s/xyz", "full", 0, metrics_of(0.02))]
     table = overview(runs)
     assert table is not None
-    assert [cell.text for cell in table.rows["times full"]] == ["-", "1.00"]
+    assert [cell.text for cell in table.rows["ratio to full"]] == ["-", "1.00"]
 
 
 def test_the_ratio_is_the_geometric_mean_over_the_sequences() -> None:
@@ -264,7 +264,7 @@ def test_the_ratio_is_the_geometric_mean_over_the_sequences() -> None:
     ]
     table = overview(runs)
     assert table is not None
-    assert [cell.text for cell in table.rows["times full"]] == ["4.00", "1.00"]
+    assert [cell.text for cell in table.rows["ratio to full"]] == ["4.00", "1.00"]
 
 
 def test_rows_without_a_sequence_keep_the_papers_order_and_figures() -> None:

@@ -1,4 +1,4 @@
-"""Masks and ids against truth: numbers against plain loops, properties, true masks from files, a run that is scored."""
+"""Mask evaluation: scores against plain loops, properties, ground-truth masks from files, scores of a run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.base import HasMotionMasks
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation.masks import MaskEvaluation, count_changes, covering_ids, people_in_view, tally
+from v3d_torch.evaluation.masks import MaskEvaluation, count_id_switches, covering_ids, people_in_view, tally
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
 from v3d_torch.slam import V3DSLAM
@@ -26,27 +26,27 @@ from v3d_torch.types import Instances, RGBDFrame
 
 H, W = 9, 11
 VALUES = [0, 0, 0, 1, 2, 7, 254, 255]
-"""Of true masks: much is static, some is nobody's."""
+"""Values of a ground-truth mask: many static pixels, some unsure."""
 
 
 def random_truth(seed: int) -> Tensor:
     return torch.from_numpy(np.random.default_rng(seed).choice(np.array(VALUES, dtype=np.uint8), (H, W)))
 
 
-def random_mask(seed: int, share: float = 0.5) -> Tensor:
-    return torch.from_numpy(np.random.default_rng(seed).random((H, W)) < share)
+def random_mask(seed: int, fraction: float = 0.5) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).random((H, W)) < fraction)
 
 
-def everybody(truth: Tensor) -> Tensor:
+def all_people(truth: Tensor) -> Tensor:
     return people_in_view(truth, torch.ones_like(truth, dtype=torch.bool), 1)
 
 
-# --- what is left out
+# --- fractions left out of tracking
 
 
 @given(st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
 @settings(max_examples=40, deadline=None)
-def test_shares_equal_a_loop_over_pixels(seeds: list[int]) -> None:
+def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
     evaluation = MaskEvaluation()
     counts = {"moving": [0, 0], "static": [0, 0], "anywhere": [0, 0]}
     for stamp, seed in enumerate(seeds):
@@ -72,23 +72,23 @@ def test_shares_equal_a_loop_over_pixels(seeds: list[int]) -> None:
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
-def test_counts_over_a_batch_are_those_of_its_images(seed: int) -> None:
+def test_tally_of_batch_equals_tally_of_each_image(seed: int) -> None:
     left_out = torch.stack([random_mask(seed + k) for k in range(6)]).reshape(2, 3, H, W)
-    among = torch.stack([random_mask(seed + 6 + k) for k in range(6)]).reshape(2, 3, H, W)
-    batch = tally(left_out, among)
+    region = torch.stack([random_mask(seed + 6 + k) for k in range(6)]).reshape(2, 3, H, W)
+    batch = tally(left_out, region)
     assert batch.shape == (2, 3, 2) and batch.dtype == torch.int64
     for i in range(2):
         for j in range(3):
-            assert torch.equal(batch[i, j], tally(left_out[i, j], among[i, j]))
+            assert torch.equal(batch[i, j], tally(left_out[i, j], region[i, j]))
 
 
-def test_convention_the_share_is_of_pixels_not_of_frames() -> None:
-    """A frame full of people weighs more than one with a sleeve."""
+def test_convention_fractions_are_over_pixels_not_frames() -> None:
+    """A frame full of people has more weight than a frame with a sleeve."""
     evaluation = MaskEvaluation()
     depth = torch.ones(1, 10, 10)
-    everywhere, corner = torch.ones(10, 10, dtype=torch.uint8), torch.zeros(10, 10, dtype=torch.uint8)
+    full, corner = torch.ones(10, 10, dtype=torch.uint8), torch.zeros(10, 10, dtype=torch.uint8)
     corner[0, 0] = 1
-    evaluation.add(0.0, everywhere, depth, torch.ones(10, 10, dtype=torch.bool), {})
+    evaluation.add(0.0, full, depth, torch.ones(10, 10, dtype=torch.bool), {})
     evaluation.add(1.0, corner, depth, torch.zeros(10, 10, dtype=torch.bool), {})
     scores = evaluation.scores()
     assert scores is not None
@@ -96,7 +96,7 @@ def test_convention_the_share_is_of_pixels_not_of_frames() -> None:
     assert scores.static_left_out == 0.0
 
 
-def test_who_is_only_about_there_is_neither_moving_nor_static() -> None:
+def test_unsure_pixels_are_neither_moving_nor_static() -> None:
     evaluation = MaskEvaluation()
     truth = torch.full((10, 10), 255, dtype=torch.uint8)
     evaluation.add(0.0, truth, torch.ones(1, 10, 10), torch.ones(10, 10, dtype=torch.bool), {})
@@ -106,30 +106,30 @@ def test_who_is_only_about_there_is_neither_moving_nor_static() -> None:
     assert scores.people == () and scores.id_changes_per_60_frames is None
 
 
-def test_without_a_true_mask_there_are_no_scores() -> None:
+def test_evaluation_without_frames_has_no_scores() -> None:
     assert MaskEvaluation().scores() is None
 
 
-# --- who is in view, and which object covers whom
+# --- people in view, and the objects that cover them
 
 
-def test_in_view_is_who_has_enough_pixels_with_depth() -> None:
+def test_people_in_view_have_enough_pixels_with_depth() -> None:
     truth = torch.zeros(4, 10, dtype=torch.uint8)
     truth[0], truth[1, :5], truth[2], truth[3] = 3, 4, 5, 255
     measured = torch.ones(4, 10, dtype=torch.bool)
     measured[2, :6] = False
     assert people_in_view(truth, measured, 5).tolist() == [3, 4]
     assert people_in_view(truth, measured, 4).tolist() == [3, 4, 5]
-    assert people_in_view(truth, measured, 0).tolist() == [3, 4, 5]  # nobody who is not there
+    assert people_in_view(truth, measured, 0).tolist() == [3, 4, 5]  # absent people are not in view
 
 
 @given(st.integers(0, 10_000), st.lists(st.integers(1, 40), unique=True, max_size=6))
 @settings(max_examples=80, deadline=None)
-def test_covering_objects_equal_sets_of_pixels(seed: int, ids: list[int]) -> None:
+def test_covering_objects_equal_a_loop_over_sets_of_pixels(seed: int, ids: list[int]) -> None:
     truth = random_truth(seed)
-    people = everybody(truth)
+    people = all_people(truth)
     objects = {}
-    for k, id_ in enumerate(ids):  # each a person's mask with some noise, so that overlaps lie around a half
+    for k, id_ in enumerate(ids):  # a person's mask with noise, so that overlaps are around one half
         person = int(np.random.default_rng(seed + k).choice(VALUES[3:7]))
         objects[id_] = (truth == person) ^ random_mask(seed + k, 0.08)
     expected = []
@@ -137,56 +137,56 @@ def test_covering_objects_equal_sets_of_pixels(seed: int, ids: list[int]) -> Non
         own = {tuple(p) for p in (truth == person).nonzero().tolist()}
         best, best_overlap = 0, 0.5
         for id_, mask in objects.items():
-            seen = {tuple(p) for p in mask.nonzero().tolist()}
-            if (overlap := len(own & seen) / len(own | seen)) > best_overlap:
+            covered = {tuple(p) for p in mask.nonzero().tolist()}
+            if (overlap := len(own & covered) / len(own | covered)) > best_overlap:
                 best, best_overlap = id_, overlap
         expected.append(best)
     assert covering_ids(truth, people, objects).tolist() == expected
 
 
-def test_an_object_over_two_people_is_the_larger_ones() -> None:
+def test_object_over_two_people_covers_the_larger_one() -> None:
     truth = torch.zeros(10, 10, dtype=torch.uint8)
     truth[:, :6], truth[:, 6:8] = 1, 2
-    assert covering_ids(truth, everybody(truth), {5: truth > 0}).tolist() == [5, 0]
+    assert covering_ids(truth, all_people(truth), {5: truth > 0}).tolist() == [5, 0]
     half = truth == 1
-    half[:, :3] = False  # exactly a half is not enough
-    assert covering_ids(truth, everybody(truth), {5: half}).tolist() == [0, 0]
+    half[:, :3] = False  # an overlap of exactly one half is not enough
+    assert covering_ids(truth, all_people(truth), {5: half}).tolist() == [0, 0]
     half[0, 0] = True
-    assert covering_ids(truth, everybody(truth), {5: half}).tolist() == [5, 0]
+    assert covering_ids(truth, all_people(truth), {5: half}).tolist() == [5, 0]
 
 
-# --- changes of ids
+# --- id switches
 
-STAYS = st.lists(st.tuples(st.sampled_from([0.1, 0.4, 0.7]), st.integers(0, 3)), max_size=25)
-"""Seconds since the frame before, and the id."""
-
-
-def as_tensors(stays: list[tuple[float, int]]) -> tuple[Tensor, Tensor]:
-    stamps = torch.tensor([gap for gap, _ in stays], dtype=torch.float64).cumsum(0)
-    return stamps, torch.tensor([id_ for _, id_ in stays], dtype=torch.int64)
+VISITS = st.lists(st.tuples(st.sampled_from([0.1, 0.4, 0.7]), st.integers(0, 3)), max_size=25)
+"""Seconds since the previous frame, and the id."""
 
 
-@given(STAYS)
+def to_tensors(visits: list[tuple[float, int]]) -> tuple[Tensor, Tensor]:
+    stamps = torch.tensor([gap for gap, _ in visits], dtype=torch.float64).cumsum(0)
+    return stamps, torch.tensor([id_ for _, id_ in visits], dtype=torch.int64)
+
+
+@given(VISITS)
 @settings(max_examples=200, deadline=None)
-def test_changes_equal_a_loop_over_frames(stays: list[tuple[float, int]]) -> None:
-    last, changes = 0, 0
-    for gap, id_ in stays:
+def test_id_switches_equal_a_loop_over_frames(visits: list[tuple[float, int]]) -> None:
+    last, switches = 0, 0
+    for gap, id_ in visits:
         if gap > 0.5:
             last = 0
         if id_:
-            changes += last not in (0, id_)
+            switches += last not in (0, id_)
             last = id_
-    assert count_changes(*as_tensors(stays), absence=0.5) == changes
+    assert count_id_switches(*to_tensors(visits), absence=0.5) == switches
 
 
-@given(STAYS)
+@given(VISITS)
 @settings(max_examples=50, deadline=None)
-def test_names_of_ids_do_not_matter_nor_does_a_longer_memory_forgive(stays: list[tuple[float, int]]) -> None:
-    stamps, ids = as_tensors(stays)
+def test_id_switches_are_invariant_to_renaming_and_grow_with_absence(visits: list[tuple[float, int]]) -> None:
+    stamps, ids = to_tensors(visits)
     renamed = torch.tensor([0, 17, 4, 9])[ids]
-    changes = count_changes(stamps, ids, absence=0.5)
-    assert count_changes(stamps, renamed, absence=0.5) == changes
-    assert count_changes(stamps, ids, absence=10.0) >= changes >= count_changes(stamps, ids, absence=0.05) == 0
+    switches = count_id_switches(stamps, ids, absence=0.5)
+    assert count_id_switches(stamps, renamed, absence=0.5) == switches
+    assert count_id_switches(stamps, ids, absence=10.0) >= switches >= count_id_switches(stamps, ids, absence=0.05) == 0
 
 
 def person_at(column: int, value: int = 1) -> Tensor:
@@ -195,12 +195,12 @@ def person_at(column: int, value: int = 1) -> Tensor:
     return truth
 
 
-def test_a_story_of_two_people() -> None:
-    """One keeps an id but for a slip, is missed for a while and has another one then; the other leaves for long."""
+def test_scores_of_two_people() -> None:
+    """The first switches ids twice, is missed, and returns with another id. The second is out of view for long."""
     evaluation = MaskEvaluation()
     depth, nothing = torch.ones(1, 48, 64), torch.zeros(48, 64, dtype=torch.bool)
-    first = [3, 3, 8, 3, 0, 0, 9, 9]  # 3 changes: to 8, back, and to 9 over the gap
-    second = [5, 5, None, None, None, None, None, 6]  # 0.6 s out of view: 6 may be somebody else
+    first = [3, 3, 8, 3, 0, 0, 9, 9]  # 3 switches: to 8, back to 3, and to 9 over the gap
+    second = [5, 5, None, None, None, None, None, 6]  # 0.6 s out of view: 6 is not a switch
     for frame, (a, b) in enumerate(zip(first, second, strict=True)):
         truth = person_at(2) + (person_at(40, 2) if b is not None else 0)
         objects = {id_: mask for id_, mask in ((a, person_at(2) > 0), (b, person_at(41) > 0)) if id_}
@@ -213,8 +213,8 @@ def test_a_story_of_two_people() -> None:
     assert json.loads(json.dumps(scores.to_dict()))["people"][0]["id_changes"] == 3
 
 
-def test_a_sliver_is_not_in_view() -> None:
-    """0.3 % of 48 x 64 pixels are 9, and they need depth."""
+def test_person_with_few_pixels_is_not_in_view() -> None:
+    """0.3 % of 48 x 64 pixels are 9 pixels, and they need depth."""
     for pixels, without_depth, in_view in ((8, 0, []), (9, 0, [7]), (9, 1, [])):
         truth, depth = torch.zeros(48, 64, dtype=torch.uint8), torch.ones(1, 48, 64)
         truth[0, :pixels] = 7
@@ -226,7 +226,7 @@ def test_a_sliver_is_not_in_view() -> None:
         assert [person.id for person in scores.people] == in_view
 
 
-# --- true masks from files
+# --- ground-truth masks from files
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
@@ -236,7 +236,7 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Five frames of a noisy wall that a camera slides along, their depth 4 ms after the colour."""
+    """Five frames of a camera that slides along a noisy wall, with depth 4 ms after colour."""
     root = tmp_path / "wall"
     noise = np.random.default_rng(0).integers(0, 256, (60, 120, 3), dtype=np.uint8)
     wall = cv2.resize(noise, (480, 240), interpolation=cv2.INTER_CUBIC)
@@ -256,7 +256,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_convention_true_masks_are_named_by_the_depth(folder: Path) -> None:
+def test_convention_ground_truth_masks_are_named_by_depth_stamp(folder: Path) -> None:
     sequence = TUMSequence(folder)
     assert isinstance(sequence, HasMotionMasks)
     for index in range(5):
@@ -266,14 +266,14 @@ def test_convention_true_masks_are_named_by_the_depth(folder: Path) -> None:
         assert truth.unique().tolist() == [0, 7 + index] and int((truth > 0).sum()) == 60 * 60
 
 
-def test_a_frame_may_have_none(folder: Path) -> None:
+def test_frame_without_ground_truth_mask_has_none(folder: Path) -> None:
     (folder / "masks" / "1.204000.png").unlink()
     sequence = TUMSequence(folder)
     assert [sequence.motion_mask(index) is None for index in range(5)] == [False, False, True, False, False]
 
 
 @pytest.mark.parametrize("case", ["colour", "16 bit", "truncated", "size"])
-def test_a_true_mask_that_is_none_is_named(case: str, folder: Path) -> None:
+def test_invalid_ground_truth_mask_is_an_error_with_its_path(case: str, folder: Path) -> None:
     path = folder / "masks" / "1.004000.png"
     images = {"colour": np.zeros((240, 320, 3), np.uint8), "16 bit": np.zeros((240, 320), np.uint16)}
     if case == "truncated":
@@ -284,18 +284,18 @@ def test_a_true_mask_that_is_none_is_named(case: str, folder: Path) -> None:
         TUMSequence(folder).motion_mask(0)
 
 
-# --- what a run makes of it
+# --- scores of a run
 
 
 def square(frame: RGBDFrame) -> Instances:
-    """The person, three columns too far left."""
+    """Return the person, three columns too far left."""
     mask = torch.zeros(1, 240, 320, dtype=torch.bool)
     mask[:, 90:150, 127:187] = True
     return Instances(mask, torch.zeros(1, dtype=torch.int64), torch.ones(1), torch.tensor([[127.0, 90, 187, 150]]))
 
 
 def run(folder: Path, out: Path) -> dict[str, object]:
-    """Metrics of a run over the wall, in which the network finds the square."""
+    """Return the metrics of a run over the wall in which the network finds the square."""
     sequence = TUMSequence(folder)
     exact = [f"objects.static_mask.{growth}=0" for growth in ("depth_margin", "surface_margin", "dilation")]
     config = load_config(overrides=[*exact, "objects.clouds.stride=1"])
@@ -305,8 +305,8 @@ def run(folder: Path, out: Path) -> dict[str, object]:
     return json.loads((out / "metrics.json").read_text())
 
 
-def test_a_run_is_scored_and_does_not_see_the_truth(folder: Path, tmp_path: Path) -> None:
-    for path in (folder / "masks").iterdir():  # the same person all the time
+def test_run_is_scored_and_does_not_depend_on_ground_truth_masks(folder: Path, tmp_path: Path) -> None:
+    for path in (folder / "masks").iterdir():  # the same person in all frames
         write_png(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED).clip(0, 1))
     metrics = run(folder, tmp_path / "known")
     assert metrics["failure"] is None

@@ -1,4 +1,4 @@
-"""Squares in drawn pictures."""
+"""Segmentation of drawn pictures into squares."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from v3d_torch.types import Instances, RGBDFrame
 
 
 def squares(frame: RGBDFrame) -> Instances:
-    """Three things side by side; the one on the left slides over the wall."""
+    """Return three objects side by side, the left one sliding along the wall."""
     masks = torch.zeros(3, 240, 320, dtype=torch.bool)
     for i, column in enumerate((20 + 4 * frame.index, 130, 220)):
         masks[i, 90:150, column : column + 60] = True

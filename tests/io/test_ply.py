@@ -16,7 +16,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.io.ply import write_ply
 from v3d_torch.types import Trajectory
-from v3d_torch.viz.frustums import STATUS_COLOURS, CameraPath, camera_path
+from v3d_torch.viz.camera_path import STATUS_COLOURS, CameraPath, camera_path
 
 CAMERA = PinholeCamera(fx=500.0, fy=510.0, cx=300.0, cy=250.0)
 

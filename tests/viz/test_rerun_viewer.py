@@ -1,4 +1,4 @@
-"""What rerun is shown of a run, read back from the recording; and that nothing changes where nobody looks on."""
+"""Rerun recordings read back and compared with the run; runs without a viewer; viewers that cannot be shown."""
 
 from __future__ import annotations
 
@@ -32,20 +32,21 @@ from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.motion_classifier import FrameObjects, MotionState
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.runtime.viewer import NULL_VIEWER
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
-from v3d_torch.viz.ballots import lines_of
-from v3d_torch.viz.figures import MOTION_STATE_COLOURS
-from v3d_torch.viz.rerun.scene import CLASS_IDS
+from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
+from v3d_torch.viz.rerun.objects import CLASS_IDS
 from v3d_torch.viz.rerun.stream import open_stream
 from v3d_torch.viz.rerun.viewer import RerunViewer
-from v3d_torch.viz.viewer import NULL_VIEWER, make_viewer
+from v3d_torch.viz.viewer import make_viewer
+from v3d_torch.viz.voting import split_votes
 
 Row = dict[str, Any]
 
 
 class Recording:
-    """Rows of a recording by entity, in the order in which they were logged."""
+    """Rows of a recording by entity, in the order of logging."""
 
     def __init__(self, path: Path) -> None:
         self._rows: dict[str, list[tuple[int, int | None, Row]]] = {}
@@ -65,31 +66,31 @@ class Recording:
         return {path for path in self._rows if not path.startswith("/__")}
 
     def at(self, entity: str) -> dict[int | None, Row]:
-        """Rows by frame; of those of one frame the last."""
+        """Return the last row of each frame."""
         return {frame: row for _, frame, row in self._rows[entity]}
 
     def all(self, entity: str) -> list[Row]:
-        """All rows."""
+        """Return all rows."""
         return [row for _, _, row in self._rows[entity]]
 
 
-class Witness:
-    """What the system said after each frame, to compare the recording with."""
+class RunLog:
+    """State of the SLAM system after each frame, for comparison with the recording."""
 
     def __init__(self, slam: V3DSLAM) -> None:
         self._slam = slam
-        self.scenes: list[FrameObjects] = []
+        self.objects: list[FrameObjects] = []
         self.frames: list[RGBDFrame] = []
         self.T_wc: list[NDArray[np.float64]] = []
-        self.ways: list[NDArray[np.float64]] = []
+        self.positions: list[NDArray[np.float64]] = []
         self.keyframes: list[list[int]] = []
         self.landmarks: list[int] = []
 
-    def __call__(self, frame: RGBDFrame, scene: FrameObjects, status: TrackingStatus) -> None:
+    def __call__(self, frame: RGBDFrame, objects: FrameObjects, status: TrackingStatus) -> None:
         self.frames.append(frame)
-        self.scenes.append(scene)
+        self.objects.append(objects)
         self.T_wc.append(invert(self._slam.poses.T_cw).numpy())
-        self.ways.append(self._slam.poses.trajectory().T_wc[:, :3, 3].numpy())
+        self.positions.append(self._slam.poses.trajectory().T_wc[:, :3, 3].numpy())
         self.keyframes.append([keyframe.frame for keyframe in self._slam.mapper.map.keyframes])
         self.landmarks.append(int(self._slam.mapper.map.landmarks["alive"].sum()))
 
@@ -98,11 +99,12 @@ CONFIG = (
     *("mapping.max_keyframe_interval=5", "objects.free_space.enabled=false"),
     *("objects.voting.baselines=[0.3]", "objects.chamfer.baseline=0.0"),
 )
-"""A keyframe every five frames, and the paper's vote, so late that shapes are compared before anybody is voted out."""
+"""A keyframe every five frames, and the paper's voting, over a baseline so long that Chamfer distances are measured
+before an object is voted dynamic."""
 
 
 class Tilted(Wall):
-    """The wall, with a ground truth in another world that begins before the frames."""
+    """The wall, with a ground truth in another world frame that begins before the first image."""
 
     T_gw = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.5, -0.3, 0.2], dtype=torch.float64))
 
@@ -114,22 +116,22 @@ class Tilted(Wall):
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, Witness, Pipeline]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, RunLog, Pipeline]:
     path = tmp_path_factory.mktemp("rerun") / "new" / "folder" / "run.rrd"
     sequence = Tilted()
     slam = V3DSLAM(CAMERA, squares, load_config(overrides=CONFIG))
-    witness = Witness(slam)
+    log = RunLog(slam)
     pipeline = Pipeline(sequence, slam, viewer=make_viewer(None, path, sequence))
-    run = pipeline(witness)
+    run = pipeline(log)
     pipeline.flush()
     assert run.failure is None
-    return Recording(path), witness, pipeline
+    return Recording(path), log, pipeline
 
 
-# --- what is in the recording
+# --- content of a recording
 
 
-def test_all_entities_are_there(recorded: tuple[Recording, Witness, Pipeline]) -> None:
+def test_recording_has_all_entities(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
     recording, _, pipeline = recorded
     world = ("camera", "objects", "centroids", "votes", "votes/without_effect", "trajectory", "trajectory/newest")
     image = ("", "/rgb", "/depth", "/masks", "/objects")
@@ -139,28 +141,28 @@ def test_all_entities_are_there(recorded: tuple[Recording, Witness, Pipeline]) -
         *(f"/world/{name}" for name in (*world, "map/landmarks", "map/keyframes", "groundtruth")),
         *(f"/world/camera/image{name}" for name in image),
         *(f"/seconds/{stage}" for stage in stages),
-        *("/votes/1", "/votes/2", "/votes/3", "/chamfer/1", "/verdicts", "/log"),
+        *("/votes/1", "/votes/2", "/votes/3", "/chamfer/1", "/frame_summary", "/log"),
     }
 
 
-def test_convention_the_camera_is_where_the_system_says(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    recording, witness, pipeline = recorded
+def test_convention_camera_pose_is_camera_to_world(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    recording, log, pipeline = recorded
     rows = recording.at("/world/camera")
     assert list(rows) == list(range(FRAMES))
     for index, row in rows.items():
         assert index is not None
-        np.testing.assert_allclose(row["translation"][0], witness.T_wc[index][:3, 3], atol=1e-6)
+        np.testing.assert_allclose(row["translation"][0], log.T_wc[index][:3, 3], atol=1e-6)
         R = np.reshape(row["mat3x3"][0], (3, 3)).T  # column by column
-        np.testing.assert_allclose(R, witness.T_wc[index][:3, :3], atol=1e-6)
+        np.testing.assert_allclose(R, log.T_wc[index][:3, :3], atol=1e-6)
     assert [row["stamp"].timestamp() for row in rows.values()] == pytest.approx(pipeline.sequence.stamps.tolist())
     (pinhole,) = recording.all("/world/camera/image")
     np.testing.assert_allclose(np.reshape(pinhole["image_from_camera"][0], (3, 3)).T, CAMERA.K)
     assert pinhole["resolution"][0] == [CAMERA.width, CAMERA.height]
 
 
-def test_images_are_those_of_the_frame(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    recording, witness, _ = recorded
-    for index, frame in enumerate(witness.frames):
+def test_images_equal_those_of_the_frame(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    recording, log, _ = recorded
+    for index, frame in enumerate(log.frames):
         jpeg = np.array(recording.at("/world/camera/image/rgb")[index]["blob"][0], dtype=np.uint8)
         image = cv2.imdecode(jpeg, cv2.IMREAD_COLOR_RGB).astype(float)
         assert np.abs(image - frame.image.permute(1, 2, 0).numpy()).mean() < 12  # noise, in JPEG
@@ -169,132 +171,122 @@ def test_images_are_those_of_the_frame(recorded: tuple[Recording, Witness, Pipel
         assert depth.dtype == np.uint16 and set(np.unique(depth)) == {round(WALL * row["meter"][0])}
 
 
-def test_verdicts_have_the_colours_of_the_figures(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    """In the masks, on the boxes and in the clouds."""
-    recording, witness, _ = recorded
+def test_motion_states_have_the_colours_of_the_figures(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    """In the masks, in the boxes and in the clouds."""
+    recording, log, _ = recorded
     (world,) = recording.all("/world")
     classes = {entry["class_id"]: entry["class_description"]["info"] for entry in world["context"][0]}
-    for verdict, number in CLASS_IDS.items():
-        assert classes[number]["label"] == verdict.value
-        red, green, blue = (round(255 * part) for part in to_rgba(MOTION_STATE_COLOURS[verdict])[:3])
+    for motion_state, number in CLASS_IDS.items():
+        assert classes[number]["label"] == motion_state.value
+        red, green, blue = (round(255 * part) for part in to_rgba(MOTION_STATE_COLOURS[motion_state])[:3])
         assert classes[number]["color"] == red << 24 | green << 16 | blue << 8 | 255
     assert classes[0]["color"] & 255 == 0
-    seen = set()
-    for index, scene in enumerate(witness.scenes):
+    present = set()
+    for index, frame_objects in enumerate(log.objects):
         buffer = np.array(recording.at("/world/camera/image/masks")[index]["buffer"][0], dtype=np.uint8)
         expected = np.zeros((240, 320), dtype=np.uint8)
-        for judged in scene.objects:
-            expected[judged.mask.numpy()] = CLASS_IDS[judged.motion_state]
+        for obj in frame_objects.objects:
+            expected[obj.mask.numpy()] = CLASS_IDS[obj.motion_state]
         assert np.array_equal(buffer.reshape(240, 320), expected)
         boxes = recording.at("/world/camera/image/objects")[index]
         assert boxes["labels"] == ["person 1", "chair 2", "tv 3"]
-        assert boxes["class_ids"] == [CLASS_IDS[judged.motion_state] for judged in scene.objects]
+        assert boxes["class_ids"] == [CLASS_IDS[obj.motion_state] for obj in frame_objects.objects]
         np.testing.assert_allclose(boxes["half_sizes"], 3 * [[30, 30]])
         np.testing.assert_allclose(boxes["centers"], [[50 + 4 * index, 120], [160, 120], [250, 120]])
         cloud = recording.at("/world/objects")[index]
-        points = torch.cat([judged.cloud for judged in scene.objects])
+        points = torch.cat([obj.cloud for obj in frame_objects.objects])
         np.testing.assert_allclose(cloud["positions"], points, atol=1e-6)
-        counts = {verdict: cloud["class_ids"].count(number) for verdict, number in CLASS_IDS.items()}
-        for verdict in MotionState:
-            assert counts[verdict] == sum(len(j.cloud) for j in scene.objects if j.motion_state is verdict)
-        seen |= {judged.motion_state for judged in scene.objects}
-    assert MotionState.DYNAMIC in seen and MotionState.STATIC in seen
+        counts = {state: cloud["class_ids"].count(number) for state, number in CLASS_IDS.items()}
+        for state in MotionState:
+            assert counts[state] == sum(len(obj.cloud) for obj in frame_objects.objects if obj.motion_state is state)
+        present |= {obj.motion_state for obj in frame_objects.objects}
+    assert MotionState.DYNAMIC in present and MotionState.STATIC in present
 
 
-def test_votes_are_red_lines_between_centroids(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    recording, witness, _ = recorded
+def test_votes_are_red_lines_between_centroids(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    recording, log, _ = recorded
     drawn = 0
-    for index, scene in enumerate(witness.scenes):
-        centroid = {judged.id: judged.centroid.numpy() for judged in scene.objects}
+    for index, frame_objects in enumerate(log.objects):
+        centroid = {obj.id: obj.centroid.numpy() for obj in frame_objects.objects}
         np.testing.assert_allclose(recording.at("/world/centroids")[index]["positions"], list(centroid.values()))
-        dynamic = [judged.id for judged in scene.objects if judged.motion_state is MotionState.DYNAMIC]
-        for entity, pairs in zip(("", "/without_effect"), lines_of(scene.vote_pairs, dynamic), strict=True):
+        dynamic = [obj.id for obj in frame_objects.objects if obj.motion_state is MotionState.DYNAMIC]
+        for entity, pairs in zip(("", "/without_effect"), split_votes(frame_objects.vote_pairs, dynamic), strict=True):
             row = recording.at(f"/world/votes{entity}")[index]
             assert len(row["strips"]) == len(pairs)
-            for strip, (one, other) in zip(row["strips"], pairs, strict=True):
-                np.testing.assert_allclose(strip, [centroid[one], centroid[other]], atol=1e-6)
+            for strip, (first, second) in zip(row["strips"], pairs, strict=True):
+                np.testing.assert_allclose(strip, [centroid[first], centroid[second]], atol=1e-6)
             drawn += len(pairs) if not entity else 0
             red, green, blue = (row["colors"][0] >> shift & 255 for shift in (24, 16, 8))
             assert red > 200 and green == blue < 140
-        votes = [recording.at(f"/votes/{judged.id}")[index]["scalars"][0] for judged in scene.objects]
-        assert votes == [judged.votes for judged in scene.objects]
+        votes = [recording.at(f"/votes/{obj.id}")[index]["scalars"][0] for obj in frame_objects.objects]
+        assert votes == [obj.votes for obj in frame_objects.objects]
     assert drawn > 0
 
 
-def test_lines_of_votes_by_hand() -> None:
-    assert lines_of([(1, 2), (2, 1), (3, 1), (3, 4), (4, 3), (2, 5)], dynamic=[1]) == (
-        [(1, 2), (1, 3)],
-        [(2, 5), (3, 4)],
-    )
-    assert lines_of([], []) == ([], [])
-
-
-def test_map_and_poses_are_logged_again_after_each_keyframe(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    recording, witness, _ = recorded
-    frusta, points = recording.at("/world/map/keyframes"), recording.at("/world/map/landmarks")
-    ways, newest = recording.at("/world/trajectory"), recording.at("/world/trajectory/newest")
+def test_map_and_poses_are_logged_again_after_each_keyframe(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    recording, log, _ = recorded
+    frustums, points = recording.at("/world/map/keyframes"), recording.at("/world/map/landmarks")
+    paths, newest = recording.at("/world/trajectory"), recording.at("/world/trajectory/newest")
     last = FRAMES - 1
-    kept = witness.keyframes[-1]
-    adjusted = [index + 1 for index in kept if index < last]
-    assert kept[:2] == [0, 5] and set(frusta) == set(points) == set(ways) == {*adjusted, last}
+    keyframes = log.keyframes[-1]
+    adjusted = [index + 1 for index in keyframes if index < last]
+    assert keyframes[:2] == [0, 5] and set(frustums) == set(points) == set(paths) == {*adjusted, last}
     for index in adjusted:
-        assert len(frusta[index]["strips"]) == len(witness.keyframes[index])
-        assert len(points[index]["positions"]) == witness.landmarks[index] > 50
-        centre = np.array(frusta[index]["strips"])[:, 5]  # of projection
-        np.testing.assert_allclose(
-            centre, [witness.T_wc[frame][:3, 3] for frame in witness.keyframes[index]], atol=5e-3
-        )
+        assert len(frustums[index]["strips"]) == len(log.keyframes[index])
+        assert len(points[index]["positions"]) == log.landmarks[index] > 50
+        centre = np.array(frustums[index]["strips"])[:, 5]  # camera centre
+        np.testing.assert_allclose(centre, [log.T_wc[frame][:3, 3] for frame in log.keyframes[index]], atol=5e-3)
     for index in adjusted:
-        np.testing.assert_allclose(ways[index]["strips"][0], witness.ways[index], atol=1e-6)
-    np.testing.assert_allclose(ways[last]["strips"][0], witness.ways[last], atol=1e-6)
+        np.testing.assert_allclose(paths[index]["strips"][0], log.positions[index], atol=1e-6)
+    np.testing.assert_allclose(paths[last]["strips"][0], log.positions[last], atol=1e-6)
     assert newest[0]["strips"] == []  # a line needs two points
-    np.testing.assert_allclose(newest[3]["strips"][0], witness.ways[3][1:], atol=1e-6)
-    np.testing.assert_allclose(newest[8]["strips"][0], witness.ways[8][6:], atol=1e-6)
+    np.testing.assert_allclose(newest[3]["strips"][0], log.positions[3][1:], atol=1e-6)
+    np.testing.assert_allclose(newest[8]["strips"][0], log.positions[8][6:], atol=1e-6)
 
 
-def test_ground_truth_lies_on_the_first_pose(recorded: tuple[Recording, Witness, Pipeline]) -> None:
+def test_ground_truth_is_aligned_at_first_pose(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
     recording, _, pipeline = recorded
     truth = pipeline.sequence.groundtruth
     assert truth is not None
     (row,) = recording.all("/world/groundtruth")
-    expected = (invert(Tilted.T_gw) @ truth.T_wc)[:, :3, 3]  # the estimate's world is the first camera's
+    expected = (invert(Tilted.T_gw) @ truth.T_wc)[:, :3, 3]  # the world frame of the estimate is the first camera frame
     np.testing.assert_allclose(row["strips"][0], expected, atol=1e-5)
     assert row["frame"] == 0
 
 
-def test_curves_and_words(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    recording, witness, pipeline = recorded
+def test_curves_summaries_and_events(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    recording, log, pipeline = recorded
     for index, row in enumerate(pipeline.record.frames):
         for stage, seconds in row.items():
             if stage not in ("frame", "stamp"):
                 assert recording.at(f"/seconds/{stage}")[index]["scalars"][0] == pytest.approx(seconds)
-    for index, scene in enumerate(witness.scenes):
-        text = recording.at("/verdicts")[index]["text"][0]
+    for index, frame_objects in enumerate(log.objects):
+        text = recording.at("/frame_summary")[index]["text"][0]
         assert f"**frame {index}** at {index / 10:.3f} s: tracked" in text
-        assert all(f"| {judged.motion_state.value} | {judged.votes} |" in text for judged in scene.objects)
-        chamfer = [judged.chamfer for judged in scene.objects if judged.id == 1]
+        assert all(f"| {obj.motion_state.value} | {obj.votes} |" in text for obj in frame_objects.objects)
+        chamfer = [obj.chamfer for obj in frame_objects.objects if obj.id == 1]
         if np.isfinite(chamfer[0]):
             assert recording.at("/chamfer/1")[index]["scalars"] == chamfer
-    said = {frame: row["text"][0] for frame, row in recording.at("/log").items()}
-    assert said == {frame: f"keyframe {i}" for i, frame in enumerate(witness.keyframes[-1])}
+    events = {frame: row["text"][0] for frame, row in recording.at("/log").items()}
+    assert events == {frame: f"keyframe {i}" for i, frame in enumerate(log.keyframes[-1])}
     assert pipeline.slam.timer.seconds["viewer"] > 0
 
 
-def test_what_a_loop_corrects_is_logged_again(tmp_path: Path) -> None:
-    """The map is moved as a closed loop moves it, before a frame that becomes a keyframe."""
+def test_map_and_poses_are_logged_again_after_loop_correction(tmp_path: Path) -> None:
+    """The map is moved as by a loop correction, before a frame that becomes a keyframe."""
     sequence = Wall()
     slam = V3DSLAM(CAMERA, squares, load_config(overrides=CONFIG))
     viewer = make_viewer(None, tmp_path / "run.rrd", sequence)
-    witness = Witness(slam)
+    log = RunLog(slam)
 
-    def on_frame(frame: RGBDFrame, scene: FrameObjects, status: TrackingStatus) -> None:
+    def on_frame(frame: RGBDFrame, objects: FrameObjects, status: TrackingStatus) -> None:
         if frame.index == FRAMES - 1:
             T_new_old = se3_exp(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.3, 0.0], dtype=torch.float64))
             slam.mapper.map.move_keyframes(slam.mapper.map.T_cw @ invert(T_new_old))
             slam.loop_closer.loop_count += 1
             slam.mapper.map.keyframes[-1].frame = frame.index
-            viewer.show(frame, scene, slam, {})
-        witness(frame, scene, status)
+            viewer.show(frame, objects, slam, {})
+        log(frame, objects, status)
 
     pipeline = Pipeline(sequence, slam, viewer=viewer)
     pipeline(on_frame)
@@ -302,7 +294,7 @@ def test_what_a_loop_corrects_is_logged_again(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "run.rrd")
     moved = recording.at("/world/trajectory")[FRAMES - 1]["strips"][0]
     np.testing.assert_allclose(moved, slam.poses.trajectory().T_wc[:, :3, 3], atol=1e-6)
-    assert np.linalg.norm(np.array(moved[0])) > 0.4  # where it began, too
+    assert np.linalg.norm(np.array(moved[0])) > 0.4  # the first pose is moved as well
     centres = np.array(recording.at("/world/map/keyframes")[FRAMES - 1]["strips"])[:, 5]
     np.testing.assert_allclose(centres, invert(slam.mapper.map.T_cw)[:, :3, 3], atol=1e-6)
     assert "loop closed" in recording.at("/log")[FRAMES - 1]["text"][0]
@@ -311,7 +303,7 @@ def test_what_a_loop_corrects_is_logged_again(tmp_path: Path) -> None:
     )
 
 
-def test_a_ground_truth_without_orientations_is_not_laid_anywhere(tmp_path: Path) -> None:
+def test_ground_truth_without_orientations_is_not_logged(tmp_path: Path) -> None:
     sequence = Wall()
     assert sequence.groundtruth is not None
     sequence.groundtruth.T_wc[:, :3, :3] = torch.eye(3, dtype=torch.float64)
@@ -321,27 +313,29 @@ def test_a_ground_truth_without_orientations_is_not_laid_anywhere(tmp_path: Path
     assert "/world/groundtruth" not in Recording(tmp_path / "run.rrd").entities
 
 
-# --- nobody looks on, or cannot
+# --- runs without a viewer, and viewers that cannot be shown
 
 
-def test_a_run_without_a_viewer_needs_no_rerun() -> None:
+def test_run_without_viewer_does_not_import_rerun() -> None:
     assert make_viewer(None, None, Wall()) is NULL_VIEWER
     probe = "import sys, v3d_torch.runs.console; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "False"
 
 
-def test_poses_are_the_same_with_and_without_a_viewer(recorded: tuple[Recording, Witness, Pipeline]) -> None:
-    _, _, looked_on = recorded
-    alone = Pipeline(Tilted(), V3DSLAM(CAMERA, squares, load_config(overrides=CONFIG)))
-    alone()
-    alone.flush()
-    assert torch.equal(alone.slam.poses.trajectory().T_wc, looked_on.slam.poses.trajectory().T_wc)
-    assert "viewer" not in alone.slam.timer.seconds
+def test_poses_are_the_same_with_and_without_a_viewer(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    _, _, with_viewer = recorded
+    without_viewer = Pipeline(Tilted(), V3DSLAM(CAMERA, squares, load_config(overrides=CONFIG)))
+    without_viewer()
+    without_viewer.flush()
+    assert torch.equal(without_viewer.slam.poses.trajectory().T_wc, with_viewer.slam.poses.trajectory().T_wc)
+    assert "viewer" not in without_viewer.slam.timer.seconds
 
 
-def test_what_is_missing_or_unknown_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match="--viz open3d: there is no such viewer; there is rerun"):
+def test_unknown_viewer_unwritable_file_and_missing_library_are_errors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ConfigError, match="--viz open3d: unknown viewer; use --viz rerun"):
         make_viewer("open3d", None, Wall())
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"run\.rrd: cannot be written"):
@@ -350,14 +344,14 @@ def test_what_is_missing_or_unknown_is_said(tmp_path: Path, monkeypatch: pytest.
         make_viewer(None, tmp_path, Wall())
     monkeypatch.setitem(sys.modules, "rerun", None)
     for viz, option in (("rerun", "--viz rerun"), (None, "--rerun")):
-        with pytest.raises(ViewerError, match=rf"{option} needs rerun-sdk .* pip install 'v3d-torch\[rerun\]'"):
+        with pytest.raises(ViewerError, match=rf"{option}: needs rerun-sdk .*; run pip install 'v3d-torch\[rerun\]'"):
             make_viewer(viz, tmp_path / "run.rrd", Wall())
 
 
-def test_a_file_that_cannot_be_written_to_the_end_fails_the_run_after_its_results(tmp_path: Path) -> None:
+def test_incomplete_recording_is_a_failure_after_all_frames(tmp_path: Path) -> None:
     class Full(RerunViewer):
-        def _show_map(self, slam: V3DSLAM) -> None:
-            """Stands in for the library's flush, which says so when its disk was full."""
+        def _log_map(self, slam: V3DSLAM) -> None:
+            """Log nothing: `flush` below raises the library's error for a full disk."""
 
     sequence = Wall()
     viewer = Full(open_stream(live=False, file=tmp_path / "run.rrd"), CAMERA, None, "wall")
@@ -370,11 +364,11 @@ def test_a_file_that_cannot_be_written_to_the_end_fails_the_run_after_its_result
     pipeline()
     pipeline.flush()
     failure = pipeline.record.failure
-    assert failure is not None and "the recording for rerun is not complete (File-writer" in failure
+    assert failure is not None and "the rerun recording is incomplete (File-writer" in failure
     assert len(pipeline.slam.poses.statuses) == FRAMES
 
 
-# --- live: rerun's own server stands in for the window
+# --- live viewer, replaced by rerun's server without a window
 
 
 def free_port() -> int:
@@ -385,7 +379,7 @@ def free_port() -> int:
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
-    """A program that a viewer is started by, and where what it gets is saved; it has no window."""
+    """Program that replaces the viewer, without a window, and the file in which it saves the received data."""
     script, saved, pid = tmp_path / "bin" / "rerun", tmp_path / "received.rrd", tmp_path / "pid"
     script.parent.mkdir()
     program = str(Path(rerun_cli.__file__).with_name("rerun"))
@@ -401,7 +395,7 @@ def server(tmp_path: Path) -> Iterator[tuple[Path, Path]]:
         os.kill(int(pid.read_text()), signal.SIGTERM)
 
 
-def test_a_viewer_is_started_and_is_sent_the_run(
+def test_viewer_is_started_and_receives_the_run(
     server: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     script, saved = server
@@ -413,7 +407,7 @@ def test_a_viewer_is_started_and_is_sent_the_run(
     pipeline = Pipeline(Wall(broken=3), V3DSLAM(CAMERA, squares), viewer=viewer)
     (viewer_process,) = [child for child in psutil.Process().children() if f"--port={port}" in child.cmdline()]
     listening = [at.laddr.ip for at in viewer_process.net_connections() if at.status == psutil.CONN_LISTEN]
-    assert listening == ["127.0.0.1"]  # what a camera sees at home is nobody else's
+    assert listening == ["127.0.0.1"]  # private images must not be accessible from the network
     pipeline()
     pipeline.flush()
     assert list(Recording(file).at("/world/camera")) == [0, 1, 2]
@@ -423,7 +417,7 @@ def test_a_viewer_is_started_and_is_sent_the_run(
     assert saved.stat().st_size > 10_000
 
 
-def test_without_a_screen_the_command_says_what_to_do_instead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_without_screen_suggests_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_sequence(tmp_path / "three", range(45, 48))
     for name in list(os.environ):
         if "DISPLAY" in name or "WAYLAND" in name:
@@ -436,7 +430,8 @@ def test_without_a_screen_the_command_says_what_to_do_instead(tmp_path: Path, mo
     if sys.platform == "linux":
         done = call("--viz", "rerun", "--out", str(tmp_path / "out"))
         assert done.exit_code == 2 and not (tmp_path / "out").exists()
-        assert done.stderr.startswith("error: --viz rerun: there is no screen") and done.stderr.count("\n") == 1
+        assert done.stderr.startswith("error: --viz rerun: no screen to open a viewer on; record")
+        assert done.stderr.count("\n") == 1
         assert "--rerun FILE.rrd" in done.stderr
     done = call("--rerun", "three.rrd", "--out", str(tmp_path / "out"))
     assert (done.exit_code, done.stderr) == (0, "")

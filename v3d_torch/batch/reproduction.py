@@ -19,9 +19,9 @@ from v3d_torch.datasets.locate import data_folder, stored_path
 from v3d_torch.datasets.names import download_url
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.evaluation import ablation
-from v3d_torch.evaluation.layout import latex_table, markdown_table, screen_table
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.evaluation.summary import LEGEND, PACKAGES, csv_text, latex, markdown, screen_tables
+from v3d_torch.evaluation.tables import latex_table, markdown_table, screen_table
 from v3d_torch.io.files import write_text
 from v3d_torch.runs.console import open_sequence, wide_console
 from v3d_torch.runs.result_folder import make_result_folder

@@ -1,4 +1,4 @@
-"""``python -m v3d_torch evaluate GROUNDTRUTH ESTIMATE``: the scores of a trajectory, beside the paper's."""
+"""``python -m v3d_torch evaluate GROUNDTRUTH ESTIMATE``: errors of a trajectory, compared with the paper's tables."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 @expand_user_paths
 def main(
     groundtruth: Annotated[Path, typer.Argument(help="True poses: stamp tx ty tz qx qy qz qw, camera to world.")],
-    estimate: Annotated[Path, typer.Argument(help="Estimated poses, in the same layout and any world.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
+    estimate: Annotated[Path, typer.Argument(help="Estimated poses in the same format, in any world frame.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     max_difference: Annotated[
-        float, typer.Option(min=0.0, help="Stamps farther apart than this are no pair, seconds.")
+        float, typer.Option(min=0.0, help="Maximum difference between the timestamps of a pair, seconds.")
     ] = 0.02,
     delta: Annotated[float, typer.Option(min=1e-3, help="Time over which RPE measures drift, seconds.")] = 1.0,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="Colour-depth pairs of the sequence, to say how many have a pose.")
+        int | None, typer.Option(min=1, help="Number of colour-depth pairs of the sequence, to print the coverage.")
     ] = None,
     sequence: Annotated[
         str | None, typer.Option(help="Sequence of the paper's tables, such as fr3/w/xyz [guessed from the paths].")
     ] = None,
 ) -> None:
-    """Score a trajectory by ATE and RPE, as the TUM benchmark does.
+    """Evaluate a trajectory by ATE and RPE, as the TUM benchmark does.
 
-    ATE is the absolute error of the aligned positions, RPE the relative one of the motion over a time.
+    ATE is the absolute error of the aligned positions, RPE the relative error of the motions over a fixed time.
     """
     from rich.console import Console
 
     from v3d_torch.datasets.tum_trajectory import read_trajectory
     from v3d_torch.errors import InputError, V3DError
     from v3d_torch.evaluation import evaluate
-    from v3d_torch.evaluation.tables import paper_sequence, paper_table
+    from v3d_torch.evaluation.paper_tables import paper_sequence, paper_table
 
     try:
         truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)
         if sequence is not None and paper_sequence(sequence) is None:
-            raise InputError(f"--sequence {sequence}: is not in the paper's tables; one is fr3/w/xyz")
+            raise InputError(f"--sequence {sequence}: is not in the paper's tables; use a name such as fr3/w/xyz")
         try:
             evaluation = evaluate(truth, poses, max_time_difference=max_difference, rpe_delta=delta, frames=frames)
         except InputError as error:
@@ -62,7 +62,7 @@ def main(
         typer.echo(json.dumps(evaluation.to_dict(), indent=2))
         return
     console = Console(soft_wrap=True, highlight=False)
-    console.print(_summary(evaluation))
+    console.print(_error_table(evaluation))
     for note in evaluation.notes:
         console.print(f"note: {note}")
     name = sequence or paper_sequence(groundtruth.as_posix()) or paper_sequence(estimate.as_posix())
@@ -70,19 +70,19 @@ def main(
         console.print(table)
 
 
-def _summary(evaluation: Evaluation) -> Table:
+def _error_table(evaluation: Evaluation) -> Table:
     from dataclasses import astuple, fields
 
     from rich.table import Table
 
     from v3d_torch.evaluation.statistics import Statistics
 
-    covered = f", {evaluation.coverage:.1%} of the frames" if evaluation.coverage is not None else ""
+    coverage = f", {evaluation.coverage:.1%} of the frames" if evaluation.coverage is not None else ""
     rows = {"ATE, m": evaluation.ate}
     if (rpe := evaluation.rpe) is not None:
-        over = "s" if rpe.delta == 1 else f"{rpe.delta:g} s"
-        rows |= {f"RPE, m/{over}": rpe.trans, f"RPE, deg/{over}": rpe.rot}
-    table = Table(title=f"{evaluation.pairs} of {evaluation.poses} poses have ground truth{covered}")
+        delta = "s" if rpe.delta == 1 else f"{rpe.delta:g} s"
+        rows |= {f"RPE, m/{delta}": rpe.trans, f"RPE, deg/{delta}": rpe.rot}
+    table = Table(title=f"{evaluation.pairs} of {evaluation.poses} poses have ground truth{coverage}")
     table.add_column("error")
     for field in fields(Statistics):
         table.add_column(field.name, justify="right")

@@ -1,4 +1,4 @@
-"""``python -m v3d_torch report DIR``: the results of a run as one page to look at."""
+"""``python -m v3d_torch report DIR``: HTML report of a run."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 @app.command()
 @expand_user_paths
 def main(
-    folder: Annotated[Path, typer.Argument(help="Results of a run: the folder that it names at its end.")],
+    folder: Annotated[Path, typer.Argument(help="Results of a run: the folder that the run prints at its end.")],
     groundtruth: Annotated[
         Path | None,
-        typer.Option(help="True poses, stamp tx ty tz qx qy qz qw [those that the sequence brought]."),
+        typer.Option(help="True poses, stamp tx ty tz qx qy qz qw [those of the sequence]."),
     ] = None,
 ) -> None:
-    """Make one HTML page of the results of a run.
+    """Write an HTML report of a run.
 
-    It is report.html in their folder: one file with everything in it, for any browser.
+    The report is report.html in the folder of the results: one self-contained file for any browser.
     """
     from v3d_torch.io.files import write_text
     from v3d_torch.runs.console import exit_on_error

@@ -16,7 +16,7 @@ from v3d_torch.config.loading import FULL, changed, find_config, load_config
 from v3d_torch.datasets import RGBDStream, open_source
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
-from v3d_torch.evaluation.tables import paper_table
+from v3d_torch.evaluation.paper_tables import paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.pipeline import Pipeline

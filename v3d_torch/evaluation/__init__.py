@@ -1,8 +1,8 @@
-"""Evaluation of trajectories: `evaluate` gives what the paper's tables hold."""
+"""Evaluation of trajectories and masks: ATE, RPE, masked pixels, id switches, and the paper's tables."""
 
 from __future__ import annotations
 
 from v3d_torch.evaluation.ate import Alignment
-from v3d_torch.evaluation.report import Evaluation, evaluate
+from v3d_torch.evaluation.evaluation import Evaluation, evaluate
 
 __all__ = ["Alignment", "Evaluation", "evaluate"]

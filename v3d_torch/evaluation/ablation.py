@@ -1,4 +1,4 @@
-"""The ablation study (paper, Sec. IV-D): its variants, what their runs gave, and the tables of that."""
+"""Ablation study (paper, Sec. IV-D): its variants, and tables of their results."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from v3d_torch.config.loading import FULL
-from v3d_torch.evaluation.cells import Cell, row, shown_lowest, spread
-from v3d_torch.evaluation.layout import ErrorTable
-from v3d_torch.evaluation.outcome import Outcome, values_of
+from v3d_torch.evaluation.outcome import Outcome, collect_metric
+from v3d_torch.evaluation.paper_tables import HEADINGS
 from v3d_torch.evaluation.summary import error_tables
-from v3d_torch.evaluation.tables import HEADINGS
+from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, row, spread
 
 VARIANTS = (
     "baseline",
@@ -29,30 +28,43 @@ VARIANTS = (
     "paper",
     FULL,
 )
-"""Names of the configurations that are compared (`v3d_torch.config.loading.CONFIGS`), the whole system last."""
+"""Names of the compared configurations (`v3d_torch.config.loading.CONFIGS`), the full system last."""
 
 LEGEND = (
-    "Median and [range] over the seeds. ATE and RPE (over 1 s): RMSE; SD: of the ATE. Moving out, static out: share of"
-    " the truly moving and static pixels with depth that tracking did not use; id changes: of a person in view, in 60"
-    " frames; found: share of the frames in view in which an object covers the person."
+    "Median and [range] over the seeds. ATE and RPE (over 1 s): RMSE; SD: standard deviation of the ATE. Moving out,"
+    " static out: percentage of the truly moving and truly static pixels with depth that tracking left out; id"
+    " switches: per 60 frames in which a person is in view; found: percentage of these frames in which an object covers"
+    " the person."
 )
-PAPER_SAYS = (
-    "The paper (Sec. IV-D) gives no table but says of the ATE: without voting 8 % better than the baseline and four"
-    " times that of the full system; without the intra-object stage (Chamfer) 6 % worse than the full system."
-)
+"""Explanation of the columns."""
 
-PAPER_TIMES_FULL: Mapping[str, float] = {"baseline": 4 / 0.92, "no_voting": 4.0, "no_chamfer": 1.06, FULL: 1.0}
-"""How many times the full system's ATE a variant has, by what the paper says."""
+PAPER_SAYS = (
+    "The paper (Sec. IV-D) has no table of its ablation, but compares ATEs: without voting, 8 % lower than the baseline"
+    " and four times that of the full system; without the intra-object stage (Chamfer distance), 6 % higher than that"
+    " of the full system."
+)
+"""Results of the paper's ablation study."""
+
+PAPER_RATIOS: Mapping[str, float] = {"baseline": 4 / 0.92, "no_voting": 4.0, "no_chamfer": 1.06, FULL: 1.0}
+"""ATE of a variant divided by the full system's ATE, from `PAPER_RESULTS`."""
 
 TIMES_FULL = (
-    "Times full: the ATE as a multiple of the full system's, geometric mean over the sequences that both were run on;"
-    " (paper): by what it says."
+    "Ratio to full: ATE divided by the full system's ATE, geometric mean over the sequences on which both were run;"
+    " (paper): according to the paper's text."
 )
-"""What is to be known to read the last rows of `overview`."""
+"""Explanation of the last rows of `make_overview_table`."""
+
+_RATIO_ROW = "ratio to full"
 
 
 class Column(NamedTuple):
-    """A figure of the tables: its heading, how a value is written, and whether it is an error, the lowest the best."""
+    """Column of the tables.
+
+    Attributes:
+        heading: Heading, with the unit.
+        form: Format of a value, such as ``.4f``.
+        is_error: True if the lowest value is the best. False if no value is marked as the best.
+    """
 
     heading: str
     form: str
@@ -64,39 +76,39 @@ COLUMNS: Mapping[str, Column] = {
     "ate.std": Column("SD, m", ".4f", True),
     "rpe.trans.rmse": Column("RPE, m/s", ".4f", True),
     "rpe.rot.rmse": Column("RPE, deg/s", ".3f", True),
-    # Leaving out everything, or nobody, is no merit: of these none is marked as the best.
+    # The mask metrics are a trade-off: masking everything, or nothing, makes one of them perfect.
     "masks.moving_left_out": Column("moving out", ".1%", False),
     "masks.static_left_out": Column("static out", ".1%", False),
-    "masks.id_changes_per_60_frames": Column("id changes", ".2f", False),
+    "masks.id_changes_per_60_frames": Column("id switches", ".2f", False),
     "masks.people_found": Column("found", ".0%", False),
 }
-"""By the figure's place in ``metrics.json``."""
+"""Columns of the tables by their key in ``metrics.json``."""
 
 
 def screen_table(outcomes: Sequence[Outcome]) -> Table:
-    """The outcomes on one sequence for the screen, a row per variant, the best of each error in green."""
-    headings, rows = _summary(outcomes)
+    """Return the results on one sequence for the screen, one row per variant, the best of each error in green."""
+    headings, rows = _summarise(outcomes)
     table = Table(title=f"Ablation on {escape(outcomes[0].sequence)}", caption=verdict(outcomes))
     table.add_column("variant", no_wrap=True)
     for heading in headings:
         table.add_column(heading, justify="right", overflow="fold")
     for variant, cells in rows.items():
-        texts = [cell.text.replace(" ", "\n") for cell in cells]  # the range below the median
+        texts = [cell.text.replace(" ", "\n") for cell in cells]  # put the range below the median
         table.add_row(variant, *(f"[green]{t}[/]" if c.best else t for t, c in zip(texts, cells, strict=True)))
     return table
 
 
 def markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
-    """All outcomes as a document: a table for each sequence, the best of each error in bold, and what failed.
+    """Return a Markdown document with one table per sequence, the best of each error in bold, and the failed runs.
 
     Args:
-        outcomes: of the runs.
-        note: on how they were made.
+        outcomes: Outcomes of the runs.
+        note: Remark on how the runs were made.
     """
     lines = ["# Ablation", LEGEND, "", PAPER_SAYS, "", *([note] if note else [])]
     for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
-        headings, rows = _summary(runs)
+        headings, rows = _summarise(runs)
         lines += ["", f"## {sequence}", f"Seeds: {len({run.seed for run in runs})}. {verdict(runs)}", ""]
         lines += [row(["variant", *headings]), row(["---", *["---:"] * len(headings)])]
         for variant, cells in rows.items():
@@ -106,29 +118,29 @@ def markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
 
 
 def overview(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTable | None:
-    """The ATE of all variants on all sequences, and how many times the full system's that is, beside the paper's word.
+    """Return the ATE of all variants on all sequences, and its ratio to the full system's ATE.
 
     Args:
-        outcomes: of the runs.
-        absent: sequences of the paper that nothing could be run on, but that have their row.
+        outcomes: Outcomes of the runs.
+        absent: Sequences of the paper that are not available, and have a row all the same.
 
     Returns:
-        A column per variant. The last rows are the geometric mean, over the sequences that have both, of the ratio to
-        the full system's, and what the paper says of it. None where no run has an ATE.
+        Table with one column per variant. The last two rows are the geometric mean of the ratio, over the sequences on
+        which both were run, and the ratio according to the paper. None if no run has an ATE.
     """
     tables = [table for table in error_tables(outcomes, papers=(), absent=absent) if table.heading == HEADINGS["ate"]]
     if not tables:
         return None
     (ate,) = tables
-    paper = {variant: f"{PAPER_TIMES_FULL[variant]:.2f}" for variant in ate.methods if variant in PAPER_TIMES_FULL}
-    times = {
-        "times full": tuple(Cell(_times_full(outcomes, variant), best=False) for variant in ate.methods),
-        "times full (paper)": tuple(Cell(paper.get(variant, "-"), best=False) for variant in ate.methods),
+    paper = {variant: f"{PAPER_RATIOS[variant]:.2f}" for variant in ate.methods if variant in PAPER_RATIOS}
+    ratios = {
+        _RATIO_ROW: tuple(Cell(_ratio_to_full(outcomes, variant), best=False) for variant in ate.methods),
+        f"{_RATIO_ROW} (paper)": tuple(Cell(paper.get(variant, "-"), best=False) for variant in ate.methods),
     }
-    return ErrorTable(f"Ablation: {ate.heading}", ate.methods, {**ate.rows, **times})
+    return ErrorTable(f"Ablation: {ate.heading}", ate.methods, {**ate.rows, **ratios})
 
 
-def _times_full(outcomes: Sequence[Outcome], variant: str) -> str:
+def _ratio_to_full(outcomes: Sequence[Outcome], variant: str) -> str:
     ratios = []
     for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
         measured = dict(_by_variant([run for run in outcomes if run.sequence == sequence], "ate.rmse"))
@@ -139,20 +151,20 @@ def _times_full(outcomes: Sequence[Outcome], variant: str) -> str:
 
 
 def csv_text(outcomes: Sequence[Outcome]) -> str:
-    """All outcomes, a line for each run."""
+    """Return all outcomes as CSV, one line per run."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["sequence", "variant", "seed", *COLUMNS, "failure"])
     for run in outcomes:
-        writer.writerow([run.sequence, run.config, run.seed, *(run.figure(place) for place in COLUMNS), run.failure])
+        writer.writerow([run.sequence, run.config, run.seed, *(run.figure(key) for key in COLUMNS), run.failure])
     return text.getvalue()
 
 
 def verdict(outcomes: Sequence[Outcome]) -> str:
-    """Whether the full system's ATE is the best on one sequence, or at least within noise of it.
+    """Return a sentence on whether the full system has the lowest ATE on one sequence, or is within noise of it.
 
-    Within noise is a variant whose range over the seeds overlaps the best one's. What the table does not show, less
-    than 0.1 mm, is no difference.
+    Two variants are within noise of each other if their ranges over the seeds overlap. Values are rounded as in the
+    table, to 0.1 mm, so smaller differences do not count. The sentence is empty if there is nothing to compare.
     """
     measured = {variant: [round(ate, 4) for ate in ates] for variant, ates in _by_variant(outcomes, "ate.rmse")}
     ates = {variant: values for variant, values in measured.items() if values}
@@ -164,20 +176,20 @@ def verdict(outcomes: Sequence[Outcome]) -> str:
     if min(ates[FULL]) <= max(ates[best]):
         return f"The full system is within noise of {best}: their ranges over the seeds overlap."
     if len(ates[FULL]) == len(ates[best]) == 1:
-        return f"The full system is worse than {best}; one seed does not tell whether by more than noise."
+        return f"The full system is worse than {best}; with one seed, the difference may be noise."
     return f"The full system is worse than {best}: their ranges over the seeds do not overlap."
 
 
-def _summary(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[Cell]]]:
-    """Headings and a row of cells for each variant; figures that no run has are left out."""
+def _summarise(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[Cell]]]:
+    """Return the headings and a row of cells for each variant, without the metrics that no run has."""
     headings: list[str] = []
     rows: dict[str, list[Cell]] = {outcome.config: [] for outcome in outcomes}
-    for place, column in COLUMNS.items():
-        measured = dict(_by_variant(outcomes, place))
+    for key, column in COLUMNS.items():
+        measured = dict(_by_variant(outcomes, key))
         medians = {variant: median(values) for variant, values in measured.items() if values}
         if medians:
             headings.append(column.heading)
-            lowest = shown_lowest(medians.values(), column.form)
+            lowest = format_lowest(medians.values(), column.form)
             for variant, values in measured.items():
                 best = column.is_error and bool(values) and format(medians[variant], column.form) == lowest
                 rows[variant].append(Cell(spread(values, column.form), best))
@@ -189,7 +201,7 @@ def _summary(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[Cel
     return headings, rows
 
 
-def _by_variant(outcomes: Sequence[Outcome], place: str) -> Iterator[tuple[str, list[float]]]:
-    """Variant and the values of a figure over the seeds, without those not measured."""
+def _by_variant(outcomes: Sequence[Outcome], key: str) -> Iterator[tuple[str, list[float]]]:
+    """Yield each variant and its values of a metric over the seeds, without the runs in which it was not measured."""
     for variant in dict.fromkeys(outcome.config for outcome in outcomes):
-        yield variant, values_of([outcome for outcome in outcomes if outcome.config == variant], place)
+        yield variant, collect_metric([outcome for outcome in outcomes if outcome.config == variant], key)

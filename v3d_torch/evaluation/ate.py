@@ -8,17 +8,21 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-_PLANE = 1e-3
-"""Metres: a ground truth whose positions spread less than this (standard deviation) in all directions but one spans no
-plane. Motion capture is no more precise; the hand that holds a camera still in fr3/s/static spreads it by 12 mm."""
+_MIN_PLANE_SPREAD = 1e-3
+"""Minimum standard deviation of the positions along their second principal axis, metres. Positions with less spread do
+not determine the rotation of an alignment: the spread is no larger than the noise of motion capture."""
 
+_MIN_SCALE_FACTOR = 1.5
+"""Minimum ratio between the sizes of two trajectories to report a scale error. Drift changes the size by less; a wrong
+unit of depth changes it by more."""
 
-_SCALE = 1.5
-"""A trajectory of the right shape that is larger or smaller by this did not drift: its unit is another one."""
+_MAX_UNEXPLAINED_VARIANCE = 0.25
+"""Maximum fraction of the ground truth's variance that a rescaled estimate leaves unexplained, for a scale error. With
+more, the estimate has another shape, and its size says nothing about the unit of depth."""
 
 
 class RotationSource(StrEnum):
-    """What the rotation of an alignment was taken from."""
+    """Source of the rotation of an alignment."""
 
     POSITIONS = "positions"
     ORIENTATIONS = "orientations"
@@ -26,11 +30,12 @@ class RotationSource(StrEnum):
 
 @dataclass(frozen=True)
 class Alignment:
-    """The rigid motion that lays an estimate on its ground truth.
+    """Rigid alignment of an estimate to its ground truth.
 
     Attributes:
-        T_ge: maps the estimate's world to the ground truth's, ``T_gc = T_ge @ T_ec``; float64, shape :math:`(4, 4)`.
-        source: what the rotation was taken from.
+        T_ge: Transform from the estimate's world to the ground truth's world, ``T_gc = T_ge @ T_ec``, float64, shape
+            :math:`(4, 4)`.
+        source: Source of the rotation.
     """
 
     T_ge: Tensor
@@ -38,26 +43,29 @@ class Alignment:
 
 
 def spans_plane(positions: Tensor) -> bool:
-    """Whether positions determine a rotation: not those of a camera that stands, only turns, or moves on a line.
+    """Check whether positions span a plane, and so determine the rotation of an alignment.
+
+    Positions of a camera that stands still, only turns, or moves along a line do not.
 
     Args:
-        positions: metres, shape :math:`(N, 3)`.
+        positions: Camera positions, metres, shape :math:`(N, 3)`.
     """
     centred = positions - positions.mean(dim=0)
     spread = torch.linalg.eigvalsh(centred.mT @ centred / len(positions)).clamp(min=0).sqrt()  # increasing
-    return bool(spread[1] > _PLANE)
+    return bool(spread[1] > _MIN_PLANE_SPREAD)
 
 
 def align(T_gc: Tensor, T_ec: Tensor, *, oriented: bool = True) -> Alignment:
-    """Find the rigid motion, without scale, that lays the estimate on the ground truth (Umeyama, PAMI 1991).
+    """Align the estimate to the ground truth by a rigid transform, without scale (Umeyama, PAMI 1991).
 
-    Least squares over the positions. Where those of the ground truth span no plane they leave the rotation open: it is
-    then the mean of what the orientations say, and the centroids give the translation.
+    The alignment is the least-squares fit of the positions. If the positions of the ground truth do not span a plane,
+    they do not determine the rotation: the rotation is then the mean of the orientation differences, and the
+    translation follows from the centroids.
 
     Args:
-        T_gc: ground truth, camera to its world, float64, shape :math:`(N, 4, 4)`.
-        T_ec: estimate at the same times, camera to its world, float64, shape :math:`(N, 4, 4)`.
-        oriented: whether the ground truth's orientations were measured.
+        T_gc: Ground truth, camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
+        T_ec: Estimate at the same times, camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
+        oriented: True if the orientations of the ground truth were measured.
     """
     p_g, p_e = T_gc[:, :3, 3], T_ec[:, :3, 3]
     mean_g, mean_e = p_g.mean(dim=0), p_e.mean(dim=0)
@@ -74,41 +82,44 @@ def align(T_gc: Tensor, T_ec: Tensor, *, oriented: bool = True) -> Alignment:
 
 
 def absolute_errors(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> Tensor:
-    """Distance of each aligned position to the true one.
+    """Compute the distance between each aligned position and the ground truth.
 
     Args:
-        T_gc: ground truth, shape :math:`(N, 4, 4)`.
-        T_ec: estimate at the same times, shape :math:`(N, 4, 4)`.
-        alignment: of the two, from `align`.
+        T_gc: Ground truth, camera-to-world poses, shape :math:`(N, 4, 4)`.
+        T_ec: Estimate at the same times, camera-to-world poses, shape :math:`(N, 4, 4)`.
+        alignment: Alignment of the estimate to the ground truth, from `align`.
 
     Returns:
-        Metres, shape :math:`(N,)`.
+        Position errors, metres, shape :math:`(N,)`.
     """
     return ((alignment.T_ge @ T_ec)[:, :3, 3] - T_gc[:, :3, 3]).norm(dim=-1)
 
 
 def scale_error(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> float | None:
-    """By how much an estimate of the right shape has the wrong size, as where depth is read in wrong units.
+    """Compute the scale error of an estimate that has the right shape but the wrong size.
+
+    Such an estimate results from depth in the wrong unit.
 
     Args:
-        T_gc: ground truth, shape :math:`(N, 4, 4)`.
-        T_ec: estimate at the same times, shape :math:`(N, 4, 4)`.
-        alignment: of the two, from `align`.
+        T_gc: Ground truth, camera-to-world poses, shape :math:`(N, 4, 4)`.
+        T_ec: Estimate at the same times, camera-to-world poses, shape :math:`(N, 4, 4)`.
+        alignment: Alignment of the estimate to the ground truth, from `align`.
 
     Returns:
-        Size of the ground truth over that of the estimate; None where that is less than `_SCALE` either way, or the
-        shape is another one: the estimate in this size leaves more than half of the ground truth's spread.
+        Size of the ground truth divided by the size of the estimate. None if both sizes agree within a factor of
+        `_MIN_SCALE_FACTOR`, or if the shapes differ (more than `_MAX_UNEXPLAINED_VARIANCE` after rescaling).
     """
     p_g, p_e = T_gc[:, :3, 3], (alignment.T_ge @ T_ec)[:, :3, 3]
     p_g, p_e = p_g - p_g.mean(dim=0), p_e - p_e.mean(dim=0)
     factor = float((p_g * p_e).sum() / p_e.square().sum())
-    left = (factor * p_e - p_g).square().sum() / p_g.square().sum()
-    return factor if factor > 0 and not 1 / _SCALE < factor < _SCALE and left < 0.25 else None
+    unexplained = (factor * p_e - p_g).square().sum() / p_g.square().sum()
+    same_size = 1 / _MIN_SCALE_FACTOR < factor < _MIN_SCALE_FACTOR
+    return factor if factor > 0 and not same_size and unexplained < _MAX_UNEXPLAINED_VARIANCE else None
 
 
 def _nearest_rotation(M: Tensor) -> Tensor:
-    """The rotation R that maximises trace(R^T M), shape (3, 3)."""
+    """Return the rotation R that maximises trace(R^T M), shape (3, 3)."""
     U, _, Vh = torch.linalg.svd(M)
     signs = torch.ones(3, dtype=M.dtype)
-    signs[2] = torch.linalg.det(U @ Vh).sign()  # a rotation, never a reflection
+    signs[2] = torch.linalg.det(U @ Vh).sign()  # exclude reflections
     return U @ torch.diag(signs) @ Vh

@@ -1,4 +1,4 @@
-"""How well what moves is left out of tracking, and whether people keep their ids, against true masks."""
+"""Evaluation of the masks and object ids of a run against ground-truth masks of moving people."""
 
 from __future__ import annotations
 
@@ -10,19 +10,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-STATIC, UNSURE = 0, 255
-"""Values of a true mask that name nobody: what stands still, and what is somebody but only about there."""
+STATIC = 0
+"""Value of static pixels in a ground-truth mask."""
+
+UNSURE = 255
+"""Value of the pixels in a ground-truth mask that are neither surely moving nor surely static."""
+
+_MIN_OVERLAP = 0.5
+"""Intersection over union above which an object covers a person, as for the id switches of MOTS."""
 
 
 @dataclass(frozen=True)
 class PersonScore:
-    """What became of one person's id.
+    """Counts of one person.
 
     Attributes:
-        id: in the true masks.
-        in_view: frames in which the person is in view.
-        found: those of them in which an object covers the person.
-        id_changes: how often that object has another id than the last one.
+        id: Id of the person in the ground-truth masks.
+        in_view: Number of frames in which the person is in view.
+        found: Number of these frames in which an object covers the person.
+        id_changes: Number of id switches: the object that covers the person has another id than the last one.
     """
 
     id: int
@@ -33,16 +39,18 @@ class PersonScore:
 
 @dataclass(frozen=True)
 class MaskScores:
-    """Scores over all frames that have a true mask; None where there is nothing to count.
+    """Scores over all frames with a ground-truth mask; a ratio is None if its denominator is zero.
 
     Attributes:
-        frames: that have a true mask.
-        moving_left_out: share of the moving pixels with depth that are left out of tracking.
-        static_left_out: share of the static pixels with depth that are; tracking uses no others.
-        static_left_out_anywhere: the same over all static pixels, with depth or not.
-        id_changes_per_60_frames: changes of all people's ids, for every 60 frames that a person is in view.
-        people_found: share of these frames in which an object covers the person: ids that are nowhere do not change.
-        people: the counts behind the last two.
+        frames: Number of frames with a ground-truth mask.
+        moving_left_out: Fraction of the moving pixels with depth that are left out of tracking.
+        static_left_out: Fraction of the static pixels with depth that are left out of tracking. Tracking uses pixels
+            with depth only.
+        static_left_out_anywhere: Fraction of all static pixels, with or without depth, that are left out of tracking.
+        id_changes_per_60_frames: Id switches of all people per 60 frames in view.
+        people_found: Fraction of the frames in view in which an object covers the person. Needed to interpret the id
+            switches: a person who is never found has none.
+        people: Counts of each person.
     """
 
     frames: int
@@ -54,39 +62,42 @@ class MaskScores:
     people: tuple[PersonScore, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, by attribute."""
+        """Return plain values for JSON, by attribute."""
         return asdict(self)
 
 
 class MaskEvaluation:
-    """Adds up, frame by frame, what the system left out and which ids it gave to whom.
+    """Accumulator of mask and id scores over the frames of a run.
 
-    A person is in view where enough of the person is seen with depth. The object that covers a person is the one whose
-    mask's intersection over union with the true one is largest and above a half, as for the id switches of MOTS
-    (Voigtlaender et al., CVPR 2019); where there is none the id neither changes nor is forgotten. Who was out of view
-    for longer than `ABSENCE` may come back under another id.
+    A person is in view if enough of their pixels have depth. A person is covered by the object whose mask has the
+    largest intersection over union with the ground truth, if it is above one half, as for the id switches of MOTS
+    (Voigtlaender et al., CVPR 2019). In frames in which no object covers the person, the last id is kept. A person who
+    was out of view for longer than `ABSENCE` may return under another id.
     """
 
     IN_VIEW = 0.003
-    """Least share of the image, 900 pixels at 640x480: a tenth of a person at 5 m. Less is a sleeve behind a door."""
+    """Minimum fraction of the image that a person in view covers, 900 pixels at 640x480. About a tenth of a person at
+    5 m; less is a sleeve behind a door, which no detector finds."""
+
     ABSENCE = 0.5
-    """Seconds: about a step. Without appearance nobody can say who comes back after longer."""
+    """Longest time out of view after which the id must be the same, seconds. Without appearance features the identity
+    of a person who returns later cannot be known."""
 
     def __init__(self) -> None:
         self._frames = 0
         self._moving, self._static, self._anywhere = torch.zeros(3, 2, dtype=torch.int64)
-        self._sightings: dict[int, list[tuple[float, int]]] = {}
+        self._ids_in_view: dict[int, list[tuple[float, int]]] = {}  # person: (stamp, id of the covering object)
 
     def add(self, stamp: float, truth: Tensor, depth: Tensor, left_out: Tensor, objects: Mapping[int, Tensor]) -> None:
-        """Take in a frame; frames come in order of time.
+        """Add a frame. Frames are added in the order of their timestamps.
 
         Args:
-            stamp: seconds.
-            truth: who moves: 0 what is static, 1-254 a person's id, 255 what belongs to neither, uint8, shape
+            stamp: Timestamp, seconds.
+            truth: Ground-truth mask: 0 for static pixels, 1-254 for the id of a person, 255 for neither, uint8, shape
                 :math:`(H, W)`.
-            depth: metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            left_out: pixels that tracking did not use, bool, shape :math:`(H, W)`.
-            objects: mask of each object by its id, which is above 0, bool, shape :math:`(H, W)`; they may overlap.
+            depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            left_out: Pixels left out of tracking, bool, shape :math:`(H, W)`.
+            objects: Mask of each object by its id (> 0), bool, shape :math:`(H, W)`; masks may overlap.
         """
         measured = depth[0] > 0
         static = truth == STATIC
@@ -96,99 +107,102 @@ class MaskEvaluation:
         self._anywhere += tally(left_out, static)
         people = people_in_view(truth, measured, round(self.IN_VIEW * truth.numel()))
         for person, id_ in zip(people.tolist(), covering_ids(truth, people, objects).tolist(), strict=True):
-            self._sightings.setdefault(person, []).append((stamp, id_))
+            self._ids_in_view.setdefault(person, []).append((stamp, id_))
 
     def scores(self) -> MaskScores | None:
-        """What has come together; None where no frame had a true mask."""
+        """Compute the scores of the added frames; None if no frame was added."""
         if not self._frames:
             return None
-        people = tuple(self._score(person) for person in sorted(self._sightings))
+        people = tuple(self._score(person) for person in sorted(self._ids_in_view))
         in_view = sum(person.in_view for person in people)
         return MaskScores(
             frames=self._frames,
-            moving_left_out=_share(*self._moving.tolist()),
-            static_left_out=_share(*self._static.tolist()),
-            static_left_out_anywhere=_share(*self._anywhere.tolist()),
-            id_changes_per_60_frames=_share(60 * sum(person.id_changes for person in people), in_view),
-            people_found=_share(sum(person.found for person in people), in_view),
+            moving_left_out=_ratio(*self._moving.tolist()),
+            static_left_out=_ratio(*self._static.tolist()),
+            static_left_out_anywhere=_ratio(*self._anywhere.tolist()),
+            id_changes_per_60_frames=_ratio(60 * sum(person.id_changes for person in people), in_view),
+            people_found=_ratio(sum(person.found for person in people), in_view),
             people=people,
         )
 
     def _score(self, person: int) -> PersonScore:
-        stamps, ids = zip(*self._sightings[person], strict=True)
-        given = torch.tensor(ids)
-        changes = count_changes(torch.tensor(stamps, dtype=torch.float64), given, self.ABSENCE)
-        return PersonScore(person, in_view=len(ids), found=int((given > 0).sum()), id_changes=changes)
+        stamps, ids = zip(*self._ids_in_view[person], strict=True)
+        object_ids = torch.tensor(ids)
+        switches = count_id_switches(torch.tensor(stamps, dtype=torch.float64), object_ids, self.ABSENCE)
+        return PersonScore(person, in_view=len(ids), found=int((object_ids > 0).sum()), id_changes=switches)
 
 
-def tally(left_out: Tensor, among: Tensor) -> Tensor:
-    """Count pixels.
-
-    Args:
-        left_out: bool, shape :math:`(*, H, W)`.
-        among: those that count, bool, shape :math:`(*, H, W)`.
-
-    Returns:
-        How many of those that count are left out, and how many count, int64, shape :math:`(*, 2)`.
-    """
-    return torch.stack([(left_out & among).sum(dim=(-2, -1)), among.sum(dim=(-2, -1))], dim=-1)
-
-
-def people_in_view(truth: Tensor, measured: Tensor, least: int) -> Tensor:
-    """Who is seen well enough to be followed.
+def tally(left_out: Tensor, region: Tensor) -> Tensor:
+    """Count the pixels of a region, and those of them that are left out.
 
     Args:
-        truth: see `MaskEvaluation.add`, uint8, shape :math:`(H, W)`.
-        measured: pixels with depth, bool, shape :math:`(H, W)`.
-        least: pixels with depth that a person in view has.
+        left_out: Pixels left out of tracking, bool, shape :math:`(*, H, W)`.
+        region: Pixels to count, bool, shape :math:`(*, H, W)`.
 
     Returns:
-        True ids, int64, increasing, shape :math:`(P,)`.
+        Number of pixels of the region that are left out, and number of pixels of the region, int64, shape
+        :math:`(*, 2)`.
     """
-    visible = _histogram(truth, measured)
+    return torch.stack([(left_out & region).sum(dim=(-2, -1)), region.sum(dim=(-2, -1))], dim=-1)
+
+
+def people_in_view(truth: Tensor, measured: Tensor, min_pixels: int) -> Tensor:
+    """Return the ids of the people with enough visible pixels to be tracked.
+
+    Args:
+        truth: Ground-truth mask, see `MaskEvaluation.add`, uint8, shape :math:`(H, W)`.
+        measured: Pixels with depth, bool, shape :math:`(H, W)`.
+        min_pixels: Minimum number of pixels with depth of a person in view.
+
+    Returns:
+        Ground-truth ids, int64, increasing, shape :math:`(P,)`.
+    """
+    visible = _count_values(truth, measured)
     visible[[STATIC, UNSURE]] = 0
-    return torch.nonzero(visible >= max(least, 1))[:, 0]
+    return torch.nonzero(visible >= max(min_pixels, 1))[:, 0]
 
 
 def covering_ids(truth: Tensor, people: Tensor, objects: Mapping[int, Tensor]) -> Tensor:
-    """Id of the object that covers each person.
+    """Return the id of the object that covers each person.
 
     Args:
-        truth: see `MaskEvaluation.add`, uint8, shape :math:`(H, W)`.
-        people: true ids, int64, shape :math:`(P,)`.
-        objects: see `MaskEvaluation.add`.
+        truth: Ground-truth mask, see `MaskEvaluation.add`, uint8, shape :math:`(H, W)`.
+        people: Ground-truth ids, int64, shape :math:`(P,)`.
+        objects: Mask of each object, see `MaskEvaluation.add`.
 
     Returns:
-        Of the object with the largest intersection over union, 0 where none has more than a half, int64, shape
+        Id of the object with the largest intersection over union, 0 if none is above one half, int64, shape
         :math:`(P,)`.
     """
-    true_areas = _histogram(truth, torch.ones_like(truth, dtype=torch.bool))
-    # The first row stands for no object: argmax takes the first of equal ones, so that others must be above a half.
-    overlaps = [torch.full((len(people),), 0.5)]
+    true_areas = _count_values(truth, torch.ones_like(truth, dtype=torch.bool))
+    # The first row stands for no object. For equal values argmax returns the first, so an object must exceed it.
+    overlaps = [torch.full((len(people),), _MIN_OVERLAP)]
     for mask in objects.values():
-        both = _histogram(truth, mask)
-        overlaps.append((both / (true_areas + both.sum() - both).clamp(min=1))[people])
+        intersection = _count_values(truth, mask)
+        union = true_areas + intersection.sum() - intersection
+        overlaps.append((intersection / union.clamp(min=1))[people])
     return torch.tensor([0, *objects])[torch.stack(overlaps).argmax(dim=0)]
 
 
-def count_changes(stamps: Tensor, ids: Tensor, absence: float) -> int:
-    """How often a person's id changes.
+def count_id_switches(stamps: Tensor, ids: Tensor, absence: float) -> int:
+    """Count the id switches of a person.
 
     Args:
-        stamps: times at which the person is in view, seconds, increasing, float64, shape :math:`(F,)`.
-        ids: given to the person at these times, 0 for none, int64, shape :math:`(F,)`.
-        absence: after more time than this out of view a new id is no change, seconds.
+        stamps: Timestamps of the frames in which the person is in view, seconds, increasing, float64, shape
+            :math:`(F,)`.
+        ids: Id of the object that covers the person in these frames, 0 for none, int64, shape :math:`(F,)`.
+        absence: A new id after a longer time out of view is not a switch, seconds.
     """
-    stay, found = (stamps.diff(prepend=stamps[:1]) > absence).cumsum(dim=0), ids > 0
-    stay, ids = stay[found], ids[found]
-    return int(((ids[1:] != ids[:-1]) & (stay[1:] == stay[:-1])).sum())
+    visit, found = (stamps.diff(prepend=stamps[:1]) > absence).cumsum(dim=0), ids > 0
+    visit, ids = visit[found], ids[found]
+    return int(((ids[1:] != ids[:-1]) & (visit[1:] == visit[:-1])).sum())
 
 
-def _histogram(truth: Tensor, among: Tensor) -> Tensor:
-    """How many pixels of a set have each value of a true mask, int64, shape (256,)."""
-    # numpy picks pixels by a mask five times as fast as torch.
-    return torch.from_numpy(np.bincount(truth.numpy()[among.numpy()], minlength=UNSURE + 1))
+def _count_values(truth: Tensor, region: Tensor) -> Tensor:
+    """Count the pixels of a region by their value in a ground-truth mask, int64, shape (256,)."""
+    # NumPy is faster at boolean indexing than torch.
+    return torch.from_numpy(np.bincount(truth.numpy()[region.numpy()], minlength=UNSURE + 1))
 
 
-def _share(part: int, whole: int) -> float | None:
+def _ratio(part: int, whole: int) -> float | None:
     return part / whole if whole else None

@@ -1,4 +1,4 @@
-"""What one run of several gave: the figures of its ``metrics.json``, or the sentence that it failed with."""
+"""Outcome of one run of a batch: the metrics of its ``metrics.json``, or an error message."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run gave.
+    """Outcome of one run.
 
     Attributes:
-        sequence: name.
-        config: name of the configuration, such as ``full``.
-        seed: of the run.
-        metrics: as in its ``metrics.json``; empty where it failed.
-        failure: the sentence that it failed with; None where it did not.
+        sequence: Name of the sequence.
+        config: Name of the configuration, such as ``full``.
+        seed: Random seed of the run.
+        metrics: Content of the run's ``metrics.json``; empty if the run failed.
+        failure: Error message; None if the run succeeded.
     """
 
     sequence: str
@@ -26,21 +26,20 @@ class Outcome:
     failure: str | None = None
 
     def figure(self, place: str) -> float | None:
-        """The value at ``place``, such as ``ate.rmse``; None where it was not measured."""
+        """Return a metric by its dotted key, such as ``ate.rmse``; None if it was not measured."""
         value: Any = self.metrics
-        for key in place.split("."):
-            value = (value or {}).get(key)
+        for name in place.split("."):
+            value = (value or {}).get(name)
         return value
 
     def __str__(self) -> str:
-        """One line for whoever waits."""
         ate = self.figure("ate.rmse")
-        score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth to score it"
+        score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth, not scored"
         result = score if self.failure is None else f"failed: {self.failure}"
         return f"{self.sequence}, {self.config}, seed {self.seed}: {result}"
 
 
-def values_of(outcomes: Iterable[Outcome], place: str) -> list[float]:
-    """A figure of some runs, without those in which it was not measured."""
-    figures = (outcome.figure(place) for outcome in outcomes)
-    return [figure for figure in figures if figure is not None]
+def collect_metric(outcomes: Iterable[Outcome], key: str) -> list[float]:
+    """Collect a metric of several runs, without the runs in which it was not measured."""
+    values = (outcome.figure(key) for outcome in outcomes)
+    return [value for value in values if value is not None]

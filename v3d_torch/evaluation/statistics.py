@@ -1,4 +1,4 @@
-"""What is said of a set of errors."""
+"""Summary statistics of errors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Statistics:
-    """Summary of errors, in their unit; ``std`` is that of the population, as in the benchmark's tools."""
+    """Summary statistics of errors, in the unit of the errors.
+
+    ``std`` is the population standard deviation, as in the TUM benchmark's tools.
+    """
 
     rmse: float
     mean: float
@@ -20,7 +23,7 @@ class Statistics:
 
     @staticmethod
     def of(errors: Tensor) -> Statistics:
-        """Summarise errors, shape :math:`(N,)` with N >= 1."""
+        """Compute the statistics of errors, shape :math:`(N,)` with N >= 1."""
         return Statistics(
             rmse=errors.square().mean().sqrt().item(),
             mean=errors.mean().item(),

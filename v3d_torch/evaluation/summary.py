@@ -1,4 +1,4 @@
-"""Several runs in the layout of the paper's tables I-III: a row per sequence, a column per method."""
+"""Summary of several runs in the layout of the paper's tables I-III: one row per sequence, one column per method."""
 
 from __future__ import annotations
 
@@ -10,33 +10,42 @@ from statistics import median
 
 from rich.table import Table
 
-from v3d_torch.evaluation.cells import Cell, shown_lowest, spread
-from v3d_torch.evaluation.layout import ErrorTable, latex_table, markdown_table, screen_table
-from v3d_torch.evaluation.outcome import Outcome, values_of
-from v3d_torch.evaluation.tables import HEADINGS, paper_scores, paper_sequence
+from v3d_torch.evaluation.outcome import Outcome, collect_metric
+from v3d_torch.evaluation.paper_tables import HEADINGS, paper_scores, paper_sequence
+from v3d_torch.evaluation.tables import (
+    Cell,
+    ErrorTable,
+    format_lowest,
+    latex_table,
+    markdown_table,
+    screen_table,
+    spread,
+)
 
-PLACES: Mapping[str, str] = {"ate": "ate.rmse", "rpe_trans": "rpe.trans.rmse", "rpe_rot": "rpe.rot.rmse"}
-"""Where ``metrics.json`` has each of the paper's metrics."""
+METRIC_KEYS: Mapping[str, str] = {"ate": "ate.rmse", "rpe_trans": "rpe.trans.rmse", "rpe_rot": "rpe.rot.rmse"}
+"""Key in ``metrics.json`` of each metric of the paper."""
 
-_FORM = ".4f"
-LEGEND = "RMSE, median and [range] over the seeds; RPE over 1 s. The lowest of a row is bold."
-"""What is to be known to read the tables."""
+LEGEND = "RMSE, median and [range] over the seeds; RPE over 1 s. The lowest value of a row is bold."
+"""Explanation of the tables."""
 
 PACKAGES = "% \\usepackage{booktabs}"
-"""First line of a file of tables in LaTeX."""
+"""First line of a LaTeX file of tables: the packages that it requires, as a comment."""
 
-_PAPERS = "Methods marked (paper) are not run here: these are the figures of the paper's tables."
+_FORMAT = ".4f"
+_PAPER_SUFFIX = " (paper)"
+_PAPER_NOTE = f"Methods marked{_PAPER_SUFFIX} were not run here: their values are from the paper's tables."
+_SCREEN_METHODS = ("ORB-SLAM2", "V3D-SLAM")  # as many of the paper's methods as fit on a screen of 80 columns
 
 
 def error_tables(
     outcomes: Sequence[Outcome], papers: Sequence[str] | None = None, absent: Sequence[str] = ()
 ) -> list[ErrorTable]:
-    """The tables of all metrics that at least one run has.
+    """Return one table for each metric that was measured in at least one run.
 
     Args:
-        outcomes: of the runs.
-        papers: the paper's methods to set beside, such as ``V3D-SLAM``; None for all.
-        absent: sequences of the paper that nothing could be run on, but that have their row.
+        outcomes: Outcomes of the runs.
+        papers: Methods of the paper to include, such as ``V3D-SLAM``; None for all.
+        absent: Sequences of the paper that are not available, and have a row all the same.
     """
     tables = []
     for metric, heading in HEADINGS.items():
@@ -47,11 +56,11 @@ def error_tables(
 
 
 def markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """All tables as a document, with the runs that failed below; see `error_tables`."""
+    """Return a Markdown document with all tables and the runs that failed; see `make_error_tables`."""
     lines = ["# Summary", "", LEGEND]
     tables = error_tables(outcomes, absent=absent)
-    if any(_is_papers(method) for table in tables for method in table.methods):
-        lines += ["", _PAPERS]
+    if any(method.endswith(_PAPER_SUFFIX) for table in tables for method in table.methods):
+        lines += ["", _PAPER_NOTE]
     lines += [line for table in tables for line in markdown_table(table)]
     failed = [f"- {outcome}" for outcome in outcomes if outcome.failure is not None]
     lines += ["", "## Failed", "", *failed] if failed else []
@@ -59,40 +68,47 @@ def markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
 
 
 def latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """All tables for a paper; they need the package booktabs; see `error_tables`."""
+    """Return all tables as LaTeX, which requires the package booktabs; see `make_error_tables`."""
     tables = error_tables(outcomes, absent=absent)
     lines = [PACKAGES, *(line for table in tables for line in latex_table(table, LEGEND))]
     return "\n".join(lines) + "\n"
 
 
 def csv_text(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """All figures, unrounded, a line per metric, sequence and method; see `error_tables`.
+    """Return all values as CSV, unrounded, one line per metric, sequence and method; see `make_error_tables`.
 
-    The last column is the standard deviation that the paper gives as well: the median over the seeds.
+    The last column is the standard deviation of the errors, as in the paper's tables: the median over the seeds.
     """
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["metric", "sequence", "method", "median", "lowest", "highest", "seeds", "failed", "sd"])
-    for metric, place in PLACES.items():
+    for metric, key in METRIC_KEYS.items():
         for result in _results(outcomes, metric, None, absent):
             values = result.values
-            figures = [median(values), min(values), max(values)] if values else [None] * 3
+            summary = [median(values), min(values), max(values)] if values else [None] * 3
             counts = [result.seeds, result.failed] if result.seeds else [None] * 2
             deviation = median(result.deviations) if result.deviations else None
-            writer.writerow([place, result.sequence, result.method, *figures, *counts, deviation])
+            writer.writerow([key, result.sequence, result.method, *summary, *counts, deviation])
     return text.getvalue()
 
 
 def screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[Table]:
-    """The tables for the screen, of the paper's methods only the first and the last; see `error_tables`."""
-    return [screen_table(table) for table in error_tables(outcomes, ("ORB-SLAM2", "V3D-SLAM"), absent)]
+    """Return the tables for the screen, with the first and the last method of the paper; see `make_error_tables`."""
+    return [screen_table(table) for table in error_tables(outcomes, _SCREEN_METHODS, absent)]
 
 
 @dataclass(frozen=True)
 class _Result:
-    """One metric of a method on a sequence; ``seeds`` is 0 for what the paper says and where there is no sequence.
+    """One metric of one method on one sequence.
 
-    ``values`` are root mean squares, ``deviations`` the standard deviations of the same errors.
+    Attributes:
+        sequence: Name of the sequence.
+        method: Name of the configuration, or of a method of the paper.
+        values: RMSE of each run.
+        seeds: Number of runs; 0 for values of the paper, and if the sequence is not available.
+        failed: Number of runs that failed.
+        absent: True if the sequence is not available.
+        deviations: Standard deviation of the errors of each run.
     """
 
     sequence: str
@@ -109,32 +125,32 @@ class _Result:
             return "not here"
         if self.seeds and self.failed == self.seeds:
             return "failed"
-        return spread(self.values, _FORM) + (f", {self.failed} failed" if self.failed else "")
+        return spread(self.values, _FORMAT) + (f", {self.failed} failed" if self.failed else "")
 
 
 def _results(
     outcomes: Sequence[Outcome], metric: str, papers: Sequence[str] | None, absent: Sequence[str]
 ) -> list[_Result]:
-    """By sequence, then configurations in the order of the runs, then the paper's methods."""
+    """Collect the results by sequence, then configurations in the order of the runs, then the paper's methods."""
     results = []
     configs = dict.fromkeys(outcome.config for outcome in outcomes)
-    for sequence in _in_order([outcome.sequence for outcome in outcomes], absent):
+    for sequence in _order_sequences([outcome.sequence for outcome in outcomes], absent):
         for config in configs:
             runs = [run for run in outcomes if (run.sequence, run.config) == (sequence, config)]
             failed = sum(run.failure is not None for run in runs)
-            values = values_of(runs, PLACES[metric])
-            sds = values_of(runs, PLACES[metric].replace("rmse", "std"))
-            results.append(_Result(sequence, config, values, len(runs), failed, sequence in absent, sds))
-        if (named := paper_sequence(sequence)) is not None:
-            for method, score in paper_scores()[metric][named].items():
+            values = collect_metric(runs, METRIC_KEYS[metric])
+            deviations = collect_metric(runs, METRIC_KEYS[metric].replace("rmse", "std"))
+            results.append(_Result(sequence, config, values, len(runs), failed, sequence in absent, deviations))
+        if (paper_name := paper_sequence(sequence)) is not None:
+            for method, score in paper_scores()[metric][paper_name].items():
                 if papers is None or method in papers:
-                    values, sds = ([figure] if figure is not None else [] for figure in score)
-                    results.append(_Result(sequence, f"{method} (paper)", values, deviations=sds))
+                    values, deviations = ([value] if value is not None else [] for value in score)
+                    results.append(_Result(sequence, f"{method}{_PAPER_SUFFIX}", values, deviations=deviations))
     return results
 
 
-def _in_order(sequences: Sequence[str], absent: Sequence[str]) -> list[str]:
-    """Each once: as they come; where some of the paper's are absent, in the order of its tables."""
+def _order_sequences(sequences: Sequence[str], absent: Sequence[str]) -> list[str]:
+    """Return each sequence once, in the given order; in the paper's order if some of its sequences are absent."""
     if not absent:
         return list(dict.fromkeys(sequences))
     return [sequence for sequence in paper_scores()["ate"] if sequence in {*sequences, *absent}]
@@ -144,18 +160,14 @@ def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:
     methods = tuple(dict.fromkeys(result.method for result in results))
     rows = {}
     for sequence in dict.fromkeys(result.sequence for result in results):
-        of_row = {result.method: result for result in results if result.sequence == sequence}
-        medians = {method: median(result.values) for method, result in of_row.items() if result.values}
-        lowest = shown_lowest(medians.values(), _FORM) if len(medians) > 1 else None
+        by_method = {result.method: result for result in results if result.sequence == sequence}
+        medians = {method: median(result.values) for method, result in by_method.items() if result.values}
+        lowest = format_lowest(medians.values(), _FORMAT) if len(medians) > 1 else None
         rows[sequence] = tuple(
             Cell(
-                of_row[method].text if method in of_row else "-",
-                best=method in medians and format(medians[method], _FORM) == lowest,
+                by_method[method].text if method in by_method else "-",
+                best=method in medians and format(medians[method], _FORMAT) == lowest,
             )
             for method in methods
         )
     return ErrorTable(heading, methods, rows)
-
-
-def _is_papers(method: str) -> bool:
-    return method.endswith(" (paper)")

@@ -1,100 +1,118 @@
-"""The paper's tables I-III as data, and a result beside their rows."""
+"""Tables that compare several runs, as Markdown, as LaTeX and for the screen."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from functools import cache
-from importlib.resources import files
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
 from typing import NamedTuple
 
-import yaml
+from rich import box
+from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
-from v3d_torch.evaluation.report import Evaluation
 
+class Cell(NamedTuple):
+    """Cell of a table.
 
-class Score(NamedTuple):
-    """One entry of the paper's tables; None where it has a dash."""
-
-    rmse: float | None
-    sd: float | None
-
-
-HEADINGS = {"ate": "ATE, m", "rpe_trans": "RPE, m/s", "rpe_rot": "RPE, deg/s"}
-"""Each metric of the paper's tables, with its unit."""
-
-
-@cache
-def paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
-    """The paper's numbers as ``[metric][sequence][method]``.
-
-    Metrics are ``ate`` (metres), ``rpe_trans`` (metres over 1 s) and ``rpe_rot`` (degrees over 1 s), sequences
-    ``fr3/s/xyz`` to ``fr3/w/rpy``, methods ``ORB-SLAM2`` to ``V3D-SLAM``.
+    Attributes:
+        text: Text of the cell.
+        best: True if the value is the best among the compared ones.
     """
-    tables = yaml.safe_load(files(__package__).joinpath("paper_tables.yaml").read_text(encoding="utf-8"))
-    return {
-        metric: {
-            sequence: {method: Score(*scores) for method, scores in row.items()} for sequence, row in table.items()
-        }
-        for metric, table in tables.items()
-    }
+
+    text: str
+    best: bool
 
 
-def paper_sequence(name: str) -> str | None:
-    """Which of the paper's sequences a name or the path of a file speaks of.
+@dataclass(frozen=True)
+class ErrorTable:
+    """Table of one metric.
+
+    Attributes:
+        heading: Name and unit of the metric.
+        methods: Column headings: the configurations, then the methods of the paper.
+        rows: For each sequence, one cell per method. The lowest value of a row, as printed, is the best.
+    """
+
+    heading: str
+    methods: tuple[str, ...]
+    rows: Mapping[str, tuple[Cell, ...]]
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Format the median of values, followed by their range unless all print the same.
 
     Args:
-        name: such as ``fr3/w/xyz``, ``results/fr3_w_xyz/latest/trajectory.txt`` or ``freiburg3_walking_xyz``.
-
-    Returns:
-        Such as ``fr3/w/xyz``; None when it is none of the eight.
+        values: Values of the runs, in any order; a dash is returned if there are none.
+        form: Format of a value, such as ``.4f``.
     """
-    named = r"(?:freiburg|fr)_?3[/_-][a-z]+[/_-](?:xyz|half(?:sphere)?|static|rpy)(?![a-z]|_?validation)"
-    spoken = {canonical_name(text) for text in [name, *re.findall(named, name.lower())]}
-    found = [full for full in PAPER_SEQUENCES if full in spoken]
-    return short_name(found[0]) if len(found) == 1 else None
+    if not values:
+        return "-"
+    middle, low, high = (format(value, form) for value in (median(values), min(values), max(values)))
+    return middle if low == high else f"{middle} [{low}-{high}]"
 
 
-def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
-    """Set a result beside the paper's rows for the same sequence, the best RMSE of each column in green.
+def format_lowest(values: Iterable[float], form: str) -> str:
+    """Format the lowest of values. Values that print the same are equal, so several can be the best."""
+    return format(min(values), form)
 
-    Args:
-        sequence: name of the sequence, in any usual way to write it.
-        evaluation: of an estimate on it.
 
-    Returns:
-        None when the sequence is not in the paper.
-    """
-    short = paper_sequence(sequence)
-    if short is None:
-        return None
-    scores = paper_scores()
-    rows = {method: [scores[metric][short][method] for metric in HEADINGS] for method in scores["ate"][short]}
-    rows["this result"] = _scores(evaluation)
-    best = [
-        min(score.rmse for score in column if score.rmse is not None) for column in zip(*rows.values(), strict=True)
+def row(cells: Sequence[str]) -> str:
+    """Format a row of a Markdown table."""
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+
+
+def markdown_table(table: ErrorTable) -> list[str]:
+    """Return the lines of a Markdown section with the table, the best values in bold."""
+    lines = ["", f"## {table.heading}", "", row(["sequence", *table.methods])]
+    lines.append(row(["---", *["---:"] * len(table.methods)]))
+    for sequence, cells in table.rows.items():
+        lines.append(row([sequence, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
+    return lines
+
+
+def latex_table(table: ErrorTable, legend: str) -> list[str]:
+    """Return the lines of a LaTeX table, the best values in bold. It requires the package booktabs."""
+    lines = [
+        "\\begin{table*}",
+        "  \\centering",
+        f"  \\caption{{{_escape_latex(table.heading)}. {_escape_latex(legend)}}}",
+        f"  \\begin{{tabular}}{{l{'r' * len(table.methods)}}}",
+        "    \\toprule",
+        f"    {_latex_row(['Sequence', *map(_escape_latex, table.methods)])}",
+        "    \\midrule",
     ]
-
-    table = Table(title=f"{short}: the paper's tables and this result")
-    table.add_column("method")
-    for heading in HEADINGS.values():
-        table.add_column(f"{heading} RMSE", justify="right")
-        table.add_column("SD", justify="right")
-    for method, row in rows.items():
-        cells = [cell for score, lowest in zip(row, best, strict=True) for cell in _cells(score, lowest)]
-        table.add_row(method, *cells, style="bold" if method == "this result" else None)
-    return table
+    for sequence, cells in table.rows.items():
+        texts = [_escape_latex(cell.text).replace("-", "--") for cell in cells]
+        bold = [f"\\textbf{{{t}}}" if cell.best else t for t, cell in zip(texts, cells, strict=True)]
+        lines.append(f"    {_latex_row([_escape_latex(sequence), *bold])}")
+    return [*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table*}"]
 
 
-def _scores(evaluation: Evaluation) -> list[Score]:
-    """A result in the columns of the paper, whose RPE is over one second."""
-    rpe = evaluation.rpe if evaluation.rpe is not None and evaluation.rpe.delta == 1 else None
-    measured = [evaluation.ate, rpe.trans if rpe else None, rpe.rot if rpe else None]
-    return [Score(s.rmse, s.std) if s is not None else Score(None, None) for s in measured]
+def screen_table(table: ErrorTable) -> Table:
+    """Return the table for the screen, the best values in green."""
+    shown = Table(title=f"{table.heading}, RMSE", box=box.SIMPLE_HEAD)
+    shown.add_column("sequence", no_wrap=True)
+    for method in table.methods:
+        shown.add_column(escape(method).replace(" (", "\n("), justify="right", overflow="fold")
+    for sequence, cells in table.rows.items():
+        # Put the range below the median, and the number of failed runs below the range.
+        texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
+        marked = [f"[bold green]{t}[/]" if cell.best else t for t, cell in zip(texts, cells, strict=True)]
+        shown.add_row(escape(sequence), *marked)
+    return shown
 
 
-def _cells(score: Score, lowest: float) -> tuple[str, str]:
-    rmse, sd = ("-" if value is None else f"{value:.4f}" for value in score)
-    return (f"[green]{rmse}[/]" if score.rmse == lowest else rmse), sd
+_LATEX_ESCAPES = str.maketrans(
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"[": "{[}"}  # a bracket at the start of a row would be the optional argument of the previous "\\"
+)
+
+
+def _escape_latex(text: str) -> str:
+    return text.translate(_LATEX_ESCAPES)
+
+
+def _latex_row(cells: Sequence[str]) -> str:
+    return " & ".join(cells) + r" \\"

@@ -8,7 +8,7 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
-from v3d_torch.evaluation.report import MIN_PAIRS
+from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.types import TrackingStatus
 

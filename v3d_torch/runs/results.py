@@ -27,7 +27,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import fuse_points
 from v3d_torch.types import TrackingStatus, Trajectory
-from v3d_torch.viz.frustums import camera_path
+from v3d_torch.viz.camera_path import camera_path
 from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":

@@ -27,7 +27,7 @@ from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
-from v3d_torch.viz.viewer import NULL_VIEWER, Viewer
+from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 
 _LOG = logging.getLogger(__name__)
 

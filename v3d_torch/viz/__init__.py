@@ -1,1 +1,1 @@
-"""Pictures of what a run did."""
+"""Figures, report pages and live views of a run."""

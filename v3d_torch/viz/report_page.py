@@ -1,4 +1,4 @@
-"""One page that shows a run: numbers, plots, pictures, configuration; nothing in it has to be loaded."""
+"""HTML report of a run: errors, plots, pictures and configuration in one self-contained page."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ from numpy.typing import NDArray
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
 from v3d_torch.runs.stored_run import StoredRun
-from v3d_torch.viz.figures import draw_trajectory
-from v3d_torch.viz.inline import inline_image, inline_svg
-from v3d_torch.viz.objects_over_time import ObjectRow, draw_objects_over_time
+from v3d_torch.viz.figure_output import embed_image, embed_svg
+from v3d_torch.viz.object_timelines import ObjectRow, draw_object_timelines
+from v3d_torch.viz.pose_timelines import draw_errors, draw_masked_fraction, draw_positions, draw_statuses
 from v3d_torch.viz.stage_times import draw_stage_bars, draw_stages_over_time
-from v3d_torch.viz.timelines import draw_errors, draw_positions, draw_share, draw_statuses
+from v3d_torch.viz.trajectory_figure import draw_trajectory
 
 _FIGURES = {
-    "masks.png": "Frames with each object's mask in the colour of its verdict.",
-    "voting.png": "The frame with the most votes for what is dynamic: who voted for whom, and what came of it.",
-    "clusters.png": "Objects of the same frame as clouds, before and after outlier rejection.",
+    "masks.png": "Frames with the mask of each object in the colour of its motion state.",
+    "voting.png": "Frame with the most votes for dynamic objects: a line joins two objects if one voted for the other.",
+    "clusters.png": "Point clouds of the objects in the same frame, before and after outlier rejection.",
 }
+"""Caption of each picture in the folder ``figures`` of a run."""
 
 
 @dataclass(frozen=True)
 class StageTime:
-    """Time of a stage, seconds; median and max are None where only the total is known."""
+    """Time of a stage, seconds; ``median`` and ``max`` are None if the times of the frames were not stored."""
 
     name: str
     total: float
@@ -42,10 +43,13 @@ class StageTime:
 
 
 def render_page(run: StoredRun) -> str:
-    """The page of a run as HTML.
+    """Return the report of a run as HTML.
+
+    Args:
+        run: Results of the run.
 
     Raises:
-        InputError: a picture in its folder is broken.
+        InputError: If a picture in its folder is damaged.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -54,47 +58,47 @@ def render_page(run: StoredRun) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    stages = _stages(run)
+    stages = _stage_times(run)
     return environment.get_template("page.html").render(
         metrics=run.metrics,
-        folder=run.folder.resolve().name,  # not "latest", which will be another, nor the empty name of "."
+        folder=run.folder.resolve().name,  # resolved, because "latest" will be another run and "." has no name
         evaluation=run.evaluation,
-        poses=_pose_plots(run),
-        found=_found_plots(run),
+        pose_plots=_pose_plots(run),
+        tracking_plots=_tracking_plots(run),
         objects=_object_plot(run),
-        left_out=_left_out(run.metrics.masks or {}),
+        masked=_masked_percentages(run.metrics.masks or {}),
         pictures=[
-            (inline_image(run.folder / "figures" / name), text)
-            for name, text in _FIGURES.items()
+            (embed_image(run.folder / "figures" / name), caption)
+            for name, caption in _FIGURES.items()
             if (run.folder / "figures" / name).is_file()
         ],
         stages=stages,
         stage_plots=_stage_plots(run, stages),
-        changes=changes(run.config) if run.config is not None else None,
+        changes=changed_values(run.config) if run.config is not None else None,
         config_text=run.config_text,
     )
 
 
-def _left_out(scores: Mapping[str, Any]) -> list[str]:
-    """Shares of the truly moving and static pixels, in words; without those of which there are no pixels."""
-    shares = {what: scores.get(f"{what}_left_out") for what in ("moving", "static")}
-    return [f"{100 * share:.1f} % of the {what}" for what, share in shares.items() if share is not None]
-
-
-def changes(config: Config) -> list[tuple[str, Any, Any]]:
-    """What differs from the defaults: key, value, default."""
+def changed_values(config: Config) -> list[tuple[str, Any, Any]]:
+    """Return the values that differ from the defaults: key, value, default."""
     return _differences(config, Config(), "")
 
 
 def _differences(section: Section, default: Section, prefix: str) -> list[tuple[str, Any, Any]]:
-    found: list[tuple[str, Any, Any]] = []
+    differences: list[tuple[str, Any, Any]] = []
     for name in type(section).model_fields:
-        value, usual = getattr(section, name), getattr(default, name)
+        value, default_value = getattr(section, name), getattr(default, name)
         if isinstance(value, Section):
-            found += _differences(value, usual, f"{prefix}{name}.")
-        elif value != usual:
-            found.append((f"{prefix}{name}", value, usual))
-    return found
+            differences += _differences(value, default_value, f"{prefix}{name}.")
+        elif value != default_value:
+            differences.append((f"{prefix}{name}", value, default_value))
+    return differences
+
+
+def _masked_percentages(scores: Mapping[str, Any]) -> list[str]:
+    """Return the masked percentages of the moving and static pixels as text, without those that were not measured."""
+    fractions = {name: scores.get(f"{name}_left_out") for name in ("moving", "static")}
+    return [f"{100 * fraction:.1f} % of the {name}" for name, fraction in fractions.items() if fraction is not None]
 
 
 def _pose_plots(run: StoredRun) -> dict[str, str]:
@@ -102,39 +106,38 @@ def _pose_plots(run: StoredRun) -> dict[str, str]:
     if estimate is None:
         return {}
     plots = {
-        "trajectory": inline_svg(draw_trajectory(truth if evaluation else None, estimate), "trajectory"),
-        "positions": inline_svg(draw_positions(truth, estimate, evaluation), "positions"),
+        "trajectory": embed_svg(draw_trajectory(truth if evaluation else None, estimate), "trajectory"),
+        "positions": embed_svg(draw_positions(truth, estimate, evaluation), "positions"),
     }
     if truth is not None and evaluation is not None:
-        plots["errors"] = inline_svg(draw_errors(truth, estimate, evaluation, run.metrics.status), "errors")
+        plots["errors"] = embed_svg(draw_errors(truth, estimate, evaluation, run.metrics.status), "errors")
     return plots
 
 
-def _found_plots(run: StoredRun) -> dict[str, str]:
-    """How the frames were found, and how much of each image was left out, where masks were saved."""
+def _tracking_plots(run: StoredRun) -> dict[str, str]:
+    """Draw the tracking status and, if masks were saved, the masked fraction of the image."""
     if run.trajectory is None:
         return {}
-    none = torch.zeros(0, dtype=torch.float64)
-    keyframes = run.keyframes.stamps if run.keyframes is not None else none
-    plots = {"statuses": inline_svg(draw_statuses(run.trajectory.stamps, run.metrics.status, keyframes), "statuses")}
+    keyframes = run.keyframes.stamps if run.keyframes is not None else torch.zeros(0, dtype=torch.float64)
+    plots = {"statuses": embed_svg(draw_statuses(run.trajectory.stamps, run.metrics.status, keyframes), "statuses")}
     masks = [(stamp, run.folder / "masks" / f"{stamp:.6f}.png") for stamp in run.trajectory.stamps.tolist()]
     saved = [(stamp, path) for stamp, path in masks if path.is_file()]
     if saved:
-        shares = [_share(path) for _, path in saved]
+        fractions = torch.tensor([_masked_fraction(path) for _, path in saved], dtype=torch.float64)
         stamps = torch.tensor([stamp for stamp, _ in saved], dtype=torch.float64)
-        plots["share"] = inline_svg(draw_share(stamps, torch.tensor(shares, dtype=torch.float64)), "share")
+        plots["masked"] = embed_svg(draw_masked_fraction(stamps, fractions), "masked")
     return plots
 
 
-def _share(path: Path) -> float:
+def _masked_fraction(path: Path) -> float:
     mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if mask is None:
-        raise InputError(f"{path}: is truncated or no image; delete it, or run again")
+        raise InputError(f"{path}: is truncated or not an image; delete it, or run the sequence again")
     return float((mask > 0).mean())
 
 
 def _object_plot(run: StoredRun) -> dict[str, Any] | None:
-    """Verdicts over time; None where no table of them is there, without a plot where it is empty."""
+    """Draw the objects over time; None without a table of objects, and no plot if the table is empty."""
     if run.dynamics is None:
         return None
     table = [
@@ -153,35 +156,35 @@ def _object_plot(run: StoredRun) -> dict[str, Any] | None:
     frames = run.frames.column("stamp").to_pylist() if run.frames is not None else []
     stamps = sorted({*frames, *(row.stamp for row in table)})
     threshold = run.config.objects.chamfer.distance_threshold if run.config is not None else None
-    figure, left_out = draw_objects_over_time(stamps, table, threshold)
-    return {"count": len({row.id for row in table}), "left_out": left_out, "plot": inline_svg(figure, "objects")}
+    figure, omitted = draw_object_timelines(stamps, table, threshold)
+    return {"count": len({row.id for row in table}), "omitted": omitted, "plot": embed_svg(figure, "objects")}
 
 
-def _stages(run: StoredRun) -> list[StageTime]:
+def _stage_times(run: StoredRun) -> list[StageTime]:
     frames = max(run.metrics.processed, 1)
-    each = _seconds_per_frame(run)
+    per_frame = _seconds_per_frame(run)
     return [
         StageTime(
             name=name,
             total=total,
             mean=total / frames,
-            median=float(np.median(each[name])) if name in each else None,
-            max=float(each[name].max()) if name in each else None,
+            median=float(np.median(per_frame[name])) if name in per_frame else None,
+            max=float(per_frame[name].max()) if name in per_frame else None,
         )
         for name, total in run.metrics.seconds_per_stage.items()
     ]
 
 
 def _stage_plots(run: StoredRun, stages: list[StageTime]) -> list[str]:
-    plots = [inline_svg(draw_stage_bars({stage.name: stage.mean for stage in stages}), "stages")] if stages else []
-    if run.frames is not None and (each := _seconds_per_frame(run)):
+    plots = [embed_svg(draw_stage_bars({stage.name: stage.mean for stage in stages}), "stages")] if stages else []
+    if run.frames is not None and (per_frame := _seconds_per_frame(run)):
         stamps = run.frames.column("stamp").to_pylist()
-        plots.append(inline_svg(draw_stages_over_time(stamps, each), "stages_over_time"))
+        plots.append(embed_svg(draw_stages_over_time(stamps, per_frame), "stages_over_time"))
     return plots
 
 
 def _seconds_per_frame(run: StoredRun) -> dict[str, NDArray[np.float64]]:
-    """Of each stage, shape (frames,); no stage where that is not known."""
+    """Return the time of each stage in each frame, seconds, shape (frames,); empty if not stored."""
     table = run.frames
     if table is None or not len(table):
         return {}

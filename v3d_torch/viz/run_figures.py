@@ -1,4 +1,4 @@
-"""The figures that every run leaves behind."""
+"""Figures written by every run: trajectory, masks, votes and clusters."""
 
 from __future__ import annotations
 
@@ -11,74 +11,77 @@ from v3d_torch.geometry.camera import BackProjector
 from v3d_torch.objects.motion_classifier import TrackedObject
 from v3d_torch.pipeline import Pipeline, Snapshot
 from v3d_torch.types import Instances, Trajectory
-from v3d_torch.viz.clusters import Cluster, clusters_figure
-from v3d_torch.viz.figures import Overlay, mask_strip, trajectory_figure
-from v3d_torch.viz.voting import voting_figure
+from v3d_torch.viz.clusters import Cluster, save_clusters_figure
+from v3d_torch.viz.object_overlay import Overlay, save_mask_figure
+from v3d_torch.viz.trajectory_figure import save_trajectory_figure
+from v3d_torch.viz.voting import save_voting_figure
 
 
 def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
-    """Draw the trajectory, the masks, and of the liveliest frame the votes and the clouds, where it has any.
+    """Draw the trajectory, the masks, and the votes and clouds of the most dynamic frame, if there are any.
 
     Args:
-        folder: for the images.
-        pipeline: that has run.
-        trajectory: of all frames.
+        folder: Folder of the images.
+        pipeline: Pipeline after the run.
+        trajectory: Poses of all frames.
 
     Raises:
-        OutputError: when an image cannot be written.
+        OutputError: If an image cannot be written.
     """
-    trajectory_figure(pipeline.sequence.groundtruth, trajectory, folder / "trajectory.png", pipeline.sequence.name)
-    if snapshots := pipeline.record.snapshots:
-        overlays = [[_overlay(judged) for judged in shot.scene.objects] for shot in snapshots]
-        mask_strip([shot.frame.image for shot in snapshots], overlays, folder / "masks.png")
-    shot = pipeline.record.most_dynamic_snapshot
-    if shot is not None and shot.scene.vote_pairs:
-        _draw_votes(folder / "voting.png", pipeline, shot)
-    if shot is not None and (clusters := _clusters(pipeline, shot)):
-        clusters_figure(clusters, folder / "clusters.png", _title(shot))
+    sequence, record = pipeline.sequence, pipeline.record
+    save_trajectory_figure(sequence.groundtruth, trajectory, folder / "trajectory.png", sequence.name)
+    if record.snapshots:
+        images = [snapshot.frame.image for snapshot in record.snapshots]
+        overlays = [[_overlay(obj) for obj in snapshot.scene.objects] for snapshot in record.snapshots]
+        save_mask_figure(images, overlays, folder / "masks.png")
+    snapshot = record.most_dynamic_snapshot
+    if snapshot is not None and snapshot.scene.vote_pairs:
+        _draw_votes(folder / "voting.png", pipeline, snapshot)
+    if snapshot is not None and (clusters := _clusters(pipeline, snapshot)):
+        save_clusters_figure(clusters, folder / "clusters.png", _title(snapshot))
 
 
-def _draw_votes(path: Path, pipeline: Pipeline, shot: Snapshot) -> None:
-    camera, T_cw = pipeline.sequence.camera, shot.T_cw
+def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot) -> None:
+    camera, T_cw = pipeline.sequence.camera, snapshot.T_cw
     objects: dict[int, Overlay] = {}
     centres: dict[int, Tensor] = {}
-    for judged in shot.scene.objects:
-        mask, text, verdict = _overlay(judged)
-        votes = f": {judged.votes} {'vote' if judged.votes == 1 else 'votes'}" if judged.votes else ""
-        objects[judged.id] = (mask, f"{text}{votes}", verdict)
-        in_camera = T_cw[:3, :3] @ judged.centroid + T_cw[:3, 3]
-        if mask.any() and in_camera[2] > 0:  # in view, and neither unknown, which is nan, nor behind the camera
-            centres[judged.id] = camera.distort(camera.project(in_camera[None]))[0]
-    voting_figure(shot.frame.image, objects, centres, shot.scene.vote_pairs, path, _title(shot))
+    for obj in snapshot.scene.objects:
+        mask, label, motion_state = _overlay(obj)
+        votes = f": {obj.votes} {'vote' if obj.votes == 1 else 'votes'}" if obj.votes else ""
+        objects[obj.id] = (mask, f"{label}{votes}", motion_state)
+        centroid = T_cw[:3, :3] @ obj.centroid + T_cw[:3, 3]
+        if mask.any() and centroid[2] > 0:  # in view and in front of the camera; false for NaN, an unknown centroid
+            centres[obj.id] = camera.distort(camera.project(centroid[None]))[0]
+    save_voting_figure(snapshot.frame.image, objects, centres, snapshot.scene.vote_pairs, path, _title(snapshot))
 
 
-def _clusters(pipeline: Pipeline, shot: Snapshot) -> list[Cluster]:
-    """The clouds of a frame's objects once more, with what outlier rejection took away."""
-    seen = [judged for judged in shot.scene.objects if not judged.missed]
-    if not seen:
+def _clusters(pipeline: Pipeline, snapshot: Snapshot) -> list[Cluster]:
+    """Compute the clouds of a frame's objects again, with the points removed by outlier rejection."""
+    detected = [obj for obj in snapshot.scene.objects if not obj.missed]
+    if not detected:
         return []
-    slam, count = pipeline.slam, len(seen)
-    masks = torch.stack([judged.mask for judged in seen])
-    labels = torch.tensor([judged.label for judged in seen])
-    depth = slam.smooth_depth(shot.frame.depth[None])[0]
+    slam, count = pipeline.slam, len(detected)
+    masks = torch.stack([obj.mask for obj in detected])
+    labels = torch.tensor([obj.label for obj in detected])
+    depth = slam.smooth_depth(snapshot.frame.depth[None])[0]
     clouds = slam.back_project_instances(depth, Instances(masks, labels, torch.ones(count), torch.zeros(count, 4)))
     points = BackProjector(pipeline.sequence.camera)(depth[None])[0]
-    lifted = (depth[0] > 0) & (depth[0] <= slam.config.objects.clouds.max_depth)
+    measured = (depth[0] > 0) & (depth[0] <= slam.config.objects.clouds.max_depth)
     return [
         Cluster(
-            text=_overlay(judged)[1],
-            before=points[judged.mask & lifted],
-            kept=clouds.cloud_pixels[i][judged.mask & lifted],
+            label=obj.name,
+            before=points[obj.mask & measured],
+            inliers=clouds.cloud_pixels[i][obj.mask & measured],
             after=clouds.points[i, clouds.valid[i]],
         )
-        for i, judged in enumerate(seen)
+        for i, obj in enumerate(detected)
         if clouds.centroid[i].isfinite().all()
     ]
 
 
-def _overlay(judged: TrackedObject) -> Overlay:
-    return judged.mask, judged.name, judged.motion_state.value
+def _overlay(obj: TrackedObject) -> Overlay:
+    return obj.mask, obj.name, obj.motion_state.value
 
 
-def _title(shot: Snapshot) -> str:
-    return f"frame {shot.frame.index}, {shot.frame.stamp:.3f} s"
+def _title(snapshot: Snapshot) -> str:
+    return f"frame {snapshot.frame.index} at {snapshot.frame.stamp:.3f} s"

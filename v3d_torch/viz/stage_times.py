@@ -1,4 +1,4 @@
-"""Where the time goes: seconds of each stage."""
+"""Plots of the time spent in each stage."""
 
 from __future__ import annotations
 
@@ -10,45 +10,47 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from v3d_torch.viz.timelines import WIDTH, rows
+from v3d_torch.viz.time_axes import WIDTH, make_time_axes
 
-_MOST_STEPS = 240  # more than a page can show; between them the mean
+_MAX_STEPS = 240
+"""Maximum number of steps of a plot over time, about one per two pixels of a page. Longer runs are averaged."""
 
 
-def draw_stage_bars(per_frame: Mapping[str, float]) -> Figure:
-    """A bar per stage with its mean time in a frame.
+def draw_stage_bars(seconds_per_frame: Mapping[str, float]) -> Figure:
+    """Draw one bar per stage with its mean time per frame.
 
     Args:
-        per_frame: seconds by stage, at least one.
+        seconds_per_frame: Mean time of each stage, seconds, at least one stage.
     """
-    figure = Figure(figsize=(WIDTH, 0.27 * len(per_frame) + 0.6), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 0.27 * len(seconds_per_frame) + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    bars = axes.barh(list(per_frame), [1e3 * seconds for seconds in per_frame.values()], color=_colours(per_frame))
+    milliseconds = [1e3 * seconds for seconds in seconds_per_frame.values()]
+    bars = axes.barh(list(seconds_per_frame), milliseconds, color=_colours(seconds_per_frame))
     axes.bar_label(bars, fmt="%.1f", padding=3, fontsize="small")
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_xlabel("milliseconds a frame")
+    axes.set_xlabel("mean time per frame [ms]")
     axes.margins(x=0.08)
     return figure
 
 
 def draw_stages_over_time(stamps: Sequence[float], seconds: Mapping[str, NDArray[np.float64]]) -> Figure:
-    """The time of each frame, by stage.
+    """Draw the time of each frame, stacked by stage.
 
     Args:
-        stamps: of the frames, increasing.
-        seconds: of each stage in each frame, shape :math:`(N,)`.
+        stamps: Timestamps of the frames, seconds, increasing.
+        seconds: Time of each stage in each frame, seconds, shape :math:`(N,)`.
     """
-    at = np.asarray(stamps) - stamps[0]
-    parts = min(len(at), _MOST_STEPS)
-    means = [[part.mean() for part in np.array_split(values, parts)] for values in seconds.values()]
-    figure, (axes,) = rows(at.tolist(), [1.9], labels=0.5)
-    centres = [part.mean() for part in np.array_split(at, parts)]
+    times = np.asarray(stamps) - stamps[0]
+    steps = min(len(times), _MAX_STEPS)
+    means = [[part.mean() for part in np.array_split(values, steps)] for values in seconds.values()]
+    figure, (axes,) = make_time_axes(times.tolist(), [1.9], extra_height=0.5)
+    centres = [part.mean() for part in np.array_split(times, steps)]
     axes.stackplot(
         centres, 1e3 * np.array(means), labels=list(seconds), colors=_colours(seconds), linewidth=0, step="mid"
     )
-    axes.set(ylabel="milliseconds", ylim=(0, None))
+    axes.set(ylabel="time per frame [ms]", ylim=(0, None))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=8, frameon=False, fontsize=8)
     return figure
 

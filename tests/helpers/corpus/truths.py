@@ -174,9 +174,9 @@ CASES = [
         "another clock",
         stamps_as(lambda s: f"{s + 3600:.6f}", (TRUTH,)),
         Says(
-            "seq: has no scores, only 0 poses of the estimate (1305031102.00 to 1305031102.70 s) lie within"
-            " 0.02 s of the ground truth (1305034702.00 to 1305034702.70 s), at least 3 are needed; are they"
-            " of the same sequence? (the results are in {out})",
+            "seq: has no scores, only 0 poses of the estimate (1305031102.00 to 1305031102.70 s) are within"
+            " 0.02 s of the ground truth (1305034702.00 to 1305034702.70 s), at least 3 are needed; check that"
+            " both belong to the same sequence (the results are in {out})",
             kept=8,
         ),
     ),
@@ -184,9 +184,9 @@ CASES = [
         "two poses",
         lines(TRUTH, lambda listed: listed[:2]),
         Says(
-            "seq: has no scores, only 2 poses of the estimate (1305031102.00 to 1305031102.70 s) lie within"
-            " 0.02 s of the ground truth (1305031102.00 to 1305031102.10 s), at least 3 are needed; are they"
-            " of the same sequence? (the results are in {out})",
+            "seq: has no scores, only 2 poses of the estimate (1305031102.00 to 1305031102.70 s) are within"
+            " 0.02 s of the ground truth (1305031102.00 to 1305031102.10 s), at least 3 are needed; check that"
+            " both belong to the same sequence (the results are in {out})",
             kept=8,
         ),
     ),

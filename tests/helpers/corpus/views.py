@@ -93,7 +93,7 @@ CASES = [
     Case(
         "depth in millimetres",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1000, np.uint16))),
-        Right(ate=0.1, note="the ground truth is 5 times as large as the estimate: is depth_scale right?"),
+        Right(ate=0.1, note="the ground truth is 5 times as large as the estimate: check depth_scale"),
     ),
     Case(
         "depth of a camera that counts metres",

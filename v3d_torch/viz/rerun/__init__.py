@@ -1,1 +1,1 @@
-"""A run in rerun's viewer (``pip install v3d-torch[rerun]``)."""
+"""View of a run in rerun (``pip install v3d-torch[rerun]``)."""

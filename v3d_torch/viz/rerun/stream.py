@@ -1,4 +1,4 @@
-"""Where a rerun recording goes: to a viewer on the screen, to a file, or to both."""
+"""Destination of a rerun recording: a viewer on the screen, a file, or both."""
 
 from __future__ import annotations
 
@@ -15,30 +15,35 @@ import rerun as rr
 from v3d_torch.errors import OutputError, ViewerError
 
 PORT = 9876
-"""On which rerun's viewer listens."""
+"""Port of rerun's viewer."""
 
-_PATIENCE = 20.0  # seconds: a busy machine takes its time
-_SCREENS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+_START_TIMEOUT = 20.0
+"""Longest time for the viewer to start, seconds. On a busy machine, it takes several seconds."""
+
+_POLL_INTERVAL = 0.2  # seconds
+
+_DISPLAY_VARIABLES = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+"""Environment variables, at least one of which is set on a Linux machine with a screen."""
 
 
 def open_stream(*, live: bool, file: Path | None, port: int = PORT) -> rr.RecordingStream:
-    """Begin a recording.
+    """Open a recording.
 
-    A file is written as the run goes: what was recorded until a crash can be looked at.
+    The file is written during the run, so that after a crash it holds everything until then.
 
     Args:
-        live: whether to show it in the viewer that listens on this machine, or in a new one.
-        file: to record to, ``.rrd``; None for none.
-        port: of the viewer.
+        live: True to show the recording in the viewer that listens on this machine, or in a new viewer.
+        file: File to record to, ``.rrd``; None for no file.
+        port: Port of the viewer.
 
     Raises:
-        ViewerError: no viewer can be started.
-        OutputError: the file cannot be written.
+        ViewerError: If no viewer can be started.
+        OutputError: If the file cannot be written.
     """
     stream = rr.RecordingStream("v3d_torch", recording_id=uuid4())
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if live:
-        _reach_viewer(port)
+        _ensure_viewer(port)
         sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{port}/proxy"))
     try:
         if file is not None:
@@ -50,26 +55,29 @@ def open_stream(*, live: bool, file: Path | None, port: int = PORT) -> rr.Record
     return stream
 
 
-def _reach_viewer(port: int) -> None:
-    """Make sure that a viewer listens."""
+def _ensure_viewer(port: int) -> None:
+    """Start a viewer unless one is listening already."""
     if _listens(port):
         return
-    instead = f"record with --rerun FILE.rrd to look at it elsewhere, or let a viewer listen on port {port} here"
-    if sys.platform == "linux" and not any(os.environ.get(name) for name in _SCREENS):
-        raise ViewerError(f"--viz rerun: there is no screen to open a viewer on; {instead}")
-    own = Path(sys.executable).with_name("rerun")  # where an environment that is not activated has it
-    program = str(own) if own.is_file() else "rerun"
-    # rerun.spawn would do, but its viewer listens to the whole network.
-    here_alone = [f"--port={port}", "--bind=127.0.0.1", "--expect-data-soon"]
+    alternatives = (
+        f"record with --rerun FILE.rrd and open the file elsewhere, or start a viewer on port {port} of this machine"
+    )
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAY_VARIABLES):
+        raise ViewerError(f"--viz rerun: no screen to open a viewer on; {alternatives}")
+    # In an environment that is not activated, the program is not on the path, but beside the interpreter.
+    local_program = Path(sys.executable).with_name("rerun")
+    program = str(local_program) if local_program.is_file() else "rerun"
+    # Not rerun.spawn, because its viewer accepts connections from the whole network.
+    arguments = [f"--port={port}", "--bind=127.0.0.1", "--expect-data-soon"]
     try:
-        viewer = subprocess.Popen([program, *here_alone], start_new_session=True)  # noqa: S603 - it outlives the run
+        viewer = subprocess.Popen([program, *arguments], start_new_session=True)  # noqa: S603 - outlives the run
     except OSError as error:
-        raise ViewerError(f"--viz rerun: the viewer cannot be started ({error}); {instead}") from error
-    deadline = time.monotonic() + _PATIENCE
+        raise ViewerError(f"--viz rerun: the viewer cannot be started ({error}); {alternatives}") from error
+    deadline = time.monotonic() + _START_TIMEOUT
     while not _listens(port):
         if viewer.poll() is not None or time.monotonic() > deadline:
-            raise ViewerError(f"--viz rerun: no viewer came up, its reason may stand above; {instead}")
-        time.sleep(0.2)
+            raise ViewerError(f"--viz rerun: the viewer did not start, see its output above; {alternatives}")
+        time.sleep(_POLL_INTERVAL)
 
 
 def _listens(port: int) -> bool:

@@ -1,0 +1,119 @@
+"""Evaluation of a trajectory: invariance, notes on unusual inputs, missing RPE, errors."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from helpers.trajectories import assert_statistics, noisy, random_walk
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from v3d_torch.errors import InputError
+from v3d_torch.evaluation import evaluate
+from v3d_torch.evaluation.ate import RotationSource
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.types import Trajectory
+
+
+@given(xi=st.lists(st.floats(-3, 3), min_size=6, max_size=6))
+@settings(max_examples=25)
+def test_errors_do_not_depend_on_world_frame_of_estimate(xi: list[float]) -> None:
+    groundtruth = random_walk(60, seed=3)
+    estimate = noisy(groundtruth, seed=4)
+    T = se3_exp(torch.tensor(xi, dtype=torch.float64))
+    original = evaluate(groundtruth, estimate)
+    moved = evaluate(groundtruth, Trajectory(estimate.stamps, T @ estimate.T_wc))
+    assert_statistics(moved.ate, vars(original.ate))
+    assert original.rpe is not None and moved.rpe is not None
+    assert moved.rpe.trans.rmse == pytest.approx(original.rpe.trans.rmse, abs=1e-9)
+    assert moved.rpe.rot.rmse == pytest.approx(original.rpe.rot.rmse, abs=1e-9)
+    assert torch.allclose(moved.alignment.T_ge @ T, original.alignment.T_ge, atol=1e-9)
+
+
+@given(scale=st.floats(0.05, 20), seed=st.integers(0, 1000))
+@settings(max_examples=40, deadline=None)
+def test_wrong_depth_unit_is_noted(scale: float, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    steps = torch.randn(60, 6, dtype=torch.float64, generator=generator) * 0.02
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(60, 1, 1)
+    for i in range(1, 60):
+        T_wc[i] = T_wc[i - 1] @ se3_exp(steps[i])
+    stamps = torch.arange(60, dtype=torch.float64) / 10
+    scaled = T_wc.clone()
+    scaled[:, :3, 3] *= scale
+    notes = " ".join(evaluate(Trajectory(stamps, T_wc), Trajectory(stamps, scaled)).notes)
+    note = re.search(r"is (\S+) times as large as the estimate", notes)
+    if 0.7 < scale < 1.4:
+        assert note is None
+    elif not 0.6 < scale < 1.6:
+        assert note is not None and float(note[1]) == pytest.approx(1 / scale, rel=0.01)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=40, deadline=None)
+def test_estimate_of_other_shape_has_no_depth_unit_note(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    stamps = torch.arange(60, dtype=torch.float64) / 10
+    one, other = (se3_exp(torch.randn(60, 6, dtype=torch.float64, generator=generator)) for _ in range(2))
+    other[:, :3, 3] *= 5
+    assert "times as large" not in " ".join(evaluate(Trajectory(stamps, one), Trajectory(stamps, other)).notes)
+
+
+def test_placeholder_orientations_give_no_rpe() -> None:
+    groundtruth = random_walk(60, seed=13)
+    T_wc = groundtruth.T_wc.clone()
+    T_wc[:, :3, :3] = torch.eye(3, dtype=torch.float64)
+    evaluation = evaluate(Trajectory(groundtruth.stamps, T_wc), noisy(groundtruth, seed=14))
+    assert evaluation.rpe is None and any("placeholders" in note for note in evaluation.notes)
+    assert evaluation.ate.rmse == pytest.approx(evaluate(groundtruth, noisy(groundtruth, seed=14)).ate.rmse)
+
+
+def test_static_camera_has_rpe() -> None:
+    """The orientations of a static camera are all the same, but they are not placeholders."""
+    stamps = torch.arange(60, dtype=torch.float64) / 30
+    groundtruth = Trajectory(stamps, torch.eye(4, dtype=torch.float64).repeat(60, 1, 1))
+    evaluation = evaluate(groundtruth, noisy(groundtruth, seed=15, sigma=0.01))
+    assert evaluation.rpe is not None and evaluation.rpe.rot.rmse > 0.1
+    assert evaluation.alignment.source is RotationSource.ORIENTATIONS
+
+
+def test_trajectory_shorter_than_delta_has_no_rpe() -> None:
+    groundtruth = random_walk(20, seed=16)
+    evaluation = evaluate(groundtruth, noisy(groundtruth, seed=17))
+    assert evaluation.rpe is None and any("1 s apart" in note for note in evaluation.notes)
+
+
+def test_fewer_than_three_associated_poses_are_rejected() -> None:
+    groundtruth = random_walk(60, seed=18)
+    elsewhere = Trajectory(groundtruth.stamps + 100, groundtruth.T_wc)
+    empty = Trajectory(groundtruth.stamps[:0], groundtruth.T_wc[:0])
+    for estimate in (elsewhere, empty, Trajectory(groundtruth.stamps[:2], groundtruth.T_wc[:2])):
+        with pytest.raises(InputError, match="at least 3 are needed"):
+            evaluate(groundtruth, estimate)
+
+
+def test_coverage_and_json_values() -> None:
+    groundtruth = random_walk(60, seed=19)
+    evaluation = evaluate(groundtruth, Trajectory(groundtruth.stamps[:45], groundtruth.T_wc[:45]), frames=60)
+    assert (evaluation.poses, evaluation.pairs, evaluation.coverage) == (45, 45, 0.75)
+    assert evaluate(groundtruth, groundtruth).coverage is None
+    values = json.loads(json.dumps(evaluation.to_dict()))
+    assert evaluation.rpe is not None
+    assert values["ate"]["rmse"] == evaluation.ate.rmse
+    assert values["rpe"]["trans"]["rmse"] == evaluation.rpe.trans.rmse
+    assert values["rpe"]["rot"]["std"] == evaluation.rpe.rot.std
+    assert values["coverage"] == 0.75 and values["alignment"]["rotation_from"] == "positions"
+
+
+def test_arguments_that_are_not_trajectories_are_rejected() -> None:
+    poses = Trajectory(torch.arange(3.0), torch.eye(4).repeat(3, 1, 1))
+    with pytest.raises(
+        InputError, match=r"^the ground truth is a str, not a Trajectory; read a file with read_trajectory"
+    ):
+        evaluate("groundtruth.txt", poses)
+    with pytest.raises(InputError, match=r"^the estimate is a ndarray, not a Trajectory; read"):
+        evaluate(poses, np.zeros((3, 8)))

@@ -1,0 +1,44 @@
+"""Figures and images embedded in an HTML page; no global state of pyplot."""
+
+from __future__ import annotations
+
+import base64
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from v3d_torch.errors import InputError
+from v3d_torch.viz.figure_output import embed_image, embed_svg
+from v3d_torch.viz.stage_times import draw_stage_bars
+
+
+def test_svg_has_colours_of_page_and_is_reproducible() -> None:
+    one, other = (embed_svg(draw_stage_bars({"read": 0.1}), "bars") for _ in range(2))
+    assert one == other
+    assert one.startswith("<svg") and one.rstrip().endswith("</svg>")
+    assert "#000000" not in one and "currentColor" in one
+    assert ">read</text>" in one  # text, not outlines
+    assert "fill: #ffffff" not in one
+
+
+def test_image_is_a_data_url_and_damaged_image_is_an_error(tmp_path: Path) -> None:
+    colour = np.zeros((40, 60, 3), dtype=np.uint8)
+    colour[:, :30] = (255, 0, 0)
+    cv2.imwrite(str(tmp_path / "a.png"), colour[..., ::-1])
+    kind, data = embed_image(tmp_path / "a.png").split(",")
+    assert kind == "data:image/webp;base64"
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), dtype=np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(decoded.astype(int) - colour).mean() < 8
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes()[:30])
+    with pytest.raises(InputError, match=r"b\.png: is truncated or not an image; delete it"):
+        embed_image(tmp_path / "b.png")
+
+
+def test_pyplot_is_not_imported() -> None:
+    probe = "import sys, v3d_torch.viz.report_page; print('matplotlib.pyplot' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,92 @@
+"""Figure of a trajectory: colours, plane, alignment, gaps, few poses, errors."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.pictures import count_pixels, read_picture
+from helpers.trajectories import arc, shaken
+
+from v3d_torch.errors import OutputError
+from v3d_torch.types import Trajectory
+from v3d_torch.viz.trajectory_figure import save_trajectory_figure
+
+BLACK, BLUE = "black", "tab:blue"
+
+
+def static_camera() -> Trajectory:
+    return Trajectory(torch.arange(60, dtype=torch.float64), torch.eye(4, dtype=torch.float64).repeat(60, 1, 1))
+
+
+def test_ground_truth_black_estimate_blue_difference_red(tmp_path: Path) -> None:
+    save_trajectory_figure(arc(), shaken(arc()), tmp_path / "with.png", title="arc")
+    save_trajectory_figure(None, shaken(arc()), tmp_path / "without.png", title="arc")
+    with_truth, without = read_picture(tmp_path / "with.png"), read_picture(tmp_path / "without.png")
+    reddish = [int(((i[..., 0] > 0.75) & (i[..., 1] < 0.5) & (i[..., 2] < 0.5)).sum()) for i in (with_truth, without)]
+    assert count_pixels(with_truth, BLUE) > 1000 and count_pixels(without, BLUE) > 1000
+    assert reddish[0] > 300 and reddish[1] == 0
+    assert count_pixels(with_truth, BLACK) > count_pixels(without, BLACK) + 1000
+
+
+@pytest.mark.parametrize(
+    ("scale", "labels"),
+    [((1.0, 0.1, 0.5), "xz"), ((0.1, 1.0, 0.5), "yz"), ((1.0, 1.0, 0.1), "xy"), ((0.0, 0.0, 0.0), "xy")],
+)
+def test_plane_has_the_two_axes_of_largest_extent(
+    tmp_path: Path, scale: tuple[float, float, float], labels: str
+) -> None:
+    save_trajectory_figure(arc(scale), shaken(arc(scale), 1e-4), tmp_path / "figure.svg")
+    assert "".join(re.findall(r"<!-- ([xyz]) \[m\] -->", (tmp_path / "figure.svg").read_text())) == labels
+
+
+def test_estimate_is_drawn_aligned(tmp_path: Path) -> None:
+    """An estimate that differs by its world frame only covers the ground truth, and its error in the legend is zero."""
+    T_ew = torch.tensor([[0, -1, 0, 9], [1, 0, 0, 9], [0, 0, 1, 9], [0, 0, 0, 1]], dtype=torch.float64)
+    save_trajectory_figure(arc(), Trajectory(arc().stamps, T_ew @ arc().T_wc), tmp_path / "figure.svg")
+    drawing = (tmp_path / "figure.svg").read_text()
+    assert "<!-- difference (ATE RMSE 0.0000 m) -->" in drawing
+    truth, estimate = (
+        re.findall(rf'<path d="([^"]+)"[^>]*stroke: {c}[^>]*', drawing)[0] for c in ("#000000; st", "#1f77b4")
+    )
+    assert truth.count("L") > 30
+    np.testing.assert_allclose(*([float(n) for n in re.findall(r"[\d.]+", d)] for d in (truth, estimate)), atol=1e-3)
+
+
+@pytest.mark.parametrize("poses", [0, 1, 2, 60])
+@pytest.mark.parametrize("groundtruth", ["none", "still", "elsewhere"])
+def test_few_poses_and_static_camera_are_drawn(tmp_path: Path, poses: int, groundtruth: str) -> None:
+    truth = {
+        "none": None,
+        "still": static_camera(),
+        "elsewhere": Trajectory(static_camera().stamps + 1e4, static_camera().T_wc),
+    }[groundtruth]
+    estimate = shaken(static_camera(), 1e-3)
+    save_trajectory_figure(truth, Trajectory(estimate.stamps[:poses], estimate.T_wc[:poses]), tmp_path / "figure.png")
+    image = read_picture(tmp_path / "figure.png")
+    assert min(image.shape[:2]) > 500
+    assert (count_pixels(image, BLUE) > 300) == (poses > 2)
+
+
+def test_curve_has_gap_where_poses_are_missing(tmp_path: Path) -> None:
+    present = torch.cat([torch.arange(0, 20), torch.arange(40, 60)])
+    estimate = Trajectory(arc().stamps[present], arc().T_wc[present])
+    save_trajectory_figure(None, estimate, tmp_path / "figure.svg")
+    line = re.findall(r'<path d="([^"]+)"[^>]*stroke: #1f77b4', (tmp_path / "figure.svg").read_text())[0]
+    assert line.count("M") == 2
+
+
+def test_same_trajectory_gives_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        save_trajectory_figure(arc(), shaken(arc()), tmp_path / f"{name}.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_unwritable_figure_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
+    (tmp_path / "figure.png").mkdir()
+    with pytest.raises(OutputError, match=r"figure\.png"):
+        save_trajectory_figure(None, arc(), tmp_path / "figure.png")
+    assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]

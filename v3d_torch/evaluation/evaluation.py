@@ -1,0 +1,134 @@
+"""Evaluation of one trajectory (paper, Sec. IV): ATE, RPE, coverage, and notes on how they were measured."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from v3d_torch.errors import InputError
+from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
+from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align, scale_error
+from v3d_torch.evaluation.rpe import RPE, relative_pose_error
+from v3d_torch.evaluation.statistics import Statistics
+from v3d_torch.types import Trajectory
+
+MIN_PAIRS = 3
+"""Minimum number of associated poses. Three positions are the fewest that determine a rigid alignment."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors of an estimated trajectory.
+
+    Attributes:
+        ate: Absolute trajectory error, metres.
+        rpe: Relative pose error; None if it cannot be measured, and ``notes`` gives the reason.
+        pairs: Number of estimated poses with ground truth.
+        poses: Number of estimated poses.
+        coverage: Number of estimated poses divided by the number of frames of the sequence; None if the latter is not
+            known. A system that skips hard frames has smaller errors, but also a smaller coverage.
+        alignment: Alignment of the estimate to the ground truth.
+        notes: Deviations from the usual protocol, one sentence each.
+    """
+
+    ate: Statistics
+    rpe: RPE | None
+    pairs: int
+    poses: int
+    coverage: float | None
+    alignment: Alignment
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON, nested by attribute: ``["ate"]["rmse"]``, ``["rpe"]["trans"]["rmse"]`` etc."""
+        return {
+            "ate": asdict(self.ate),
+            "rpe": asdict(self.rpe) if self.rpe is not None else None,
+            "pairs": self.pairs,
+            "poses": self.poses,
+            "coverage": self.coverage,
+            "alignment": {"rotation_from": self.alignment.source.value, "T_ge": self.alignment.T_ge.tolist()},
+            "notes": list(self.notes),
+        }
+
+
+def evaluate(
+    groundtruth: Trajectory,
+    estimate: Trajectory,
+    *,
+    max_time_difference: float = MAX_TIME_DIFFERENCE,
+    rpe_delta: float = 1.0,
+    frames: int | None = None,
+) -> Evaluation:
+    """Evaluate a trajectory by the protocol of the TUM RGB-D benchmark, which the paper's tables follow.
+
+    Poses are associated one to one by nearest timestamps. ATE: distances of the positions after a rigid alignment over
+    all pairs (see `align` for a camera that hardly moves). RPE: errors of the motions over ``rpe_delta``, without
+    alignment.
+
+    Args:
+        groundtruth: Ground-truth poses.
+        estimate: Estimated poses, in any world.
+        max_time_difference: Maximum difference between the timestamps of a pair, seconds.
+        rpe_delta: Time over which the RPE measures drift, seconds.
+        frames: Number of colour-depth pairs of the sequence, for the coverage.
+
+    Raises:
+        InputError: If fewer than three poses can be associated, or if an argument is not a trajectory.
+    """
+    for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
+        if not isinstance(value, Trajectory):
+            raise InputError(
+                f"the {name} is a {type(value).__name__}, not a Trajectory; read a file with read_trajectory, or build"
+                " a Trajectory from arrays"
+            )
+    matches = associate_trajectories(groundtruth, estimate, max_time_difference)
+    if len(matches) < MIN_PAIRS:
+        raise InputError(
+            f"only {len(matches)} poses of the estimate {_time_range(estimate)} are within {max_time_difference:g} s of"
+            f" the ground truth {_time_range(groundtruth)}, at least {MIN_PAIRS} are needed; check that both belong to"
+            " the same sequence"
+        )
+    T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
+    oriented = has_orientations(groundtruth)
+    alignment = align(T_gc, T_ec, oriented=oriented)
+    notes = []
+    if alignment.source is RotationSource.ORIENTATIONS:
+        notes.append("the ground-truth positions do not span a plane: aligned by the mean of the orientations")
+    factor = scale_error(T_gc, T_ec, alignment)
+    if factor is not None:
+        notes.append(f"the ground truth is {factor:.3g} times as large as the estimate: check depth_scale")
+    rpe = relative_pose_error(groundtruth, estimate, matches, rpe_delta) if oriented else None
+    if not oriented:
+        notes.append("the ground truth moves but its orientations are all the same, so they are placeholders: no RPE")
+    elif rpe is None:
+        notes.append(f"no two poses with ground truth are {rpe_delta:g} s apart: no RPE")
+    return Evaluation(
+        ate=Statistics.of(absolute_errors(T_gc, T_ec, alignment)),
+        rpe=rpe,
+        pairs=len(matches),
+        poses=len(estimate),
+        coverage=len(estimate) / frames if frames else None,
+        alignment=alignment,
+        notes=tuple(notes),
+    )
+
+
+def has_orientations(trajectory: Trajectory) -> bool:
+    """Check whether the orientations of a trajectory were measured.
+
+    A ground truth of positions only fills the quaternion columns with a constant. So if the position changes and the
+    orientation never does, the orientations are placeholders.
+    """
+    T_wc = trajectory.T_wc
+    turns = not torch.allclose(T_wc[:, :3, :3], T_wc[:1, :3, :3], rtol=0, atol=1e-9)
+    moves = not torch.allclose(T_wc[:, :3, 3], T_wc[:1, :3, 3], rtol=0, atol=1e-9)
+    return turns or not moves
+
+
+def _time_range(trajectory: Trajectory) -> str:
+    if not len(trajectory):
+        return "(empty)"
+    return f"({trajectory.stamps[0]:.2f} to {trajectory.stamps[-1]:.2f} s)"

@@ -1,0 +1,103 @@
+"""The paper's tables I-III as data, and a table that compares a result with them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import NamedTuple
+
+import yaml
+from rich.table import Table
+
+from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
+from v3d_torch.evaluation.evaluation import Evaluation
+
+
+class Score(NamedTuple):
+    """RMSE and standard deviation of an error in the paper's tables; None if the paper prints a dash."""
+
+    rmse: float | None
+    sd: float | None
+
+
+HEADINGS = {"ate": "ATE, m", "rpe_trans": "RPE, m/s", "rpe_rot": "RPE, deg/s"}
+"""Heading of each metric of the paper's tables, with its unit."""
+
+_RESULT = "this result"
+
+
+@cache
+def paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
+    """Return the numbers of the paper's tables as ``[metric][sequence][method]``.
+
+    Metrics are ``ate`` (metres), ``rpe_trans`` (metres over 1 s) and ``rpe_rot`` (degrees over 1 s), sequences
+    ``fr3/s/xyz`` to ``fr3/w/rpy``, methods ``ORB-SLAM2`` to ``V3D-SLAM``.
+    """
+    tables = yaml.safe_load(files(__package__).joinpath("paper_tables.yaml").read_text(encoding="utf-8"))
+    return {
+        metric: {
+            sequence: {method: Score(*scores) for method, scores in row.items()} for sequence, row in table.items()
+        }
+        for metric, table in tables.items()
+    }
+
+
+def paper_sequence(name: str) -> str | None:
+    """Find the sequence of the paper named by a text or by the path of a file.
+
+    Args:
+        name: Name or path, such as ``fr3/w/xyz``, ``results/fr3_w_xyz/latest/trajectory.txt`` or
+            ``freiburg3_walking_xyz``.
+
+    Returns:
+        Short name, such as ``fr3/w/xyz``; None if the text names no sequence of the paper, or several.
+    """
+    pattern = r"(?:freiburg|fr)_?3[/_-][a-z]+[/_-](?:xyz|half(?:sphere)?|static|rpy)(?![a-z]|_?validation)"
+    candidates = {canonical_name(text) for text in [name, *re.findall(pattern, name.lower())]}
+    found = [sequence for sequence in PAPER_SEQUENCES if sequence in candidates]
+    return short_name(found[0]) if len(found) == 1 else None
+
+
+def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
+    """Return a table of the paper's methods and a result on the same sequence, the best RMSE of each column in green.
+
+    Args:
+        sequence: Name of the sequence, in any notation accepted by `find_paper_sequence`.
+        evaluation: Evaluation of the result.
+
+    Returns:
+        The table; None if the paper does not evaluate the sequence.
+    """
+    name = paper_sequence(sequence)
+    if name is None:
+        return None
+    scores = paper_scores()
+    rows = {method: [scores[metric][name][method] for metric in HEADINGS] for method in scores["ate"][name]}
+    rows[_RESULT] = _scores(evaluation)
+    best = [
+        min(score.rmse for score in column if score.rmse is not None) for column in zip(*rows.values(), strict=True)
+    ]
+
+    table = Table(title=f"{name}: the paper's tables and this result")
+    table.add_column("method")
+    for heading in HEADINGS.values():
+        table.add_column(f"{heading} RMSE", justify="right")
+        table.add_column("SD", justify="right")
+    for method, row in rows.items():
+        cells = [cell for score, lowest in zip(row, best, strict=True) for cell in _cells(score, lowest)]
+        table.add_row(method, *cells, style="bold" if method == _RESULT else None)
+    return table
+
+
+def _scores(evaluation: Evaluation) -> list[Score]:
+    """Return a result in the columns of the paper. The RPE is left out unless it is over one second, as the paper's."""
+    rpe = evaluation.rpe if evaluation.rpe is not None and evaluation.rpe.delta == 1 else None
+    measured = [evaluation.ate, rpe.trans if rpe else None, rpe.rot if rpe else None]
+    return [Score(s.rmse, s.std) if s is not None else Score(None, None) for s in measured]
+
+
+def _cells(score: Score, lowest: float) -> tuple[str, str]:
+    rmse, sd = ("-" if value is None else f"{value:.4f}" for value in score)
+    return (f"[green]{rmse}[/]" if score.rmse == lowest else rmse), sd

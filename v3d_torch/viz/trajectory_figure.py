@@ -1,0 +1,131 @@
+"""Figure of a trajectory in the style of the paper: ground truth, estimate, and the difference between them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from v3d_torch.evaluation.association import associate_trajectories
+from v3d_torch.evaluation.ate import absolute_errors, align
+from v3d_torch.evaluation.evaluation import has_orientations
+from v3d_torch.evaluation.statistics import Statistics
+from v3d_torch.types import Trajectory
+from v3d_torch.viz.figure_output import save_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+_MIN_HALF_RANGE = 0.01
+"""Minimum half width of the view, metres, so that the pose noise of a static camera does not fill the figure."""
+
+_MARGIN = 1.1
+"""Width of the view divided by the extent of the trajectory."""
+
+_GAP_FACTOR = 10
+"""A curve is interrupted where two stamps are farther apart than this multiple of the median interval."""
+
+
+def save_trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory, path: Path, title: str = "") -> None:
+    """Write a figure of a trajectory to a file, see `draw_trajectory`.
+
+    Args:
+        groundtruth: Ground-truth poses, or None.
+        estimate: Estimated poses, any number.
+        path: Image file; the suffix (.png, .pdf, .svg) selects the format.
+        title: Title of the figure.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    save_figure(draw_trajectory(groundtruth, estimate, title), path)
+
+
+def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title: str = "") -> Figure:
+    """Draw a trajectory as in the paper's figures: ground truth black, estimate blue, their difference red.
+
+    The trajectory is projected onto the two axes with the largest extent. The estimate is aligned to the ground truth.
+    Without ground truth at the timestamps of the estimate, the estimate is drawn alone, in its own world frame.
+
+    Args:
+        groundtruth: Ground-truth poses, or None.
+        estimate: Estimated poses, any number.
+        title: Title of the figure.
+    """
+    p_e = estimate.T_wc[:, :3, 3]
+    curves: list[tuple[Tensor, Tensor, str, str]] = [(estimate.stamps, p_e, "tab:blue", "estimate")]
+    segments, error = torch.zeros(0, 2, 3), 0.0
+    matches = associate_trajectories(groundtruth, estimate) if groundtruth is not None else None
+    if groundtruth is not None and matches:
+        T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
+        alignment = align(T_gc, T_ec, oriented=has_orientations(groundtruth))
+        aligned = p_e @ alignment.T_ge[:3, :3].mT + alignment.T_ge[:3, 3]
+        segments = torch.stack([T_gc[:, :3, 3], aligned[matches.estimate]], dim=1)
+        error = Statistics.of(absolute_errors(T_gc, T_ec, alignment)).rmse
+        curves = [
+            (groundtruth.stamps, groundtruth.T_wc[:, :3, 3], "black", "ground truth"),
+            (estimate.stamps, aligned, "tab:blue", "estimate"),
+        ]
+    figure = Figure(figsize=(6.4, 6.0), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    horizontal, vertical = _widest_axes(curves[0][1])
+    plane = [horizontal, vertical]
+    for stamps, positions, colour, label in curves:
+        axes.plot(*insert_gaps(stamps, positions[:, plane]).T, color=colour, linewidth=1.2, label=label)
+        axes.plot(*positions[:1, plane].numpy().T, "o", color=colour, markeredgecolor="white", zorder=3)
+    if len(segments):
+        lines = list(segments[:, :, plane].numpy())
+        axes.add_collection(LineCollection(lines, colors="tab:red", linewidths=0.7, alpha=0.7, zorder=1.5))
+        axes.plot([], [], color="tab:red", linewidth=0.9, label=f"difference (ATE RMSE {error:.4f} m)")
+    axes.plot([], [], "o", color="gray", label="start")
+    _set_square_view(axes, torch.cat([positions[:, plane] for _, positions, _, _ in curves]))
+    axes.set(xlabel=f"{'xyz'[horizontal]} [m]", ylabel=f"{'xyz'[vertical]} [m]")
+    axes.set_title(title, parse_math=False)  # the name of a folder may contain dollar signs
+    axes.grid(True, linewidth=0.4, alpha=0.5)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def insert_gaps(stamps: Tensor, points: Tensor) -> NDArray[np.float64]:
+    """Insert a NaN into a curve wherever poses are missing, so that it is drawn with a gap.
+
+    Args:
+        stamps: Timestamps, seconds, increasing, shape :math:`(N,)`.
+        points: Points of the curve, shape :math:`(N, 2)`.
+
+    Returns:
+        Points with the NaNs, shape :math:`(N + G, 2)`.
+    """
+    if len(stamps) < 2:
+        return points.numpy()
+    intervals = stamps.diff()
+    after = (intervals > _GAP_FACTOR * intervals.median()).nonzero()[:, 0].numpy() + 1
+    return np.insert(points.numpy(), after, np.nan, axis=0)
+
+
+def _widest_axes(positions: Tensor) -> tuple[int, int]:
+    """Return the two axes along which positions extend farthest, in the order x, y, z."""
+    if not len(positions):
+        return 0, 1
+    extent = positions.amax(dim=0) - positions.amin(dim=0)
+    first, second = extent.argsort(descending=True, stable=True)[:2].sort().values.tolist()
+    return first, second
+
+
+def _set_square_view(axes: Axes, points: Tensor) -> None:
+    """Set limits with equal scales that contain all points, shape (N, 2)."""
+    if not len(points):
+        points = torch.zeros(1, 2)
+    low, high = points.amin(dim=0), points.amax(dim=0)
+    half = max(_MARGIN / 2 * float((high - low).max()), _MIN_HALF_RANGE)
+    (x, y) = ((low + high) / 2).tolist()
+    axes.set(xlim=(x - half, x + half), ylim=(y - half, y + half), aspect="equal")
+    axes.locator_params(nbins=6)
