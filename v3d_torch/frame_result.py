@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -40,7 +41,7 @@ class PreprocessedFrame:
         depth: re-estimated, metres, float32, shape :math:`(1, H, W)`.
         features: of the whole image.
         seconds: that each stage took.
-        memory: of the segmentation after the frame, where it has one (`Remembering`).
+        segmenter_state: State of the segmenter after the frame; None unless it is a `StatefulSegmenter`.
     """
 
     frame: RGBDFrame
@@ -48,4 +49,4 @@ class PreprocessedFrame:
     depth: Tensor
     features: Features
     seconds: dict[str, float]
-    memory: object
+    segmenter_state: dict[str, Any] | None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from torch import Tensor
 
@@ -33,7 +33,7 @@ from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.tracking.pose_history import PoseHistory
-from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus, memory_of
+from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus, segment_frame, segmenter_state_of
 
 
 class V3DSLAM:
@@ -70,7 +70,7 @@ class V3DSLAM:
         self.poses = PoseHistory()
         self.timer = StageTimer()
         self._last: TrackedFrame | None = None
-        self._memory: object = None
+        self._segmenter_state: dict[str, Any] | None = None
         self._known = known
         self.outlooks = [self.outlook()] * PREFETCHED_FRAMES
         self.camera: PinholeCamera | None = None
@@ -140,13 +140,13 @@ class V3DSLAM:
             self._set_up(camera)
         clock = StageTimer()
         with clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(replace(frame, T_cw=None if outlook is None else outlook.at(frame.stamp)))
+            instances = segment_frame(self.segment, frame, None if outlook is None else outlook.at(frame.stamp))
             check_instances(instances, frame)
         with clock("depth"):  # III-B.1: depth re-estimated
             depth = self.smooth_depth(frame.depth[None])[0]
         with clock("features"):  # III-A: ORB
             features = self.detect_features(frame.image, depth)
-        return PreprocessedFrame(frame, instances, depth, features, clock.seconds, memory_of(self.segment))
+        return PreprocessedFrame(frame, instances, depth, features, clock.seconds, segmenter_state_of(self.segment))
 
     def track(self, percept: PreprocessedFrame) -> FrameResult:
         """Follow the camera and the objects on to the next frame.
@@ -156,7 +156,7 @@ class V3DSLAM:
         """
         check_order(percept.frame, self.poses.stamp)
         frame, instances, depth = percept.frame, percept.instances, percept.depth
-        self._memory = percept.memory  # not as the segmentation has it now: it may be frames ahead
+        self._segmenter_state = percept.segmenter_state  # as of this frame: the segmenter itself can be frames ahead
         self.timer.add(percept.seconds)
         with self.timer("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
             last, outlook = self._last, self.poses.outlook()

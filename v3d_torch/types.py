@@ -8,15 +8,15 @@ means "no measurement"; stamps are seconds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
@@ -32,7 +32,6 @@ class RGBDFrame:
         stamp: time of the colour image, seconds.
         image: colour, uint8 RGB, shape :math:`(3, H, W)`, as the camera delivers it (distorted).
         depth: metres, float32, shape :math:`(1, H, W)`, pixel by pixel on the colour image; 0 = no measurement.
-        T_cw: world to camera where the camera is expected to be, float64, shape :math:`(4, 4)`; None before it is.
         camera: that took both; None where who takes the frame in knows it.
         delay: of the depth image, seconds after the colour image; less than 0 where it was taken before.
     """
@@ -41,7 +40,6 @@ class RGBDFrame:
     stamp: float
     image: Tensor
     depth: Tensor
-    T_cw: Tensor | None = None
     camera: PinholeCamera | None = None
     depth_delay: float = 0.0
 
@@ -165,26 +163,70 @@ Segmenter = Callable[[RGBDFrame], Instances]
 
 
 @runtime_checkable
-class Remembering(Protocol):
-    """A segmenter that goes by the frames before.
+class PoseAwareSegmenter(Protocol):
+    """A segmenter that also uses the predicted pose of the camera, for example to find the up direction."""
 
-    Attributes:
-        memory: all that it remembers, of tensors and plain Python values, which it replaces and does not change. Given
-            back to another one made alike, that one goes on in its place.
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+        """Segment a frame.
+
+        Args:
+            frame: Frame to segment.
+            T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None if it is unknown.
+
+        Returns:
+            Instances in the frame's colour image.
+        """
+
+
+@runtime_checkable
+class StatefulSegmenter(Protocol):
+    """A segmenter whose results depend on earlier frames.
+
+    The state consists of tensors and plain Python values. An identically configured segmenter that loads it continues
+    with the same results.
     """
 
-    memory: object
+    def state_dict(self) -> dict[str, Any]:
+        """Return a snapshot of the state; no tensor in it is changed in place later."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `state_dict` returned."""
 
 
-def memory_of(segment: object) -> object:
-    """What a segmenter remembers; None where it does not go by the frames before."""
-    return segment.memory if isinstance(segment, Remembering) else None
+def segment_frame(segmenter: Segmenter, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+    """Segment a frame; only a `PoseAwareSegmenter` receives the predicted pose.
+
+    Args:
+        segmenter: Segmenter to call.
+        frame: Frame to segment.
+        T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None if it is unknown.
+
+    Returns:
+        Instances in the frame's colour image.
+    """
+    pose_aware = cast("PoseAwareSegmenter", segmenter)
+    return pose_aware.segment_with_pose(frame, T_cw) if _has(segmenter, "segment_with_pose") else segmenter(frame)
 
 
-def remind(segment: object, memory: object) -> None:
-    """Give a segmenter, where it goes by the frames before, what one made alike remembered of them."""
-    if isinstance(segment, Remembering):
-        segment.memory = memory
+def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
+    """Return the state of a `StatefulSegmenter`, None for any other segmenter."""
+    return cast("StatefulSegmenter", segmenter).state_dict() if _is_stateful(segmenter) else None
+
+
+def restore_segmenter(segmenter: object, state: Mapping[str, Any] | None) -> None:
+    """Load a state that `segmenter_state_of` returned; do nothing if the state is None."""
+    if state is not None and _is_stateful(segmenter):
+        cast("StatefulSegmenter", segmenter).load_state_dict(state)
+
+
+def _is_stateful(segmenter: object) -> bool:
+    # The state_dict of a torch module holds its weights: constant, and too large to be copied after every frame.
+    return _has(segmenter, "state_dict", "load_state_dict") and not isinstance(segmenter, nn.Module)
+
+
+def _has(segmenter: object, *methods: str) -> bool:
+    """Check for methods by name: from Python 3.12 on, isinstance does not find those that a proxy forwards."""
+    return all(callable(getattr(segmenter, method, None)) for method in methods)
 
 
 class TrackingStatus(StrEnum):

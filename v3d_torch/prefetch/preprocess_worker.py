@@ -25,7 +25,7 @@ from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
-from v3d_torch.types import memory_of, remind
+from v3d_torch.types import restore_segmenter, segmenter_state_of
 
 _LOG = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class PreprocessWorker:
         percept: PreprocessedFrame | None = self._try(self._channel.receive)
         if percept is None:
             return None
-        remind(self._slam.segment, percept.memory)
+        restore_segmenter(self._slam.segment, percept.segmenter_state)
         return replace(percept, frame=replace(percept.frame, camera=self._sequence.camera))
 
     def close(self) -> None:
@@ -114,7 +114,7 @@ class PreprocessWorker:
         channel.connection.settimeout(_LONGEST)
         channel.receive()
         stages = {name: getattr(slam, name) for name in _STAGES}
-        channel.send((type(slam), slam.camera, slam.config, stages, memory_of(slam.segment), self._sequence))
+        channel.send((type(slam), slam.camera, slam.config, stages, segmenter_state_of(slam.segment), self._sequence))
         channel.receive()
         channel.connection.settimeout(None)
 
@@ -140,11 +140,11 @@ def serve(connection: int, arena: int | None = None) -> None:
     """
     channel = Channel(socket.socket(fileno=connection), arena, PREFETCHED_FRAMES)
     channel.send(None)
-    kind, camera, config, stages, memory, sequence = channel.receive()
+    kind, camera, config, stages, segmenter_state, sequence = channel.receive()
     set_num_threads(config.threads)
     slam: V3DSLAM = kind(camera, stages["segment"], config)
     vars(slam).update(stages)
-    remind(slam.segment, memory)
+    restore_segmenter(slam.segment, segmenter_state)
     channel.send(None)
     while True:
         index, outlook = channel.receive()

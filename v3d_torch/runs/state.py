@@ -32,13 +32,13 @@ from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.tracking.pose_history import PoseHistory, _Entry
-from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus, remind
+from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus, restore_segmenter
 
 State = dict[str, Any]
 """Values of attributes by their names, one graph: what two of them share is shared."""
 
 OF_SLAM = (
-    *("timer", "poses", "outlooks", "_memory", "_last"),
+    *("timer", "poses", "outlooks", "_segmenter_state", "_last"),
     *(f"mapper.map.{name}" for name in ("keyframes", "landmarks", "observations", "loops", "readout")),
     *("mapper._most_tracked", "mapper._untracked_since", "loop_closer.loop_count", "back_end.keyframe"),
     *(
@@ -105,7 +105,7 @@ def refresh(slam: V3DSLAM) -> None:
             slam.loop_closer.add_keyframe(keyframe)
     if newest is not None:
         slam.back_end.submit(newest)
-    remind(slam.segment, slam._memory)
+    restore_segmenter(slam.segment, slam._segmenter_state)
 
 
 def save_state(path: StrPath, slam: V3DSLAM) -> None:
