@@ -1,8 +1,8 @@
 """Safe reading of published ``.pt`` weights: no code from the file is executed.
 
 Such a file is a pickle of a tree of module objects of another library, and a pickle can call any function by name.
-Therefore the checksum is verified first. Then torch's restricted unpickler reads the file and rejects every name that is
-not allowed. The allowed module classes are replaced by `_InertModule`, which only stores attributes.
+Therefore the checksum is verified first. Then torch's restricted unpickler reads the file and rejects every name that
+is not allowed. The allowed module classes are replaced by `_InertModule`, which only stores attributes.
 """
 
 from __future__ import annotations

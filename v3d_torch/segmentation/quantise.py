@@ -1,7 +1,7 @@
 """Static 8-bit quantisation of a network's convolutions (Jacob et al., CVPR 2018).
 
-Integer convolutions are faster on processors with 8-bit vector instructions. The range of every activation is calibrated
-on rendered frames of the demo: nothing has to be downloaded, and every machine uses the same frames.
+Integer convolutions are faster on processors with 8-bit vector instructions. The range of every activation is
+calibrated on rendered frames of the demo: nothing has to be downloaded, and every machine uses the same frames.
 """
 
 from __future__ import annotations

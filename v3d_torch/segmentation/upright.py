@@ -60,8 +60,8 @@ class UprightSegmenter:
 
         Args:
             frame: Frame to segment.
-            T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None if it is unknown, then
-                the frame is segmented in the orientation that it has.
+            T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None segments the frame in
+                the orientation that it has.
 
         Returns:
             Instances of the frame in its own orientation.
@@ -87,9 +87,10 @@ class UprightSegmenter:
         self._calls, self._up = state["calls"], state["up"].clone()
 
     def _is_search_due(self) -> bool:
-        """Check whether to segment all turns: often until up is settled; at calls 0 and 2^n because poses can change."""
+        """Check whether to segment all turns: often until up is settled, then rarely, because poses are corrected."""
         is_unsettled = self._calls < _SEARCH_CALLS and float(self._up.norm()) < _CONFIDENT_WEIGHT
-        return (is_unsettled and self._calls % _SEARCH_INTERVAL == 0) or self._calls.bit_count() <= 1
+        is_zero_or_power_of_two = self._calls.bit_count() <= 1
+        return (is_unsettled and self._calls % _SEARCH_INTERVAL == 0) or is_zero_or_power_of_two
 
     def _upright_turns(self, T_cw: Tensor) -> int:
         """Number of counterclockwise quarter turns that bring an image upright."""
