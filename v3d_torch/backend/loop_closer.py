@@ -140,7 +140,7 @@ class LoopCloser:
         place = self._detect_revisit(keyframe, sparse_map) if self._config.enabled else None
         if place is None:
             return None
-        # Old keyframe i, new keyframe j: T_ij is the pose of camera j in camera i, tracked in the map around keyframe i.
+        # Old keyframe i, new keyframe j: T_ij is the pose of camera j in camera i, both in the map around keyframe i.
         T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
         loop = Loop(place.keyframe.index, keyframe.index, T_ij)
         return LoopCorrection(place, loop, self._optimise_poses(sparse_map, T_cw, [*sparse_map.loops, loop]))
