@@ -28,7 +28,7 @@ from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import Instances, RGBDFrame, Segmenter
+from v3d_torch.types import Instances, RGBDFrame, Segmenter, segment_frame
 
 SERIAL = ("prefetch=false",)  # as in v3d_torch/cli/run.py
 
@@ -67,11 +67,15 @@ class Watched:
     people: dict[int, Tensor] = field(default_factory=dict)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Instances of a frame; none of those in between."""
+        """Segment a frame without a pose."""
+        return self.segment_with_pose(frame, None)
+
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+        """Segment every n-th frame; the frames in between have no instances."""
         if frame.index % self.every:
             return Instances.empty(*frame.image.shape[1:])
         begin = time.perf_counter()
-        instances = self.segment(frame)
+        instances = segment_frame(self.segment, frame, T_cw)
         self.seconds.append(time.perf_counter() - begin)
         self.people[frame.index] = instances.masks[instances.labels == PERSON].any(dim=0)
         return instances

@@ -1,18 +1,20 @@
-"""V3D-SLAM: the way of one frame, in the paper's order."""
+"""V3D-SLAM: the processing of one frame, in the order of the paper."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections import deque
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 from torch import Tensor
 
 from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
-from v3d_torch.features.features import Features
+from v3d_torch.errors import ConfigError
 from v3d_torch.features.orb import ORB
-from v3d_torch.frame_result import PREFETCHED_FRAMES, FrameResult, PreprocessedFrame
+from v3d_torch.frame_result import FrameResult, PreprocessedFrame
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.se3 import invert, rigid
@@ -23,39 +25,54 @@ from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.unlabelled import unlabelled_instances
-from v3d_torch.odometry.depth_delay import DepthDelayCompensation
-from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion
+from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, TrackedFrame
-from v3d_torch.odometry.rolling_shutter import RollingShutterCompensation
-from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parts
+from v3d_torch.odometry.time_compensation import TimeCompensation
+from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
-from v3d_torch.tracking.motion_model import PosePrediction
+from v3d_torch.tracking.motion_model import MotionModel, PosePrediction
 from v3d_torch.tracking.pose_history import PoseHistory
-from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus, memory_of
+from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
+from v3d_torch.types import (
+    RGBDFrame,
+    Segmenter,
+    Stateful,
+    TrackingStatus,
+    is_stateful,
+    restore_segmenter,
+    segment_frame,
+    segmenter_state_of,
+)
+
+PREFETCHED_FRAMES = 4
+"""Number of frames that are preprocessed ahead: a frame that becomes a keyframe takes twice as long to track as others, and
+preprocessing continues meanwhile."""
 
 
 class V3DSLAM:
-    """Tracks an RGB-D camera and maps what stands still.
+    """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
-    Every stage is an attribute, and any callable of the same signature can take its place. Those up to the features
-    look at a frame by itself (`perceive`), and may run ahead of those that follow the camera (`take_in`).
+    Every stage is an attribute and can be replaced by a callable with the same signature. `preprocess` uses the stages
+    that need the frame alone, and can run ahead of `track`, which uses the others.
 
     Args:
         camera: Camera of all frames.
-        segment: gives the instances of a frame; None takes what the configuration names.
-        config: of all stages.
-        known_map: map of an earlier run, see `load_map`, in which the camera begins lost; None to begin a new one.
+        segment: Segmenter; None takes that of the configuration.
+        config: Configuration of all stages; None takes the default.
+        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None starts a new map.
 
     Attributes:
-        camera: of all frames; None before the first, where it was not given.
-        outlooks: with which each of the next `PREFETCHED_FRAMES` frames is to be looked at, see `perceive`.
+        map: Keyframes and landmarks.
+        poses: Poses of all frames.
+        predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
+        timer: Time of each stage.
 
     Raises:
-        WeightsError: the network's weights are not to be had.
-        ConfigError: what is given as camera or configuration is none.
+        WeightsError: If the weights of the network are not available.
+        ConfigError: If a parameter has the wrong type.
     """
 
     def __init__(
@@ -65,172 +82,195 @@ class V3DSLAM:
         config: Config | None = None,
         known_map: SparseMap | None = None,
     ) -> None:
-        check_parts(camera, config)
+        check_parameters(camera, config)
         self.camera = camera
         self.config = config = config or Config()
         self.timer = StageTimer()
+        self.map = SparseMap.empty(config, camera) if known_map is None else known_map
         self.poses = PoseHistory()
+        self.motion_model = MotionModel()
+        # Preprocessing
         self.segment = segment or make_segmenter(config.segmentation)
         self.smooth_depth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio)
         self.detect_features = ORB(config.features, camera)
-        self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
+        # Motion of the camera since the previous frame
+        self.compensate = TimeCompensation(config, camera)
         self.register = MotionEstimator(config.odometry, config.features, camera, config.seed)
         self.odometry = Odometry(config, camera, self.register)
-        self.free_space_check = FreeSpaceCheck(config.objects.free_space, camera)
+        # Objects
+        free_space = config.objects.free_space
+        self.free_space_check = FreeSpaceCheck(free_space, camera)
         self.propose_unlabelled = partial(
-            unlabelled_instances, camera=camera, min_area=config.objects.free_space.min_unlabelled_area
+            unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area
         )
+        self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
         self.classify_motion = MotionClassifier(config.objects, camera)
-        self.compensate_rolling_shutter = RollingShutterCompensation(camera)
-        self.compensate_depth_delay = DepthDelayCompensation(config, camera)
-        self.map_tracker = MapTracker(config.tracking, config.features, camera)
-        self.mapper = Mapper(config, camera, known_map)
-        self.loop_closer = LoopCloser(config.loop, self.register, self.map_tracker, config.tracking.local_keyframes)
-        for keyframe in self.mapper.map.active_keyframes:
-            self.loop_closer.add_keyframe(keyframe)
-        self.back_end = BackEnd(config, camera, self.mapper.map, self.loop_closer)
-        self.track_camera = CameraTracker(
-            self.map_tracker, self.loop_closer, self.mapper.map, config.tracking.local_keyframes
+        # Camera pose and map
+        local_keyframes = config.tracking.local_keyframes
+        self.track_map = MapTracker(config.tracking, config.features, camera)
+        self.loop_closer = LoopCloser(config.loop, self.register, self.track_map, local_keyframes)
+        self.track_camera = CameraTracker(self.track_map, self.loop_closer, self.map, local_keyframes)
+        self.refine_previous = PreviousFrameRefinement(
+            self.compensate, self.track_map, self.map, refine_pose=config.rolling_shutter.enabled
         )
-        self._last: TrackedFrame | None = None
-        self._memory: object = None
-        self._known = known_map
-        self.outlooks = [self.outlook()] * PREFETCHED_FRAMES
+        self.mapper = Mapper(config, camera, self.map)
+        self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
+        self.loop_closer.rebuild(self.map.active_keyframes)
+        self._previous: TrackedFrame | None = None
+        self._segmenter_state: dict[str, Any] | None = None
+        self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
 
     def __call__(self, frame: RGBDFrame) -> FrameResult:
-        """Take in the next frame.
+        """Process the next frame: preprocess and track.
 
         Raises:
-            ConfigError: nobody said which camera took the first frame; a stage of the user's gave what it should not.
-            InputError: it is no frame, or not of this camera, or not after the last one.
+            InputError: If the frame is not valid, of another camera, or not later than the previous one.
+            ConfigError: If the segmenter returned something else than instances.
         """
-        percept = self.preprocess(frame, self.outlooks[0])
-        self.look_further()
-        return self.track(percept)
+        preprocessed = self.preprocess(frame, self.predictions[0])
+        self.advance_predictions()
+        return self.track(preprocessed)
 
-    def outlook(self) -> PosePrediction | None:
-        """How the camera is expected to go on; None in a known map as long as nobody knows where."""
-        return self.poses.outlook() if self.poses.located or self._known is None else None
-
-    def look_further(self) -> PosePrediction | None:
-        """Note, before a frame is taken in, with which outlook the one `PREFETCHED_FRAMES` frames later is to be looked at."""
-        self.outlooks = [*self.outlooks[1:], self.outlook()]
-        return self.outlooks[-1]
-
-    def preprocess(self, frame: RGBDFrame, outlook: PosePrediction | None) -> PreprocessedFrame:
-        """Look at a frame by itself: nothing of what follows the camera is touched.
+    def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
+        """Run the stages that need the frame alone; the state of the tracking stages is neither read nor changed.
 
         Args:
-            frame: the next one.
-            outlook: how the camera was expected to go on `PREFETCHED_FRAMES` frames before, which tells up from down; see
-                `FramePrefetcher`, which runs this ahead.
+            frame: Next frame.
+            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of the
+                camera; None if the pose is not known.
 
         Raises:
-            ConfigError: nobody said which camera took the first frame; the segmenter gave no instances.
-            InputError: it is no frame, or not of this camera.
+            InputError: If the frame is not valid or of another camera.
+            ConfigError: If the segmenter returned something else than instances.
         """
         check_frame(frame, self.camera)
-        clock = StageTimer()
-        with clock("segmentation"):  # III-A: instances, people among them set aside
-            instances = self.segment(replace(frame, T_cw=None if outlook is None else outlook.at(frame.stamp)))
+        timer = StageTimer()
+        with timer("segmentation"):  # III-A: instances; people are masked until they are classified
+            T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
+            instances = segment_frame(self.segment, frame, T_cw)
             check_instances(instances, frame)
-        with clock("depth"):  # III-B.1: depth re-estimated
+        with timer("depth"):  # III-B.1: depth re-estimation
             depth = self.smooth_depth(frame.depth[None])[0]
-        with clock("features"):  # III-A: ORB
+        with timer("features"):  # III-A: ORB
             features = self.detect_features(frame.image, depth)
-        return PreprocessedFrame(frame, instances, depth, features, clock.seconds, memory_of(self.segment))
+        return PreprocessedFrame(frame, instances, depth, features, timer.seconds, segmenter_state_of(self.segment))
 
-    def track(self, percept: PreprocessedFrame) -> FrameResult:
-        """Follow the camera and the objects on to the next frame.
+    def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
+        """Track the camera and the objects in the next frame, and extend the map.
 
         Raises:
-            InputError: it is not after the last one.
+            InputError: If the frame is not later than the previous one.
         """
-        check_order(percept.frame, self.poses.stamp)
-        frame, instances, depth = percept.frame, percept.instances, percept.depth
-        self._memory = percept.memory  # not as the segmentation has it now: it may be frames ahead
-        self.timer.add(percept.seconds)
-        with self.timer("motion"):  # III-E: the camera's motion since the last frame, seen on what stood still there
-            last, outlook = self._last, self.poses.outlook()
-            seen = TrackedFrame(frame, depth, self._at_once(percept.features, depth, frame, outlook.velocity))
-            guess = outlook.at(frame.stamp) @ invert(outlook.T_cw)
-            motion = None if last is None else self.odometry(last, seen, guess)
-            T_cw = self._expect(frame.stamp, motion)
-        with self.timer("background"):  # what does not fit that motion, also what the network has no name for
-            view = self.free_space_check.make_view(frame.stamp, depth, T_cw)
-            arrivals = self.free_space_check(view, trusted=motion is not None)
-            if self.config.segmentation.source != "none":  # the baseline has no masks at all
-                instances = instances.concatenate(self.propose_unlabelled(arrivals, instances, depth))
-        with self.timer("clouds"):  # III-B.2: instances lifted to clean clouds
+        frame, instances, depth = preprocessed.frame, preprocessed.instances, preprocessed.depth
+        check_order(frame, self.poses.stamp)
+        self._segmenter_state = preprocessed.segmenter_state
+        self.timer.add(preprocessed.seconds)
+        with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
+            prediction = self.motion_model.predict(self.poses)
+            velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
+            features = self.compensate(preprocessed.features, depth, frame.depth_delay, velocity, self.map.readout)
+            motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
+        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
+            view = self.free_space_check.make_view(frame.stamp, depth, rigid(motion.T_cp @ self.poses.T_cw))
+            occupied = self.free_space_check(view, trusted=motion.is_measured)
+            if self.config.segmentation.source != "none":
+                instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
+        with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
-        with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer, the mask of what stands still
-            scene = self.classify_motion(
-                instances, clouds, view, arrivals, FeatureSupport(seen.features.pixel, seen.matched(motion))
-            )
-            keep = seen.features.in_mask(scene.static_mask)
-        self.flush()  # III-E: bundle adjustment, loops, pose graph, begun with the frame before
-        with self.timer("tracking"):  # III-E: the pose in the local map
-            T_cw = self._expect(frame.stamp, motion)  # in the map as it is now
-            velocity = outlook.velocity if motion is None else motion.velocity(frame.stamp - outlook.stamp)
-            static = self._at_once(percept.features[keep], depth, frame, velocity)
-            carried = seen.carried(motion, last)[keep]
-            estimate = self.track_camera(static, depth, T_cw, carried, self.poses, moved=motion is not None)
-        with self.timer("mapping"):  # keyframes and landmarks
-            reference = self.track_camera.reference(estimate)
-            T_new_old = self.poses.record(frame.stamp, estimate, reference, None if motion is None else motion.T_ba)
-            if T_new_old is not None:
-                self._move_world(T_new_old)
-            self._look_back()
-            keyframe = self.mapper(frame, static, estimate, reference)
-            if estimate.status is not TrackingStatus.LOST:
+        with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
+            support = FeatureSupport(features.pixel, motion.matched(len(features)))
+            objects = self.classify_motion(instances, clouds, view, occupied, support)
+        self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
+        with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
+            is_static = features.in_mask(objects.static_mask)
+            landmarks, features = motion.landmarks(self._previous, len(features))[is_static], preprocessed.features[is_static]
+            features = self.compensate(features, depth, frame.depth_delay, motion.velocity, self.map.readout)
+            T_cw = rigid(motion.T_cp @ self.poses.T_cw)
+            pose = self.track_camera(features, depth, T_cw, landmarks, motion, self.poses)
+            self.motion_model.update(self.poses, frame.stamp, pose, motion)
+            self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
+        with self.timer("mapping"):  # III-E: keyframes and landmarks
+            reference = self.track_camera.reference_keyframe(pose)
+            keyframe = self.mapper(frame, features, pose, reference)
+            T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
+            self._apply_world_correction(T_new_old)
+            if pose.status is not TrackingStatus.LOST:
                 self.free_space_check.remember(view.moved_to(self.poses.T_cw))
-            landmarks = estimate.landmarks if keyframe is None else keyframe.landmarks
-            self._last = TrackedFrame(frame, depth, static, scene.static_mask, landmarks)
+            landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
+            self._previous = TrackedFrame(frame, depth, features, objects.static_mask, landmarks)
             if keyframe is not None:
-                self.poses.anchor(keyframe)
                 self.back_end.submit(keyframe)
         status = self.poses.statuses[-1]
-        return FrameResult(**vars(scene), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)
+        return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)
 
     def flush(self) -> None:
-        """Take in what is being solved for the last keyframe. The next frame does that; after the last one, call it."""
-        if (solved := self.back_end.result()) is None:
+        """Apply the pending result of the back end. `track` does this; call it once after the last frame."""
+        result = self.back_end.result()
+        if result is None:
             return
-        self.timer.add(solved.seconds)
+        self.timer.add(result.seconds)
         with self.timer("mapping"):
-            T_new_old = self.back_end.apply(solved)
-            if T_new_old is not None:
-                self._move_world(T_new_old)
-            self.mapper.map.compact(self._landmarks_held())
+            self._apply_world_correction(self.back_end.apply(result))
+            previous = None if self._previous is None else self._previous.landmark_ids
+            self.map.compact([self.poses.landmark_ids] if previous is None else [self.poses.landmark_ids, previous])
 
-    def _landmarks_held(self) -> list[Tensor]:
-        """Ids of landmarks that are kept from frame to frame, outside the map."""
-        seen = None if self._last is None else self._last.landmarks
-        return [self.poses.landmarks] if seen is None else [self.poses.landmarks, seen]
+    def advance_predictions(self) -> PosePrediction | None:
+        """Append the prediction for the frame after the next `PREFETCHED_FRAMES`, and return it.
 
-    def _expect(self, stamp: float, motion: RelativeMotion | None) -> Tensor:
-        """Pose of the camera by its motion since the last frame; predicted, where that is not known."""
-        return self.poses.predict(stamp) if motion is None else rigid(motion.T_ba @ self.poses.T_cw)
+        It is made before the next frame is tracked, whether that frame is preprocessed ahead or not.
+        """
+        self.predictions.popleft()
+        self.predictions.append(self._predict())
+        return self.predictions[-1]
 
-    def _at_once(self, features: Features, depth: Tensor, frame: RGBDFrame, velocity: Tensor) -> Features:
-        """Features as a camera would have seen them that takes all rows, of colour and of depth, at once."""
-        features = self.compensate_depth_delay(features, depth, velocity, frame.depth_delay)
-        return self.compensate_rolling_shutter(features, velocity, self.mapper.map.readout)
+    def preprocessing_stages(self) -> dict[str, Any]:
+        """Return the stages that `preprocess` uses, by attribute name."""
+        return {"segment": self.segment, "smooth_depth": self.smooth_depth, "detect_features": self.detect_features}
 
-    def _look_back(self) -> None:
-        """Put the last frame right: how the camera passed it, and so what it saw at once, is known only now."""
-        sparse_map, last, velocity = self.mapper.map, self._last, self.poses.passed
-        if velocity is None or last is None or last.landmarks is None or not sparse_map.keyframes:
-            return
-        newest = sparse_map.keyframes[-1]
-        if newest.frame == last.frame.index:
-            sparse_map.update_features(newest, self._at_once(newest.features, last.depth, last.frame, velocity))
-        elif self.config.rolling_shutter.enabled:
-            found, points = sparse_map.landmark_positions(last.landmarks)
-            features = self._at_once(last.features[found], last.depth, last.frame, velocity)
-            self.track_camera.again(features, points, self.poses)
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that changes from frame to frame, between two frames.
 
-    def _move_world(self, T_new_old: Tensor) -> None:
-        """Carry what is remembered along when the world is corrected under it."""
-        self.classify_motion.tracker.move_world(T_new_old)
-        self.free_space_check.move_world(T_new_old)
+        Raises:
+            ConfigError: If a stage was replaced by one without state_dict.
+        """
+        state = {name: component.state_dict() for name, component in self._stateful_components().items()}
+        own = {"previous": self._previous, "predictions": list(self.predictions), "segmenter": self._segmenter_state}
+        return {**state, **own}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `state_dict`; the next frames give the same results as without the interruption."""
+        for name, component in self._stateful_components().items():
+            component.load_state_dict(state[name])
+        self.loop_closer.rebuild(each for each in self.map.active_keyframes if each is not self.back_end.keyframe)
+        self._previous = state["previous"]
+        self.predictions = deque(state["predictions"])
+        self._segmenter_state = state["segmenter"]
+        restore_segmenter(self.segment, self._segmenter_state)
+
+    def _stateful_components(self) -> dict[str, Stateful]:
+        components = {
+            "timer": self.timer,
+            "map": self.map,
+            "poses": self.poses,
+            "motion_model": self.motion_model,
+            "free_space_check": self.free_space_check,
+            "classify_motion": self.classify_motion,
+            "mapper": self.mapper,
+            "loop_closer": self.loop_closer,
+            "back_end": self.back_end,
+        }
+        for name, component in components.items():
+            if not is_stateful(component):
+                raise ConfigError(f"{name} was replaced by a stage without state_dict; its state cannot be saved")
+        return components
+
+    def _predict(self) -> PosePrediction | None:
+        """Predict the motion of the camera; None if it has not been localised in a known map yet."""
+        is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
+        return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_located else None
+
+    def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
+        """Move everything outside the map that is stored in the world frame, after a correction of the map."""
+        if T_new_old is not None:
+            self.classify_motion.tracker.move_world(T_new_old)
+            self.free_space_check.move_world(T_new_old)

@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
@@ -186,15 +186,42 @@ class PoseAwareSegmenter(Protocol):
         """
 
 
-def segmenter_state(segment: object) -> dict[str, Any] | None:
-    """Return the state of a segmenter; None if it has no state."""
-    return segment.state_dict() if isinstance(segment, Stateful) else None
+def segment_frame(segmenter: Segmenter, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+    """Segment a frame; only a `PoseAwareSegmenter` receives the predicted pose.
+
+    Args:
+        segmenter: Segmenter.
+        frame: Frame.
+        T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`; None if it is not known.
+    """
+    pose_aware = cast("PoseAwareSegmenter", segmenter)
+    return pose_aware.segment_with_pose(frame, T_cw) if _has(segmenter, "segment_with_pose") else segmenter(frame)
 
 
-def restore_segmenter(segment: object, state: Mapping[str, Any] | None) -> None:
-    """Restore the state of a segmenter, if it has state."""
-    if state is not None and isinstance(segment, Stateful):
-        segment.load_state_dict(state)
+def is_stateful(component: object) -> bool:
+    """Check whether a component has ``state_dict`` and ``load_state_dict``."""
+    return _has(component, "state_dict", "load_state_dict")
+
+
+def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
+    """Return the state of a segmenter; None if it has no state.
+
+    The state_dict of a torch module holds its weights, which are constant and too large to be copied for each frame, so
+    it does not count as state.
+    """
+    has_state = is_stateful(segmenter) and not isinstance(segmenter, nn.Module)
+    return cast("Stateful", segmenter).state_dict() if has_state else None
+
+
+def restore_segmenter(segmenter: object, state: Mapping[str, Any] | None) -> None:
+    """Restore a state that `segmenter_state_of` returned; do nothing if it is None."""
+    if state is not None and is_stateful(segmenter):
+        cast("Stateful", segmenter).load_state_dict(state)
+
+
+def _has(value: object, *methods: str) -> bool:
+    """Check for methods by name; since Python 3.12, isinstance does not find those that a proxy forwards."""
+    return all(callable(getattr(value, method, None)) for method in methods)
 
 
 class TrackingStatus(StrEnum):

@@ -1,4 +1,4 @@
-"""Photographs of scikit-image as tensors."""
+"""Photographs from scikit-image as tensors."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from torch import Tensor
 
 
 def photograph(name: str) -> Tensor:
-    """A photograph of scikit-image, uint8, shape (3, H, W)."""
+    """Load a photograph from scikit-image by name, uint8 RGB, shape (3, H, W)."""
     return torch.from_numpy(getattr(skimage.data, name)()).permute(2, 0, 1)

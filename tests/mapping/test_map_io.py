@@ -27,7 +27,7 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.segmentation.none import NoSegmentation
+from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
@@ -413,13 +413,13 @@ def test_in_another_room_the_camera_stays_lost_and_the_map_as_it_is(
 def test_the_segmenter_is_told_no_pose_before_the_camera_is_found(wall: tuple[Path, Pipeline]) -> None:
     path, _ = wall
     told: list[bool] = []
-    nobody = NoSegmentation()
 
-    def segment(frame: RGBDFrame) -> Instances:
-        told.append(frame.T_cw is not None)
-        return nobody(frame)
+    class Listening(NoSegmentation):
+        def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+            told.append(T_cw is not None)
+            return self(frame)
 
-    slam = V3DSLAM(CAMERA, segment, LOCALISE, load_map(path, CAMERA, LOCALISE).map)
+    slam = V3DSLAM(CAMERA, Listening(), LOCALISE, load_map(path, CAMERA, LOCALISE).map)
     for frame in Slide(400, 660, step=20):
         slam(frame)
     found = slam.poses.statuses.index(TrackingStatus.TRACKED)

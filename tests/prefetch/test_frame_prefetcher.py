@@ -36,7 +36,10 @@ class Expecting:
         self.threads: set[str] = set()
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        self.poses.append(frame.T_cw)
+        raise AssertionError("called without a pose")
+
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: torch.Tensor | None) -> Instances:
+        self.poses.append(T_cw)
         self.threads.add(threading.current_thread().name)
         return NoSegmentation()(frame)
 

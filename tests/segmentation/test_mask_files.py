@@ -15,12 +15,12 @@ from v3d_torch.types import RGBDFrame
 
 
 def frame(index: int, stamp: float, height: int = 12, width: int = 16) -> RGBDFrame:
-    """A black frame."""
+    """Black frame without depth."""
     return RGBDFrame(index, stamp, torch.zeros(3, height, width, dtype=torch.uint8), torch.zeros(1, height, width))
 
 
 def ids(dtype: type, *values: int) -> np.ndarray:
-    """An id image with a rectangle of 4 x 3 pixels per value, side by side from (row 2, column 1)."""
+    """Id image with a rectangle of 4 x 3 pixels for each value, side by side from row 2, column 1."""
     image = np.zeros((12, 16), dtype=dtype)
     for place, value in enumerate(values):
         image[2:6, 1 + 4 * place : 4 + 4 * place] = value
@@ -28,18 +28,18 @@ def ids(dtype: type, *values: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("dtype", "values"), [(np.uint8, (255, 7)), (np.uint16, (40_000, 300))])
-def test_every_value_is_an_instance(tmp_path: Path, dtype: type, values: tuple[int, int]) -> None:
+def test_every_nonzero_value_is_an_instance(tmp_path: Path, dtype: type, values: tuple[int, int]) -> None:
     Image.fromarray(ids(dtype, *values)).save(tmp_path / "10.000000.png")
-    instances, found = MaskFolder(tmp_path).read(frame(0, 10.0))
-    assert found.tolist() == sorted(values)
+    instances, read_ids = MaskFolder(tmp_path).read(frame(0, 10.0))
+    assert read_ids.tolist() == sorted(values)
     assert instances.labels.tolist() == [PERSON, PERSON]
     assert instances.scores.tolist() == [1, 1]
-    assert instances.boxes.tolist() == [[5, 2, 8, 6], [1, 2, 4, 6]]  # edges: the pixels 5, 6, 7 lie from 5 to 8
+    assert instances.boxes.tolist() == [[5, 2, 8, 6], [1, 2, 4, 6]]  # edges: pixels 5, 6 and 7 lie between 5 and 8
     for mask, value in zip(instances.masks, sorted(values), strict=True):
         assert np.array_equal(mask.numpy(), ids(dtype, *values) == value)
 
 
-def test_indices_count_in_an_image_with_a_palette(tmp_path: Path) -> None:
+def test_ids_of_a_palette_image_are_its_palette_indices(tmp_path: Path) -> None:
     image = Image.fromarray(ids(np.uint8, 3)).convert("P")
     image.putpalette([value for index in range(256) for value in (255 - index, index, 0)])
     image.putdata(ids(np.uint8, 3).flatten().tolist())
@@ -47,13 +47,13 @@ def test_indices_count_in_an_image_with_a_palette(tmp_path: Path) -> None:
     assert MaskFolder(tmp_path).read(frame(0, 0.0))[1].tolist() == [3]
 
 
-def test_an_empty_image_holds_no_instances(tmp_path: Path) -> None:
+def test_image_without_ids_gives_no_instances(tmp_path: Path) -> None:
     Image.fromarray(ids(np.uint8)).save(tmp_path / "a.png")
     instances = MaskFolder(tmp_path)(frame(0, 0.0))
     assert (len(instances), instances.masks.shape, instances.boxes.shape) == (0, (0, 12, 16), (0, 4))
 
 
-def test_stamps_are_matched_to_the_nearest(tmp_path: Path) -> None:
+def test_files_named_by_timestamp_belong_to_the_nearest_frame(tmp_path: Path) -> None:
     for value, stamp in ((1, "5.000000"), (2, "5.033333"), (3, "5.100000")):
         Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{stamp}.png")
     masks = MaskFolder(tmp_path)
@@ -63,7 +63,7 @@ def test_stamps_are_matched_to_the_nearest(tmp_path: Path) -> None:
         masks(frame(9, 5.075))
 
 
-def test_other_names_are_matched_by_order(tmp_path: Path) -> None:
+def test_files_with_other_names_belong_to_frames_in_order(tmp_path: Path) -> None:
     for value in (1, 2):
         Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{value:06d}.png")
     masks = MaskFolder(tmp_path)
@@ -72,22 +72,22 @@ def test_other_names_are_matched_by_order(tmp_path: Path) -> None:
         masks(frame(2, 100.0))
 
 
-def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no PNG files"):
+def test_unusable_id_images_are_rejected_by_path(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="contains no PNG files"):
         MaskFolder(tmp_path)
     path = tmp_path / "a.png"
     Image.fromarray(np.zeros((12, 16, 3), dtype=np.uint8)).save(path)
-    with pytest.raises(InputError, match=r"a\.png: has 3 channels"):
+    with pytest.raises(InputError, match=r"a\.png: has 3 channels, expected one 8- or 16-bit channel"):
         MaskFolder(tmp_path)(frame(0, 0.0))
     Image.fromarray(ids(np.uint8, 1)).save(path)
     with pytest.raises(InputError, match=r"a\.png: has 16x12 pixels, its frame 16x24"):
         MaskFolder(tmp_path)(frame(0, 0.0, height=24))
     path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"a\.png: cannot be read"):
+    with pytest.raises(InputError, match=r"a\.png: is not a readable PNG"):
         MaskFolder(tmp_path)(frame(0, 0.0))
 
 
-def test_masks_of_a_real_sequence_fit_its_frames(v3d_data: Path) -> None:
+def test_every_frame_of_a_real_sequence_has_an_id_image(v3d_data: Path) -> None:
     folder = v3d_data / "crowd_static"
     pairs = [line.split() for line in (folder / "associations.txt").read_text().splitlines() if line[:1] != "#"]
     masks = MaskFolder(folder / "masks")

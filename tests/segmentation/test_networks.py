@@ -1,4 +1,4 @@
-"""The networks as modules: shapes, published sizes, the meaning of the head, the export."""
+"""Networks as modules: shapes, published sizes, conventions of the head, export."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ BUILDERS = [yolov8n_seg, yolo11n_seg, yolo26n_seg]
 
 @pytest.mark.parametrize("builder", BUILDERS)
 @pytest.mark.parametrize(("batch", "height", "width"), [(1, 64, 96), (2, 96, 32)])
-def test_cardinality(builder: Callable[[], LayerGraph], batch: int, height: int, width: int) -> None:
+def test_output_shapes_follow_batch_and_image_size(
+    builder: Callable[[], LayerGraph], batch: int, height: int, width: int
+) -> None:
     torch.manual_seed(0)
     with torch.inference_mode():
         predictions, prototypes = builder().eval()(torch.rand(batch, 3, height, width))
@@ -35,11 +37,11 @@ def test_cardinality(builder: Callable[[], LayerGraph], batch: int, height: int,
 
 
 @pytest.mark.parametrize(("builder", "millions"), [(yolov8n_seg, 3.4), (yolo11n_seg, 2.9), (yolo26n_seg, 2.7)])
-def test_parameters_are_as_many_as_published(builder: Callable[[], LayerGraph], millions: float) -> None:
+def test_number_of_parameters_equals_the_published_one(builder: Callable[[], LayerGraph], millions: float) -> None:
     assert round(sum(p.numel() for p in builder().parameters()) / 1e6, 1) == millions
 
 
-def test_dfl_is_the_expected_bin() -> None:
+def test_dfl_returns_the_expected_bin() -> None:
     dfl = DFL(16)
     dfl.conv.weight.data = torch.arange(16.0).view(1, 16, 1, 1)
     logits = torch.randn(2, 64, 5, generator=torch.Generator().manual_seed(0))
@@ -49,7 +51,7 @@ def test_dfl_is_the_expected_bin() -> None:
 
 
 def test_convention_boxes_are_centre_and_size_around_cell_centres() -> None:
-    """Distances of 1, 0, 3, 2 cells to left, top, right, bottom everywhere: the first box of each level is known."""
+    """All cells predict distances of 1, 0, 3 and 2 cells to the edges, so the first box of each level is known."""
     head = Segment((8, 8, 8), Proto(8), bins=1, classifier=dense_branch).eval()
     for branch in head.cv2:
         branch[-1].weight.data.zero_()
@@ -59,11 +61,11 @@ def test_convention_boxes_are_centre_and_size_around_cell_centres() -> None:
     for cell, stride in zip(first_cells, (8, 16, 32), strict=True):
         expected = torch.tensor([0.5 + 1.0, 0.5 + 1.0, 4.0, 2.0]) * stride
         torch.testing.assert_close(predictions[0, :4, cell], expected)
-    assert predictions[0, 0, 1] - predictions[0, 0, 0] == 8  # cells run along the row first
+    assert predictions[0, 0, 1] - predictions[0, 0, 0] == 8  # cells are in row-major order
     assert predictions[0, 1, 12] - predictions[0, 1, 0] == 8
 
 
-def test_attention_is_scaled_dot_product_attention() -> None:
+def test_attention_equals_scaled_dot_product_attention() -> None:
     torch.manual_seed(0)
     attention = Attention(128).eval()
     attention.pe, attention.proj = nn.Conv2d(128, 128, 1), nn.Identity()
@@ -75,20 +77,20 @@ def test_attention_is_scaled_dot_product_attention() -> None:
     torch.testing.assert_close(attention(x), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_one_to_one_branches_take_the_place_of_the_others() -> None:
+def test_one_to_one_replaces_the_one_to_many_branches() -> None:
     tensors = {
         "model.23.one2one_cv2.0": torch.ones(1),
         "model.23.cv2.0": torch.zeros(1),
         "model.0": torch.full((1,), 2.0),
     }
     for order in (tensors, dict(reversed(tensors.items()))):
-        chosen = one_to_one(order)
-        assert chosen["model.23.cv2.0"] == 1
-        assert chosen["model.0"] == 2
+        replaced = one_to_one(order)
+        assert replaced["model.23.cv2.0"] == 1
+        assert replaced["model.0"] == 2
 
 
 @pytest.mark.parametrize("builder", BUILDERS)
-def test_export_computes_what_the_module_computes(builder: Callable[[], LayerGraph], tmp_path: Path) -> None:
+def test_export_gives_the_outputs_of_the_module(builder: Callable[[], LayerGraph], tmp_path: Path) -> None:
     torch.manual_seed(1)
     network = builder().eval()
     path = tmp_path / "network.onnx"
@@ -99,6 +101,6 @@ def test_export_computes_what_the_module_computes(builder: Callable[[], LayerGra
     image = torch.rand(1, 3, 64, 96)
     with torch.inference_mode():
         expected = network(image)
-    for got, want in zip(session.run(None, {"images": image.numpy()}), expected, strict=True):
-        assert got.dtype == np.float32
-        np.testing.assert_allclose(got, want.numpy(), rtol=1e-4, atol=1e-4)
+    for exported, module_output in zip(session.run(None, {"images": image.numpy()}), expected, strict=True):
+        assert exported.dtype == np.float32
+        np.testing.assert_allclose(exported, module_output.numpy(), rtol=1e-4, atol=1e-4)

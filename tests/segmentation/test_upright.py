@@ -1,4 +1,4 @@
-"""The right way up: found by what a network sees in the turns of an image, kept by the camera's poses."""
+"""Upright segmentation: search for the up direction, use of the camera's poses, saved state."""
 
 from __future__ import annotations
 
@@ -6,38 +6,47 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.segmentation.upright import UprightSegmenter
-from v3d_torch.types import Instances, RGBDFrame
+from v3d_torch.types import (
+    Instances,
+    PoseAwareSegmenter,
+    RGBDFrame,
+    Stateful,
+    restore_segmenter,
+    segment_frame,
+    segmenter_state_of,
+)
 
 HEIGHT, WIDTH = 24, 32
+IDENTITY = torch.eye(4, dtype=torch.float64)
 
 
 def rolled(degrees: float) -> Tensor:
-    """World to a camera that is turned clockwise about its optical axis, as seen from behind it."""
+    """World-to-camera pose of a camera rolled clockwise about its optical axis, as seen from behind the camera."""
     twist = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.radians(degrees)], dtype=torch.float64)
     return invert(se3_exp(twist))
 
 
-def frame(index: int, turns_needed: int | None, T_cw: Tensor | None) -> RGBDFrame:
-    """An image that so many counterclockwise quarter turns set upright: its upper edge is bright; None: all dark."""
-    portrait = (turns_needed or 0) % 2 == 1
+def make_frame(index: int, upright_turns: int | None) -> RGBDFrame:
+    """Frame whose upper edge is bright after the given counterclockwise quarter turns; None for a dark image."""
+    portrait = (upright_turns or 0) % 2 == 1
     image = torch.zeros(3, WIDTH, HEIGHT, dtype=torch.uint8) if portrait else torch.zeros(3, HEIGHT, WIDTH).byte()
-    if turns_needed is not None:
+    if upright_turns is not None:
         image[:, :2, : image.shape[2]] = 255
-        image = torch.rot90(image, -turns_needed, dims=(1, 2)).contiguous()
+        image = torch.rot90(image, -upright_turns, dims=(1, 2)).contiguous()
     assert image.shape == (3, HEIGHT, WIDTH)
-    return RGBDFrame(index, index / 30, image, torch.ones(1, HEIGHT, WIDTH), T_cw)
+    return RGBDFrame(index, index / 30, image, torch.ones(1, HEIGHT, WIDTH))
 
 
 class Network:
-    """Sees a thing in the upper left corner of an image whose upper edge is bright, in others a doubtful one."""
+    """Segmenter with one detection in the upper left corner: label 0 if the upper edge is bright, else a doubtful 1."""
 
-    def __init__(self, sure: float = 0.9, doubtful: float = 0.3) -> None:
+    def __init__(self, confident: float = 0.9, doubtful: float = 0.3) -> None:
         self.sizes: list[tuple[int, int]] = []
-        self._scores = sure, doubtful
+        self._scores = confident, doubtful
 
     def __call__(self, frame: RGBDFrame) -> Instances:
         height, width = frame.image.shape[1:]
@@ -45,73 +54,147 @@ class Network:
         self.sizes.append((height, width))
         masks = torch.zeros(1, height, width, dtype=torch.bool)
         masks[0, 2:5, 3:9] = True
-        upright = bool((frame.image[:, 0] == 255).all())
-        score = self._scores[0] if upright else self._scores[1]
-        return Instances(masks, torch.tensor([int(not upright)]), torch.tensor([score]), torch.tensor([[3.0, 2, 9, 5]]))
+        is_upright = bool((frame.image[:, 0] == 255).all())
+        score = self._scores[0] if is_upright else self._scores[1]
+        boxes = torch.tensor([[3.0, 2, 9, 5]])
+        return Instances(masks, torch.tensor([int(not is_upright)]), torch.tensor([score]), boxes)
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_an_image_is_seen_upright_and_its_instances_lie_where_they_are(turns: int) -> None:
-    """Whichever way the camera is held from the first frame on; boxes and masks are those of the image as it is."""
-    network = Network()
-    seen = UprightSegmenter(network)(frame(0, turns, torch.eye(4, dtype=torch.float64)))
-    assert seen.labels.tolist() == [0] and seen.masks.shape == (1, HEIGHT, WIDTH)
+def test_instances_are_in_the_orientation_of_the_frame(turns: int) -> None:
+    """At any orientation of the first frame, the network segments it upright, and masks and boxes are rotated back."""
+    instances = UprightSegmenter(Network()).segment_with_pose(make_frame(0, turns), IDENTITY)
+    assert instances.labels.tolist() == [0] and instances.masks.shape == (1, HEIGHT, WIDTH)
     shape = (HEIGHT, WIDTH) if turns % 2 == 0 else (WIDTH, HEIGHT)
-    there = torch.zeros(shape, dtype=torch.bool)
-    there[2:5, 3:9] = True
-    assert torch.equal(seen.masks[0], torch.rot90(there, -turns, dims=(0, 1)))
-    rows, columns = torch.nonzero(seen.masks[0], as_tuple=True)
+    upright_mask = torch.zeros(shape, dtype=torch.bool)
+    upright_mask[2:5, 3:9] = True
+    assert torch.equal(instances.masks[0], torch.rot90(upright_mask, -turns, dims=(0, 1)))
+    rows, columns = torch.nonzero(instances.masks[0], as_tuple=True)
     edges = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-    assert seen.boxes.tolist() == [[float(edge) for edge in edges]]
+    assert instances.boxes.tolist() == [[float(edge) for edge in edges]]
 
 
 @pytest.mark.parametrize("start", [0, 1, 2, 3])
-def test_the_poses_carry_up_along_as_the_camera_rolls(start: int) -> None:
-    """After the first looks one turn of each image is enough, also as the camera rolls on through all four."""
-    network = Network(sure=1.0, doubtful=0.0)
+def test_poses_give_the_up_direction_of_a_rolling_camera(start: int) -> None:
+    """After the first searches one turn of each image is enough, also if the camera rolls through all four."""
+    network = Network(confident=1.0, doubtful=0.0)
     upright = UprightSegmenter(network)
     for index in range(16):
-        upright(frame(index, start, torch.eye(4, dtype=torch.float64)))
-    # A camera that rolls clockwise sees the world turn counterclockwise: up moves to its left, its upper right is up.
+        upright.segment_with_pose(make_frame(index, start), IDENTITY)
+    # In the image of a camera that rolls clockwise, the world turns counterclockwise.
     for index, degrees in enumerate((3 * 90, 180, 90, 0, -90, 350, -350)):
         before = len(network.sizes)
-        needed = (start - round(degrees / 90)) % 4
-        seen = upright(frame(16 + index, needed, rolled(degrees)))
-        assert seen.labels.tolist() == [0], degrees
-        looks = 4 if 16 + index == 16 else 1
-        assert len(network.sizes) - before == looks
+        upright_turns = (start - round(degrees / 90)) % 4
+        instances = upright.segment_with_pose(make_frame(16 + index, upright_turns), rolled(degrees))
+        assert instances.labels.tolist() == [0], degrees
+        calls = 4 if 16 + index == 16 else 1
+        assert len(network.sizes) - before == calls
 
 
-def test_a_look_at_all_turns_becomes_rare() -> None:
-    network = Network(sure=1.0, doubtful=0.0)
+def test_searches_become_rare_when_up_is_settled() -> None:
+    network = Network(confident=1.0, doubtful=0.0)
     upright = UprightSegmenter(network)
     for index in range(300):
-        upright(frame(index, 0, torch.eye(4, dtype=torch.float64)))
-    # At each 8th call until ten sure votes, and at the powers of two.
+        upright.segment_with_pose(make_frame(index, 0), IDENTITY)
+    # At every 8th call until the votes have a weight of ten, and at powers of two.
     assert len(network.sizes) == 300 + 3 * len({0, 1, 2, 4, 8, 16, 24, 32, 40, 48, 64, 128, 256})
 
 
-def test_where_nothing_is_seen_images_are_shown_as_they_are() -> None:
+def test_without_detections_frames_keep_their_orientation_and_searches_are_bounded() -> None:
     network = Network(doubtful=0.0)
     upright = UprightSegmenter(network)
     for index in range(300):
-        upright(frame(index, None, torch.eye(4, dtype=torch.float64)))
-    assert upright(frame(300, None, torch.eye(4, dtype=torch.float64))).masks[0, 2:5, 3:9].all()
-    # Without a vote it looks around at every 8th of the first 128 calls, and no more often than that.
+        upright.segment_with_pose(make_frame(index, None), IDENTITY)
+    assert upright.segment_with_pose(make_frame(300, None), IDENTITY).masks[0, 2:5, 3:9].all()
+    # Without a vote: at every 8th of the first 128 calls, and at powers of two.
     assert len(network.sizes) == 301 + 3 * (16 + len({1, 2, 4, 128, 256}))
 
 
-def test_one_wrong_vote_is_outvoted() -> None:
-    """A picture on the wall shows people lying: two later looks put it right."""
-    upright = UprightSegmenter(Network(sure=0.9, doubtful=0.0))
-    here = torch.eye(4, dtype=torch.float64)
-    upright(frame(0, 1, here))
+def test_later_votes_outweigh_a_wrong_one() -> None:
+    """The first image shows a picture of lying people: two later searches correct the up direction."""
+    upright = UprightSegmenter(Network(confident=0.9, doubtful=0.0))
+    upright.segment_with_pose(make_frame(0, 1), IDENTITY)
     for index in range(1, 9):
-        seen = upright(frame(index, 0, here))
-    assert seen.labels.tolist() == [0]
+        instances = upright.segment_with_pose(make_frame(index, 0), IDENTITY)
+    assert instances.labels.tolist() == [0]
 
 
-def test_a_frame_whose_pose_nobody_knows_is_shown_as_it_is() -> None:
+def test_frame_without_a_pose_keeps_its_orientation_and_gives_no_vote() -> None:
     network = Network()
-    assert UprightSegmenter(network)(frame(0, 1, None)).labels.tolist() == [1]
-    assert network.sizes == [(HEIGHT, WIDTH)]
+    upright = UprightSegmenter(network)
+    before = upright.state_dict()
+    assert upright.segment_with_pose(make_frame(0, 1), None).labels.tolist() == [1]
+    assert upright(make_frame(0, 1)).labels.tolist() == [1]
+    assert network.sizes == [(HEIGHT, WIDTH)] * 2
+    assert upright.state_dict()["calls"] == before["calls"] == 0
+    assert torch.equal(upright.state_dict()["up"], before["up"])
+
+
+def test_segmenter_that_loads_a_state_continues_with_the_same_results() -> None:
+    first, second = Network(), Network()
+    upright, loaded = UprightSegmenter(first), UprightSegmenter(second)
+    for index in range(9):
+        upright.segment_with_pose(make_frame(index, 1), IDENTITY)
+    loaded.load_state_dict(upright.state_dict())
+    first.sizes.clear()
+    for index in range(9, 40):
+        frame, T_cw = make_frame(index, (1 - index) % 4), rolled(90.0 * index)
+        expected, instances = upright.segment_with_pose(frame, T_cw), loaded.segment_with_pose(frame, T_cw)
+        assert torch.equal(instances.masks, expected.masks) and torch.equal(instances.labels, expected.labels)
+    assert second.sizes == first.sizes
+    assert torch.equal(loaded.state_dict()["up"], upright.state_dict()["up"])
+
+
+def test_state_is_a_snapshot() -> None:
+    upright = UprightSegmenter(Network())
+    state = upright.state_dict()
+    calls, up = state["calls"], state["up"].clone()
+    upright.segment_with_pose(make_frame(0, 0), IDENTITY)
+    assert (state["calls"], calls) == (0, 0) and torch.equal(state["up"], up)
+    assert not torch.equal(upright.state_dict()["up"], up)
+    state["up"].zero_()
+    upright.load_state_dict({"calls": 3, "up": up})
+    up.zero_()
+    assert upright.state_dict()["up"].norm() > 0
+
+
+def test_protocols_and_helper_functions_apply_to_upright_segmenters_only() -> None:
+    network = Network()
+    upright = UprightSegmenter(network)
+    assert isinstance(upright, PoseAwareSegmenter) and isinstance(upright, Stateful)
+    assert not isinstance(network, PoseAwareSegmenter) and not isinstance(network, Stateful)
+    assert segment_frame(upright, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
+    assert segment_frame(network, make_frame(0, 1), IDENTITY).labels.tolist() == [1]
+    state = segmenter_state_of(upright)
+    assert state is not None and state["calls"] == 1 and segmenter_state_of(network) is None
+    other = UprightSegmenter(Network())
+    restore_segmenter(other, None)
+    assert other.state_dict()["calls"] == 0
+    restore_segmenter(other, state)
+    restore_segmenter(network, state)
+    assert other.state_dict()["calls"] == 1 and torch.equal(other.state_dict()["up"], state["up"])
+
+
+def test_weights_of_a_torch_module_are_not_its_state() -> None:
+    class Module(nn.Module):
+        def forward(self, frame: RGBDFrame) -> Instances:
+            return Instances.empty(*frame.image.shape[1:])
+
+    assert segmenter_state_of(Module()) is None
+
+
+def test_methods_forwarded_by_a_proxy_are_used() -> None:
+    class Proxy:
+        def __init__(self, target: object) -> None:
+            self._target = target
+
+        def __call__(self, frame: RGBDFrame) -> Instances:
+            raise AssertionError("called without the pose")
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._target, name)
+
+    proxy = Proxy(UprightSegmenter(Network()))
+    assert segment_frame(proxy, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
+    state = segmenter_state_of(proxy)
+    assert state is not None and state["calls"] == 1

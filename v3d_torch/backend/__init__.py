@@ -1,1 +1,1 @@
-"""Background optimisation: local bundle adjustment, loop closing, pose graph (paper, Sec. III-E)."""
+"""Background optimisation of the map: local bundle adjustment, loop closing, pose graph (paper, Sec. III-E)."""

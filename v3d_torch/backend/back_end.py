@@ -1,16 +1,17 @@
-"""What may take its time: bundle adjustment and loops, solved while the camera is followed on.
+"""Background optimisation: local bundle adjustment and loop closing, run while tracking continues.
 
-ORB-SLAM2 has a thread for each, which change the map whenever they are done. Here all that is solved for a keyframe is
-worked out beside the map and taken in at one place: before the next frame is looked for in the map. So it makes no
-difference to the results when it is worked out, and by which thread.
+ORB-SLAM2 has a thread for each of them, which changes the map as soon as it has finished. Here everything is computed
+beside the map, and the result is applied at one fixed point: when the next frame is tracked, before it is matched
+against the map. Therefore the results do not depend on when and in which thread the computation runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,75 +28,92 @@ from v3d_torch.runtime.stage_timer import StageTimer
 
 @dataclass(frozen=True)
 class BackEndResult:
-    """What was found for a keyframe.
+    """Result of the background optimisation for one keyframe.
 
     Attributes:
-        keyframe: it.
-        adjustment: of its neighbourhood; None where there was none.
-        closure: of the loop that ends at it; None without one.
-        seconds: that each took.
+        keyframe: Keyframe that this result belongs to.
+        adjustment: Local bundle adjustment around the keyframe; None if there was nothing to adjust.
+        loop_correction: Loop that ends at the keyframe, with corrected poses; None if no loop was detected.
+        seconds: Computation time of each stage, by name of the stage.
     """
 
     keyframe: Keyframe
     adjustment: LocalAdjustment | None
-    closure: LoopCorrection | None
+    loop_correction: LoopCorrection | None
     seconds: dict[str, float]
 
 
 class BackEnd:
-    """Adjusts the map around new keyframes, and closes loops.
+    """Optimises the map around new keyframes and closes loops.
 
     Args:
-        config: of the whole system.
-        camera: of the frames.
-        sparse_map: of the system.
-        loops: finds places again.
+        config: Configuration of the whole system.
+        camera: Camera of the frames.
+        sparse_map: Map to optimise.
+        loop_closer: Loop closer of the same map.
 
     Attributes:
-        keyframe: for which something is being solved; None for none.
+        keyframe: Keyframe of which the result is pending; None if there is none.
     """
 
-    def __init__(self, config: Config, camera: PinholeCamera, sparse_map: SparseMap, loops: LoopCloser) -> None:
+    def __init__(self, config: Config, camera: PinholeCamera, sparse_map: SparseMap, loop_closer: LoopCloser) -> None:
         self._config = config
         self._camera = camera
         self._map = sparse_map
-        self._loops = loops
-        self._thread = ThreadPoolExecutor(1, "back-end") if config.prefetch else None
-        self._result: Callable[[], BackEndResult] | None = None
+        self._loop_closer = loop_closer
+        self._executor = ThreadPoolExecutor(1, "back-end") if config.prefetch else None
+        self._get_result: Callable[[], BackEndResult] | None = None
         self.keyframe: Keyframe | None = None
 
     def submit(self, keyframe: Keyframe) -> None:
-        """Begin to solve what the newest keyframe asks for; the map gets no other before `take_in`."""
+        """Start the optimisation for the newest keyframe; the map must not change until its result is applied."""
         self.keyframe = keyframe
-        work = partial(self._solve, keyframe, inference=torch.is_inference_mode_enabled())
-        self._result = work if self._thread is None else self._thread.submit(work).result
+        optimise = partial(self._optimise, keyframe, inference=torch.is_inference_mode_enabled())
+        self._get_result = optimise if self._executor is None else self._executor.submit(optimise).result
 
     def result(self) -> BackEndResult | None:
-        """What was solved, as soon as it is; None where nothing was to be."""
-        return None if self._result is None else self._result()
+        """Wait for the pending result and return it; None if no keyframe is pending."""
+        return None if self._get_result is None else self._get_result()
 
-    def apply(self, solved: BackEndResult) -> Tensor | None:
-        """Change the map accordingly; then landmarks and keyframes go that it can do without.
+    def apply(self, result: BackEndResult) -> Tensor | None:
+        """Change the map according to a result, then cull landmarks and redundant keyframes.
 
         Returns:
-            Where a loop was closed, the correction of the world at its end, new world from old, shape :math:`(4, 4)`.
+            If a loop was closed, the correction of the world at its end, new world from old world, float64, shape
+            :math:`(4, 4)`; else None.
         """
-        self.keyframe = self._result = None
-        if solved.adjustment is not None:
-            solved.adjustment.apply(self._map)
-        T_new_old = None if solved.closure is None else self._loops.correct_loop(solved.closure, self._map)
+        self.keyframe = self._get_result = None
+        if result.adjustment is not None:
+            result.adjustment.apply(self._map)
+        T_new_old = None
+        if result.loop_correction is not None:
+            T_new_old = self._loop_closer.correct_loop(result.loop_correction, self._map)
         self._map.cull_landmarks()
-        cull_redundant_keyframes(self._map, solved.keyframe, self._config.mapping)
-        self._loops.remove_keyframes({known.index for known in self._map.keyframes if known.is_culled})
-        self._loops.add_keyframe(solved.keyframe)
+        cull_redundant_keyframes(self._map, result.keyframe, self._config.mapping)
+        self._loop_closer.remove_keyframes({keyframe.index for keyframe in self._map.keyframes if keyframe.is_culled})
+        self._loop_closer.add_keyframe(result.keyframe)
         return T_new_old
 
-    def _solve(self, keyframe: Keyframe, *, inference: bool) -> BackEndResult:
-        clock = StageTimer()
+    def state_dict(self) -> dict[str, Any]:
+        """Return the pending keyframe, ``{"keyframe": Keyframe | None}``: the same object as in the map."""
+        return {"keyframe": self.keyframe}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `state_dict` returned, by submitting the pending keyframe again.
+
+        Load the map and the loop closer first. The pending keyframe must be the object in the map.
+        """
+        self.keyframe = self._get_result = None
+        if state["keyframe"] is not None:
+            self.submit(state["keyframe"])
+
+    def _optimise(self, keyframe: Keyframe, *, inference: bool) -> BackEndResult:
+        """Adjust the map around a keyframe and detect a loop; the map itself does not change."""
+        timer = StageTimer()
         with torch.inference_mode(inference):
-            with clock("bundle"):
+            with timer("bundle"):
                 adjustment = local_bundle_adjust(self._map, keyframe, self._config, self._camera)
-            with clock("loop"):
+            with timer("loop"):
                 T_cw = self._map.T_cw if adjustment is None else adjustment.T_cw
-                closure = self._loops.detect_loop(keyframe, self._map, T_cw)
-        return BackEndResult(keyframe, adjustment, closure, clock.seconds)
+                loop_correction = self._loop_closer.detect_loop(keyframe, self._map, T_cw)
+        return BackEndResult(keyframe, adjustment, loop_correction, timer.seconds)

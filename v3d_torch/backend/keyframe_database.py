@@ -1,6 +1,7 @@
-"""Place recognition without a vocabulary: keyframes vote by descriptors that nearly equal those of a new view.
+"""Place recognition without a vocabulary, by votes of similar ORB descriptors.
 
-In the manner of DBoW2 (Galvez-Lopez and Tardos, T-RO 2012), with hash buckets of ORB descriptors in place of words.
+The scoring follows DBoW2 (Galvez-Lopez and Tardos, T-RO 2012), with hash buckets of descriptors in place of visual
+words.
 """
 
 from __future__ import annotations
@@ -11,70 +12,80 @@ import faiss
 import numpy as np
 from torch import Tensor
 
+_DESCRIPTOR_BITS = 256
+"""Length of an ORB descriptor, bits."""
+
+_KEY_BITS = 16
+"""Leading bits of a descriptor that select its hash bucket: fewer make the buckets larger and the search slower, more
+split the descriptors of one landmark between buckets, because a single different bit is enough."""
+
+_MAX_DISTANCE = 50
+"""Hamming distance below which two descriptors match, bits: the same patch from a similar view (TH_LOW of ORB-SLAM)."""
+
 
 class KeyframeDatabase:
-    """Remembers keyframes by their descriptors; grows and shrinks with the map, needs no training.
+    """Database of keyframes that is queried by descriptors; keyframes are added and removed without training.
 
-    A descriptor of the query votes for every keyframe that has one in the same bucket (equal first 16 bits) that
-    differs in less than 50 of all 256. Votes weigh as words do in text retrieval: what every keyframe shows tells no
-    place from another.
+    A descriptor of the query votes for every keyframe that has a similar descriptor: in the same hash bucket, and with
+    a Hamming distance below a threshold. Votes are weighted as in text retrieval, by inverse document frequency:
+    descriptors that match many keyframes contribute little.
     """
 
-    _KEY_BITS = 16  # finds as many places as the exhaustive search does (20 finds fewer) in a hundredth of the time
-    _RADIUS = 50  # bits: nearly the same patch from nearly the same view (ORB-SLAM's TH_LOW)
-
     def __init__(self) -> None:
-        self._begin()
+        self._clear()
 
-    def _begin(self) -> None:
-        self._index = faiss.IndexBinaryHash(256, self._KEY_BITS)
-        self._descriptors: dict[int, Tensor] = {}  # of each keyframe, those forgotten among them
-        self._owner = np.zeros(0, dtype=np.int64)  # position there of the keyframe that each descriptor is from
-        self._forgotten: set[int] = set()
+    def _clear(self) -> None:
+        self._index = faiss.IndexBinaryHash(_DESCRIPTOR_BITS, _KEY_BITS)
+        self._descriptors: dict[int, Tensor] = {}  # by keyframe id, in the order of the index, with removed keyframes
+        self._owner = np.zeros(0, dtype=np.int64)  # for each descriptor in the index, position of its keyframe
+        self._removed: set[int] = set()
 
     def __len__(self) -> int:
-        return len(self._descriptors) - len(self._forgotten)
+        """Number of keyframes."""
+        return len(self._descriptors) - len(self._removed)
 
     def add(self, keyframe: int, descriptors: Tensor) -> None:
-        """Remember a keyframe.
+        """Add a keyframe.
 
         Args:
-            keyframe: its id, not added before.
-            descriptors: uint8, shape :math:`(N, 32)`.
+            keyframe: Id of the keyframe, not added before.
+            descriptors: ORB descriptors of the keyframe, uint8, shape :math:`(N, 32)`.
         """
         self._index.add(descriptors.contiguous().numpy())
         self._owner = np.concatenate([self._owner, np.full(descriptors.shape[0], len(self._descriptors))])
         self._descriptors[keyframe] = descriptors
 
     def remove(self, keyframes: Iterable[int]) -> None:
-        """Forget keyframes, also such as were never added."""
-        self._forgotten |= self._descriptors.keys() & set(keyframes)
-        if len(self._forgotten) > len(self):  # nothing can be taken out of the index: made anew, it stays as small
-            kept = {index: own for index, own in self._descriptors.items() if index not in self._forgotten}
-            self._begin()
-            for index, own in kept.items():
+        """Remove keyframes, given by their ids; ids that are not in the database are ignored."""
+        self._removed |= self._descriptors.keys() & set(keyframes)
+        # The index cannot delete descriptors: rebuild it when most of its keyframes are removed.
+        if len(self._removed) > len(self):
+            active = {index: own for index, own in self._descriptors.items() if index not in self._removed}
+            self._clear()
+            for index, own in active.items():
                 self.add(index, own)
 
     def query(self, descriptors: Tensor, k: int, exclude: Iterable[int] = ()) -> list[tuple[int, float]]:
-        """Keyframes that most likely show the same place.
+        """Find the keyframes that most likely show the same place.
 
         Args:
-            descriptors: of the view, uint8, shape :math:`(N, 32)`.
-            k: most keyframes.
-            exclude: ids that do not count, such as recent or covisible keyframes.
+            descriptors: ORB descriptors of the query image, uint8, shape :math:`(N, 32)`.
+            k: Maximum number of keyframes.
+            exclude: Ids of keyframes that are not returned, such as recent or covisible ones.
 
         Returns:
-            (id, score) with score > 0, best first, the older first where scores are equal. The score is the mean vote
-            of a descriptor; it ranks within one query and is no probability.
+            Pairs (id, score) with score > 0, best first; of equal scores the earlier added keyframe first. The score is
+            the mean weighted vote of a descriptor. It ranks the keyframes of one query and is not a probability.
         """
         ids = np.array(list(self._descriptors), dtype=np.int64)
-        count, known = len(ids), ~np.isin(ids, list(self._forgotten))
+        count, is_active = len(ids), ~np.isin(ids, list(self._removed))
         if len(self) == 0 or descriptors.shape[0] == 0:
             return []
-        bounds, _, found = self._index.range_search(descriptors.contiguous().numpy(), self._RADIUS)
-        voter, owner = np.repeat(np.arange(descriptors.shape[0]), np.diff(bounds).astype(np.int64)), self._owner[found]
-        # A descriptor has one vote for each keyframe, however often a pattern repeats in it.
-        voter, keyframe = np.divmod(np.unique((voter * count + owner)[known[owner]]), count)
+        bounds, _, matches = self._index.range_search(descriptors.contiguous().numpy(), _MAX_DISTANCE)
+        voter = np.repeat(np.arange(descriptors.shape[0]), np.diff(bounds).astype(np.int64))
+        owner = self._owner[matches]
+        # A descriptor has one vote for each keyframe, even if it matches several descriptors of that keyframe.
+        voter, keyframe = np.divmod(np.unique((voter * count + owner)[is_active[owner]]), count)
         weight = np.log1p(len(self) / np.bincount(voter, minlength=1)[voter])
         score = np.bincount(keyframe, weights=weight, minlength=count) / descriptors.shape[0]
         score[np.isin(ids, list(exclude))] = 0.0

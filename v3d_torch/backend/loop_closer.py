@@ -1,9 +1,10 @@
-"""Loop closing: recognise a place, verify it by geometry, correct pose graph and map (paper, Sec. III-E)."""
+"""Loop closing: recognise a place, verify it geometrically, correct pose graph and map (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,14 +19,18 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.tracking.map_tracker import MapTracker, Tracking
 
+_MIN_SHARED_LANDMARKS = 30
+"""Number of shared landmarks from which two keyframes are joined in the pose graph. ORB-SLAM2 requires 100 for its
+essential graph, with 2000 features per image; here there are fewer."""
+
 
 @dataclass(frozen=True)
 class PlaceMatch:
-    """A known place that a view was recognised to show.
+    """A place in the map that was recognised in an image and verified.
 
     Attributes:
-        keyframe: that saw it before.
-        tracking: the view's pose and landmarks in the map around that keyframe.
+        keyframe: Keyframe that observed the place before.
+        tracking: Pose and landmarks of the image in the map around that keyframe.
     """
 
     keyframe: Keyframe
@@ -34,12 +39,13 @@ class PlaceMatch:
 
 @dataclass(frozen=True)
 class LoopCorrection:
-    """A loop, and what the map has to be to close it.
+    """A detected loop and the keyframe poses that close it.
 
     Attributes:
-        place: where it begins.
-        loop: the motion from there to the keyframe that it ends at.
-        T_cw: world to camera of all keyframes, float64, shape :math:`(K, 4, 4)`; of retired ones it does not count.
+        place: Place at which the loop begins.
+        loop: Relative pose between the keyframe of that place and the keyframe at which the loop ends.
+        T_cw: World-to-camera poses of all keyframes, float64, shape :math:`(K, 4, 4)`; those of culled keyframes have
+            no meaning.
     """
 
     place: PlaceMatch
@@ -48,108 +54,140 @@ class LoopCorrection:
 
 
 class LoopCloser:
-    """Finds known places again, for a lost camera and for a camera that has come around.
+    """Recognises places in the map: to relocalise a lost camera, and to detect and correct loops.
 
     Args:
-        config: how many candidates, how strict.
-        motion: registers two views by their features.
-        tracker: refines a pose in the map.
-        local_keyframes: keyframes that make up a local map.
-    """
+        config: Configuration of loop closing.
+        motion: Estimator of the motion between two images from their features.
+        tracker: Tracker that refines a pose in a local map.
+        local_keyframes: Number of keyframes that form a local map.
 
-    _COVISIBLE = 30  # landmarks shared by two keyframes that the pose graph ties together (ORB-SLAM2 takes 100 of 2000)
+    Attributes:
+        loop_count: Number of loops that were corrected.
+    """
 
     def __init__(self, config: LoopConfig, motion: MotionEstimator, tracker: MapTracker, local_keyframes: int) -> None:
         self._config = config
         self._motion = motion
         self._tracker = tracker
         self._local_keyframes = local_keyframes
-        self._index = KeyframeDatabase()
+        self._database = KeyframeDatabase()
         self.loop_count = 0
-        """Loops closed so far."""
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Make a keyframe a place that can be recognised."""
-        self._index.add(keyframe.index, keyframe.features.descriptors)
+        """Add a keyframe to the places that can be recognised."""
+        self._database.add(keyframe.index, keyframe.features.descriptors)
+
+    def remove_keyframes(self, keyframes: Iterable[int]) -> None:
+        """Remove keyframes, given by their indices, from the places that can be recognised."""
+        self._database.remove(keyframes)
+
+    def rebuild(self, keyframes: Iterable[Keyframe]) -> None:
+        """Replace the places that can be recognised by the given keyframes.
+
+        Args:
+            keyframes: Active keyframes of the map, without a keyframe that is pending in the back end.
+        """
+        self._database = KeyframeDatabase()
+        for keyframe in keyframes:
+            self.add_keyframe(keyframe)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the number of loops, ``{"loop_count": int}``; `rebuild` restores the database from the map."""
+        return {"loop_count": self.loop_count}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `state_dict` returned; call `rebuild` as well."""
+        self.loop_count = state["loop_count"]
 
     def relocalise(self, features: Features, sparse_map: SparseMap, exclude: Iterable[int] = ()) -> PlaceMatch | None:
-        """Recognise where ``features`` were seen before, outside of the excluded keyframes.
+        """Find the place in the map that an image shows.
+
+        Args:
+            features: Features of the image.
+            sparse_map: Map to search.
+            exclude: Indices of keyframes that are not candidates.
 
         Returns:
-            The first candidate that passes: a motion from its keyframe to the view, confirmed by the map around it.
+            The first candidate that passes verification: a relative motion to its keyframe is found, and enough
+            landmarks around the keyframe match. None if no candidate passes.
         """
-        for index, _ in self._index.query(features.descriptors, self._config.candidates, exclude):
+        for index, _ in self._database.query(features.descriptors, self._config.candidates, exclude):
             keyframe = sparse_map.keyframes[index]
             motion = self._motion(keyframe.features, features)
             if motion is None:
                 continue
-            known = keyframe.landmarks[keyframe.landmarks >= 0]
-            local = sparse_map.local_map(known, self._local_keyframes)
-            carried = motion.propagate_landmarks(keyframe.landmarks, len(features))
-            tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, carried)
+            observed = keyframe.landmarks[keyframe.landmarks >= 0]
+            local = sparse_map.local_map(observed, self._local_keyframes)
+            propagated = motion.propagate_landmarks(keyframe.landmarks, len(features))
+            tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, propagated)
             if tracking is not None and tracking.count >= self._config.min_inliers:
                 return PlaceMatch(keyframe, tracking)
         return None
 
-    def remove_keyframes(self, keyframes: Iterable[int]) -> None:
-        """Recognise keyframes, given by their indices, no more."""
-        self._index.remove(keyframes)
-
     def detect_loop(self, keyframe: Keyframe, sparse_map: SparseMap, T_cw: Tensor) -> LoopCorrection | None:
-        """Look for a loop that ends at ``keyframe``, and solve the pose graph with it.
+        """Detect a loop that ends at a keyframe and optimise the pose graph with it; the map does not change.
 
         Args:
-            keyframe: newest.
-            sparse_map: stays as it is.
-            T_cw: of its keyframes, by which they are joined beside loops, float64, shape :math:`(K, 4, 4)`.
-        """
-        place = self._find(keyframe, sparse_map) if self._config.enabled else None
-        if place is None:
-            return None
-        # T_ij is the pose of camera j in camera i: old keyframe i, new keyframe j, as the place says it.
-        T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
-        loop = Loop(place.keyframe.index, keyframe.index, T_ij)
-        return LoopCorrection(place, loop, self._corrected(sparse_map, T_cw, [*sparse_map.loops, loop]))
-
-    def correct_loop(self, closure: LoopCorrection, sparse_map: SparseMap) -> Tensor:
-        """Correct keyframes and landmarks, in place.
+            keyframe: Newest keyframe.
+            sparse_map: Map of the keyframe.
+            T_cw: World-to-camera poses of all keyframes, from which the edges of the pose graph other than loops are
+                computed, float64, shape :math:`(K, 4, 4)`.
 
         Returns:
-            The correction of the world at the keyframe, new world from old, shape :math:`(4, 4)`.
+            The loop and corrected poses; None if there is no loop or loop closing is disabled.
         """
-        place, keyframe = closure.place, sparse_map.keyframes[closure.loop.j]
-        T_cw_before = keyframe.T_cw
-        sparse_map.loops.append(closure.loop)
+        place = self._detect_revisit(keyframe, sparse_map) if self._config.enabled else None
+        if place is None:
+            return None
+        # Old keyframe i, new keyframe j: T_ij is the pose of camera j in camera i, both in the map around keyframe i.
+        T_ij = place.keyframe.T_cw @ invert(place.tracking.T_cw)
+        loop = Loop(place.keyframe.index, keyframe.index, T_ij)
+        return LoopCorrection(place, loop, self._optimise_poses(sparse_map, T_cw, [*sparse_map.loops, loop]))
+
+    def correct_loop(self, correction: LoopCorrection, sparse_map: SparseMap) -> Tensor:
+        """Correct keyframes and landmarks of the map in place and fuse the landmarks on both sides of the loop.
+
+        Returns:
+            Correction of the world at the keyframe at which the loop ends, new world from old world, float64, shape
+            :math:`(4, 4)`.
+        """
+        place, keyframe = correction.place, sparse_map.keyframes[correction.loop.j]
+        previous_T_cw = keyframe.T_cw
+        sparse_map.loops.append(correction.loop)
         self.loop_count += 1
-        sparse_map.move_keyframes(closure.T_cw)
+        sparse_map.move_keyframes(correction.T_cw)
         sparse_map.fuse_landmarks(keyframe, place.tracking.landmarks)
+        # The loop joins the disconnected part of the map to the rest, unless the place itself is disconnected.
         for other in sparse_map.keyframes:
             other.disconnected &= place.keyframe.disconnected
-        return invert(keyframe.T_cw) @ T_cw_before
+        return invert(keyframe.T_cw) @ previous_T_cw
 
-    def _find(self, keyframe: Keyframe, sparse_map: SparseMap) -> PlaceMatch | None:
-        """A place seen before that neither time nor the map connects with the keyframe; none soon after another."""
+    def _detect_revisit(self, keyframe: Keyframe, sparse_map: SparseMap) -> PlaceMatch | None:
+        """Find a place that is neither recent nor covisible; None soon after another loop."""
         if sparse_map.loops and keyframe.index - sparse_map.loops[-1].j < self._config.min_keyframe_gap:
             return None
-        near = sparse_map.count_shared(keyframe.landmarks[keyframe.landmarks >= 0]).nonzero()[:, 0].tolist()
+        observed = keyframe.landmarks[keyframe.landmarks >= 0]
+        covisible = sparse_map.count_shared(observed).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_keyframe_gap, keyframe.index + 1)
-        place = self.relocalise(keyframe.features, sparse_map, {*near, *recent})
+        place = self.relocalise(keyframe.features, sparse_map, {*covisible, *recent})
         if place is None or place.tracking.count < self._config.min_inlier_ratio * len(place.tracking.visible):
             return None
         return place
 
-    def _corrected(self, sparse_map: SparseMap, T_cw: Tensor, loops: Sequence[Loop]) -> Tensor:
-        """Poses of all keyframes that agree best with covisibility and loops, (K, 4, 4)."""
-        edges = sparse_map.covisibility_edges(self._COVISIBLE)
-        measured = T_cw[edges[:, 0]] @ invert(T_cw[edges[:, 1]])
+    def _optimise_poses(self, sparse_map: SparseMap, T_cw: Tensor, loops: Sequence[Loop]) -> Tensor:
+        """Optimise the poses of the active keyframes by the pose graph of covisibility and loops, shape (K, 4, 4)."""
+        covisible = sparse_map.covisibility_edges(_MIN_SHARED_LANDMARKS)
+        T_covisible = T_cw[covisible[:, 0]] @ invert(T_cw[covisible[:, 1]])
         reference = sparse_map.references
         i, j = torch.tensor([[loop.i, loop.j] for loop in loops]).unbind(dim=1)
-        # Between those kept: a retired keyframe stays where it is beside the one that it goes along with.
-        to_i, to_j = T_cw[reference[i]] @ invert(T_cw[i]), T_cw[j] @ invert(T_cw[reference[j]])
-        told = to_i @ torch.stack([loop.T_ij for loop in loops]) @ to_j
-        kept, node = reference.unique(return_inverse=True)
-        ends = torch.stack([node[i], node[j]], dim=1)
-        apart = ends[:, 0] != ends[:, 1]
-        ends, told = torch.cat([node[edges], ends[apart]]), torch.cat([measured, told[apart]])
-        solved = optimise_pose_graph(invert(T_cw[kept]), ends, told)
-        return T_cw.index_copy(0, kept, invert(solved.T_wc))
+        # Transfer each loop to active keyframes: a culled keyframe keeps its pose relative to its reference keyframe.
+        T_reference_i, T_j_reference = T_cw[reference[i]] @ invert(T_cw[i]), T_cw[j] @ invert(T_cw[reference[j]])
+        T_loop = T_reference_i @ torch.stack([loop.T_ij for loop in loops]) @ T_j_reference
+        active, node = reference.unique(return_inverse=True)
+        loop_edges = torch.stack([node[i], node[j]], dim=1)
+        is_edge = loop_edges[:, 0] != loop_edges[:, 1]  # both ends of a loop can have the same reference keyframe
+        edges = torch.cat([node[covisible], loop_edges[is_edge]])
+        T_ij = torch.cat([T_covisible, T_loop[is_edge]])
+        optimised = optimise_pose_graph(invert(T_cw[active]), edges, T_ij)
+        return T_cw.index_copy(0, active, invert(optimised.T_wc))

@@ -1,11 +1,11 @@
-"""Pose-graph optimisation: poses that agree best with measured relative motions (paper, Sec. III-E).
+"""Pose-graph optimisation: poses that fit measured relative poses best (paper, Sec. III-E).
 
-Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. Lie groups and
-their Jacobians are PyPose's; the normal equations are sparse, 6x6 blocks where an edge joins two poses, factorised by
-SciPy's SuperLU.
+Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. PyPose
+provides Lie groups and their Jacobians. The normal equations are sparse, with 6x6 blocks for poses joined by an edge,
+and are solved by SciPy's SuperLU.
 
 Convention: poses ``T_wc`` are perturbed on the right, ``T_wc @ exp(xi)``, with ``xi = [translation, rotation]`` in the
-camera's frame; the error of an edge is ``log(T_ij^-1 T_wi^-1 T_wj)``, in the same order.
+camera frame; the error of an edge is ``log(T_ij^-1 T_wi^-1 T_wj)``, in the same order.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
 
 @dataclass(frozen=True)
 class PoseGraphResult:
-    """An optimised pose graph.
+    """Result of a pose-graph optimisation.
 
     Attributes:
-        T_wc: camera to world, float64, shape :math:`(N, 4, 4)`; fixed poses are as given, to the bit.
-        cost_before: sum of (robust) squared errors at the start.
-        cost_after: the same at the end.
-        iterations: steps tried.
-        converged: whether it ended because the cost no longer changed.
+        T_wc: Camera-to-world poses, float64, shape :math:`(N, 4, 4)`; fixed poses are bit-identical to the input.
+        cost_before: Sum of (robust) squared errors at the initial poses.
+        cost_after: Sum of (robust) squared errors at the optimised poses.
+        iterations: Number of Levenberg-Marquardt steps tried.
+        converged: True if the optimisation stopped because the cost no longer changed.
     """
 
     T_wc: Tensor
@@ -44,7 +44,7 @@ class PoseGraphResult:
 
 @dataclass(frozen=True)
 class _Edges:
-    """Measured motions from pose i to pose j."""
+    """Measured relative poses, with the indices i and j of the poses that each of them joins."""
 
     i: Tensor
     j: Tensor
@@ -52,7 +52,12 @@ class _Edges:
     information: Tensor
 
 
-_System = tuple[scipy.sparse.csc_array, Tensor]  # J^T W J and J^T W r over the free poses
+_NormalEquations = tuple[scipy.sparse.csc_array, Tensor]
+"""J^T W J and J^T W r over the free poses, six unknowns each."""
+
+_REGULARISATION = 1e-9
+"""Added to the diagonal of the normal equations, so that they have a solution for poses without any edge; negligible
+beside the information of an edge."""
 
 
 @torch.no_grad()
@@ -69,16 +74,17 @@ def optimise_pose_graph(
     r"""Minimise :math:`\sum_{ij} \rho(e_{ij}^T \Omega_{ij} e_{ij})` over the free poses.
 
     Args:
-        T_wc: camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
-        edges: poses (i, j) joined by each measurement, int64, shape :math:`(E, 2)`, i and j different.
-        T_ij: measured pose of camera j in camera i, ``T_wi^-1 T_wj``, float64, shape :math:`(E, 4, 4)`.
-        information: inverse covariances of the errors, shape :math:`(E, 6, 6)`; the identity by default.
-        fixed: poses that stay as they are, bool, shape :math:`(N,)`; the first by default.
-        iterations: most Levenberg-Marquardt steps.
-        robust: error, in standard deviations, above which Huber's kernel grows linearly; None for plain squares.
+        T_wc: Initial camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
+        edges: Indices (i, j) of the poses joined by each measurement, i and j different, int64, shape :math:`(E, 2)`.
+        T_ij: Measured pose of camera j in camera i, ``T_wi^-1 T_wj``, float64, shape :math:`(E, 4, 4)`.
+        information: Inverse covariances of the errors, float64, shape :math:`(E, 6, 6)`; the identity by default.
+        fixed: Mask of the poses that are not optimised, bool, shape :math:`(N,)`; only the first by default.
+        iterations: Maximum number of Levenberg-Marquardt steps.
+        robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
 
     Returns:
-        The poses of least cost; those that no edge joins to a fixed one agree with their neighbours only.
+        The poses of minimal cost. Poses that no path of edges joins to a fixed pose are determined only relative to
+        each other.
     """
     if fixed is None:
         fixed = torch.arange(T_wc.shape[0]) == 0
@@ -97,49 +103,52 @@ def optimise_pose_graph(
 
 
 def edge_errors(T_wi: pp.LieTensor, T_wj: pp.LieTensor, T_ji: pp.LieTensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Errors of edges and their Jacobians by the right perturbations of both poses.
+    """Errors of edges and their Jacobians with respect to right perturbations of both poses.
 
     Args:
-        T_wi: poses at the start of each edge, SE3, shape :math:`(E,)`.
-        T_wj: poses at its end.
-        T_ji: measured motion, inverted.
+        T_wi: Poses at the start of each edge, SE3, shape :math:`(E,)`.
+        T_wj: Poses at the end of each edge, SE3, shape :math:`(E,)`.
+        T_ji: Inverse of the measured relative pose of each edge, SE3, shape :math:`(E,)`.
 
     Returns:
-        errors, shape :math:`(E, 6)`, Jacobians by i and by j, shape :math:`(E, 6, 6)`.
+        Errors, shape :math:`(E, 6)`, and their Jacobians with respect to pose i and pose j, each of shape
+        :math:`(E, 6, 6)`.
     """
-    motion = T_wi.Inv() @ T_wj
-    error = (T_ji @ motion).Log().tensor()
-    by_j = se3_Jl_inv(-error)  # log(E exp(xi)) = log(E) + Jr^-1(log(E)) xi, and Jr(e) = Jl(-e)
-    by_i = -by_j @ SE3_Adj(motion.Inv().tensor())  # exp(-xi) motion = motion exp(-Ad(motion^-1) xi)
-    return error, by_i, by_j
+    predicted_T_ij = T_wi.Inv() @ T_wj
+    error = (T_ji @ predicted_T_ij).Log().tensor()
+    J_j = se3_Jl_inv(-error)  # log(E exp(xi)) = log(E) + Jr^-1(log(E)) xi, and Jr(e) = Jl(-e)
+    J_i = -J_j @ SE3_Adj(predicted_T_ij.Inv().tensor())  # exp(-xi) T = T exp(-Ad(T^-1) xi)
+    return error, J_i, J_j
 
 
-def _linearise(T_wc: pp.LieTensor, graph: _Edges, free: Tensor, limit: float) -> tuple[float, _System]:
-    error, by_i, by_j = edge_errors(T_wc[graph.i], T_wc[graph.j], graph.T_ji)
+def _linearise(T_wc: pp.LieTensor, graph: _Edges, free: Tensor, limit: float) -> tuple[float, _NormalEquations]:
+    """Cost and normal equations at given poses; ``limit`` is the squared error from which Huber's kernel is linear."""
+    error, J_i, J_j = edge_errors(T_wc[graph.i], T_wc[graph.j], graph.T_ji)
     squared = torch.einsum("ea,eab,eb->e", error, graph.information, error)
     costs, weights = huber(squared, limit)
 
-    J = torch.cat([by_i, by_j], dim=2)  # (E, 6, 12)
+    J = torch.cat([J_i, J_j], dim=2)  # E x 6 x 12
     weighted = J.mT @ (weights[:, None, None] * graph.information)
-    column = torch.full((T_wc.shape[0],), -1)
-    column[free] = torch.arange(free.shape[0])
-    # Number of the unknown behind each of an edge's 12 columns; negative where the pose is fixed.
-    unknown = (6 * column[torch.stack([graph.i, graph.j], dim=1)][..., None] + torch.arange(6)).flatten(1)
+    free_index = torch.full((T_wc.shape[0],), -1)
+    free_index[free] = torch.arange(free.shape[0])
+    # Index of the unknown of each of the 12 columns of an edge; negative if the pose is fixed.
+    unknown = (6 * free_index[torch.stack([graph.i, graph.j], dim=1)][..., None] + torch.arange(6)).flatten(1)
     size = 6 * free.shape[0]
 
     gradient = torch.zeros(size, dtype=error.dtype)
-    known = unknown >= 0
-    gradient.index_add_(0, unknown[known], (weighted @ error[..., None])[..., 0][known])
+    is_free = unknown >= 0
+    gradient.index_add_(0, unknown[is_free], (weighted @ error[..., None])[..., 0][is_free])
     rows, columns = unknown[:, :, None].expand(-1, 12, 12), unknown[:, None, :].expand(-1, 12, 12)
-    known = (rows >= 0) & (columns >= 0)
-    entries = (weighted @ J)[known].numpy(), (rows[known].numpy(), columns[known].numpy())
+    is_free = (rows >= 0) & (columns >= 0)
+    entries = (weighted @ J)[is_free].numpy(), (rows[is_free].numpy(), columns[is_free].numpy())
     return float(costs.sum()), (scipy.sparse.coo_array(entries, shape=(size, size)).tocsc(), gradient)
 
 
-def _step(T_wc: pp.LieTensor, system: _System, damping: float, free: Tensor) -> pp.LieTensor:
+def _step(T_wc: pp.LieTensor, system: _NormalEquations, damping: float, free: Tensor) -> pp.LieTensor:
+    """Poses after one damped step."""
     H, gradient = system
-    damped = H + scipy.sparse.diags_array(damping * H.diagonal() + 1e-9)  # 1e-9: for poses without any edge
-    # Symmetric and positive definite: the ordering may be symmetric, and no pivot need be looked for.
+    damped = H + scipy.sparse.diags_array(damping * H.diagonal() + _REGULARISATION)
+    # The matrix is symmetric and positive definite: use a symmetric ordering and no pivoting.
     factors = scipy.sparse.linalg.splu(
         damped.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
     )

@@ -26,7 +26,7 @@ from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.slam import PREFETCHED_FRAMES, V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
-from v3d_torch.types import restore_segmenter, segmenter_state
+from v3d_torch.types import restore_segmenter, segmenter_state_of
 
 _LOG = logging.getLogger(__name__)
 
@@ -112,7 +112,7 @@ class PreprocessWorker:
         channel.connection.settimeout(_START_TIMEOUT)
         channel.receive()
         stages = slam.preprocessing_stages()
-        channel.send((type(slam), slam.camera, slam.config, stages, segmenter_state(slam.segment), self._sequence))
+        channel.send((type(slam), slam.camera, slam.config, stages, segmenter_state_of(slam.segment), self._sequence))
         channel.receive()
         channel.connection.settimeout(None)
 

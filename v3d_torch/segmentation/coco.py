@@ -1,4 +1,4 @@
-"""The 80 classes of COCO (Lin et al., ECCV 2014), in the order in which detection networks number them."""
+"""The 80 classes of COCO (Lin et al., ECCV 2014), in the order used by detection networks."""
 
 from __future__ import annotations
 
@@ -13,21 +13,22 @@ COCO_NAMES: tuple[str, ...] = (
     *("cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors"),
     *("teddy bear", "hair drier", "toothbrush"),
 )
-"""Name of each class index."""
+"""Class names by class index."""
 
 PERSON = COCO_NAMES.index("person")
-"""The class that the paper sets aside as potentially moving (Sec. III-A)."""
+"""Class index of people, the class that the paper treats as potentially moving (Sec. III-A)."""
 
 UNLABELLED = -1
-"""What moves and has no class: the network missed it, or has no name for it."""
+"""Label of moving objects without a class: the network missed them, or was not trained on their class."""
 
 LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
-"""Classes that deform by themselves: people and animals. Things are rigid: they move as a whole or not at all."""
+"""Class indices of people and animals, which deform by themselves."""
 
 THINGS = frozenset(range(len(COCO_NAMES))) - LIVING
-"""All others. What has no name is in neither: it may be somebody."""
+"""Class indices of all other objects, which are rigid: they move as a whole or not at all. `UNLABELLED` is in neither
+set, because an unlabelled object can be a person."""
 
 
 def class_name(label: int) -> str:
-    """Name of a class index, also of `UNLABELLED`."""
+    """Name of a class index or of `UNLABELLED`."""
     return "unnamed" if label == UNLABELLED else COCO_NAMES[label]

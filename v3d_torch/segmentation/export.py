@@ -1,4 +1,4 @@
-"""From a checkpoint to an ONNX file for one input size, kept in the cache."""
+"""Export of a network with published weights to an ONNX file of fixed input size, stored in the cache."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from v3d_torch.errors import WeightsError
 from v3d_torch.io.download import cache_dir
 from v3d_torch.io.files import atomic_write, file_lock
 from v3d_torch.segmentation.networks import one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
-from v3d_torch.segmentation.pt_file import read_checkpoint
+from v3d_torch.segmentation.pt_weights import read_pt_weights
 from v3d_torch.segmentation.weights import REGISTRY
 
 _VERSION = 3
-"""Of what this file makes of a checkpoint: raised with every change, so that older files in the cache are not used."""
+"""Version of the exported files, part of their name: increase it when the export changes, so that files of earlier
+versions in the cache are not used."""
 
 _OPSET = 17
+"""ONNX operator set of the exported files."""
 
 _BUILDERS: dict[str, Callable[[], nn.Module]] = {
     "yolov8n-seg": yolov8n_seg,
@@ -28,21 +30,21 @@ _BUILDERS: dict[str, Callable[[], nn.Module]] = {
 }
 
 
-def exported_path(model: str, checkpoint: Path, height: int, width: int) -> Path:
-    """The ONNX file of a checkpoint for images of one size, made on first use.
+def exported_path(model: str, weights: Path, height: int, width: int) -> Path:
+    """Path of the ONNX file for images of one size; the file is written on first use.
 
     Args:
-        model: a key of the registry of weights.
-        checkpoint: its ``.pt`` file.
-        height: rows of the input, a multiple of 32.
-        width: columns of the input, a multiple of 32.
+        model: Name of the model, a key of `REGISTRY`.
+        weights: Published ``.pt`` file of the model.
+        height: Rows of the network input, a multiple of 32.
+        width: Columns of the network input, a multiple of 32.
 
     Returns:
-        A file in the cache with the layout that `export` describes.
+        A file in the cache with the inputs and outputs described at `export`.
 
     Raises:
-        WeightsError: if the checkpoint is not the model's.
-        OutputError: if the cache cannot be written.
+        WeightsError: If the weights are not those of the model.
+        OutputError: If the cache is not writable.
     """
     sha256 = REGISTRY[model].sha256
     target = cache_dir() / "networks" / f"{model}-{sha256[:12]}-{height}x{width}-v{_VERSION}.onnx"
@@ -50,21 +52,21 @@ def exported_path(model: str, checkpoint: Path, height: int, width: int) -> Path
         return target
     with file_lock(target):
         if not target.is_file():
-            network = build(model, read_checkpoint(checkpoint, sha256))
+            network = build(model, read_pt_weights(weights, sha256))
             with atomic_write(target) as draft:
                 export(network, height, width, draft)
     return target
 
 
 def build(model: str, tensors: dict[str, Tensor]) -> nn.Module:
-    """The network with a checkpoint's tensors, ready for inference.
+    """Build a network with given weights, in evaluation mode.
 
     Args:
-        model: a key of the registry of weights.
-        tensors: by name, as `read_checkpoint` gives them; what serves only training may be among them.
+        model: Name of the model, a key of `REGISTRY`.
+        tensors: Parameters and buffers by name, see `read_pt_weights`; tensors used only in training are ignored.
 
     Raises:
-        WeightsError: if a tensor is missing or has another shape.
+        WeightsError: If a tensor is missing or has another shape.
     """
     network = _BUILDERS[model]()
     if REGISTRY[model].one_to_one:
@@ -72,14 +74,24 @@ def build(model: str, tensors: dict[str, Tensor]) -> nn.Module:
     try:
         network.load_state_dict({name: tensors[name] for name in network.state_dict()})
     except (KeyError, RuntimeError) as error:
-        raise WeightsError(f"{model}: the checkpoint's tensors are not this network's ({error})") from error
+        raise WeightsError(f"{model}: the tensors in the weights do not match this network ({error})") from error
     return network.eval()
 
 
 def export(network: nn.Module, height: int, width: int, path: Path) -> None:
-    """Write a network as ONNX: ``images`` (1, 3, H, W) in, ``output0`` and ``output1`` out as `LayerGraph` has them."""
+    """Write a network as an ONNX file.
+
+    The input ``images`` has the shape (1, 3, H, W); the outputs ``output0`` (predictions) and ``output1`` (prototypes)
+    are those of `LayerGraph`.
+
+    Args:
+        network: Network in evaluation mode.
+        height: Rows of the input, a multiple of 32.
+        width: Columns of the input, a multiple of 32.
+        path: File to write.
+    """
     with warnings.catch_warnings(), torch.inference_mode():
-        # The exporter announces its successor, which needs a package more; what it writes is checked by the tests.
+        # Ignore the deprecation warning of this exporter: its successor needs an additional package.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network,

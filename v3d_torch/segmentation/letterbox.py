@@ -1,4 +1,4 @@
-"""An image of any size on the network's canvas: scaled to fit, centred, the rest grey."""
+"""Letterboxing: an image of any size scaled to fit the network's canvas, centred, on grey padding."""
 
 from __future__ import annotations
 
@@ -9,15 +9,24 @@ from torch import Tensor
 from torch.nn import functional
 
 CELL = 4
-"""Pixels of the canvas per prototype cell: the picture covers whole cells, so that masks are cut out exactly."""
+"""Side of a prototype cell, canvas pixels. The image covers whole cells, so that masks are cropped exactly."""
 
 _GREY = 114
-"""The padding that the networks were trained with."""
+"""Padding value, as in the training of the networks."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """Where the image lies on the canvas; all pixels, all multiples of `CELL` except the image's own size."""
+    """Position of an image on the canvas, pixels.
+
+    Attributes:
+        top: First canvas row of the image, a multiple of `CELL`.
+        left: First canvas column of the image, a multiple of `CELL`.
+        height: Canvas rows that the image covers, a multiple of `CELL`.
+        width: Canvas columns that the image covers, a multiple of `CELL`.
+        image_height: Rows of the original image.
+        image_width: Columns of the original image.
+    """
 
     top: int
     left: int
@@ -27,7 +36,14 @@ class Window:
     image_width: int
 
     def to_image(self, boxes: Tensor) -> Tensor:
-        """Boxes (left, top, right, bottom) on the canvas to the image, cut at its border; shape :math:`(N, 4)`."""
+        """Transform boxes from the canvas to the image and clip them at its border.
+
+        Args:
+            boxes: Left, top, right and bottom edges, canvas pixels, shape :math:`(N, 4)`.
+
+        Returns:
+            The same edges in image pixels, shape :math:`(N, 4)`.
+        """
         offset = boxes.new_tensor([self.left, self.top, self.left, self.top])
         size = boxes.new_tensor([self.width, self.height, self.width, self.height])
         image_size = boxes.new_tensor([self.image_width, self.image_height, self.image_width, self.image_height])
@@ -35,15 +51,15 @@ class Window:
 
 
 def letterbox(image: Tensor, height: int, width: int) -> tuple[Tensor, Window]:
-    """Put an image on a canvas.
+    """Scale an image to fit a canvas and centre it there.
 
     Args:
-        image: uint8 RGB, shape :math:`(3, H, W)`.
-        height: rows of the canvas, a multiple of `CELL`.
-        width: columns of the canvas, a multiple of `CELL`.
+        image: Colour image, uint8 RGB, shape :math:`(3, H, W)`.
+        height: Rows of the canvas, a multiple of `CELL`.
+        width: Columns of the canvas, a multiple of `CELL`.
 
     Returns:
-        The canvas, float32 in [0, 1], shape :math:`(1, 3, height, width)`, and where the image lies on it.
+        The canvas, float32 in [0, 1], shape :math:`(1, 3, height, width)`, and the position of the image on it.
     """
     image_height, image_width = image.shape[1:]
     scale = min(height / image_height, width / image_width)
@@ -53,9 +69,9 @@ def letterbox(image: Tensor, height: int, width: int) -> tuple[Tensor, Window]:
     left = (width - inner_width) // 2 // CELL * CELL
     window = Window(top, left, inner_height, inner_width, image_height, image_width)
 
-    picture = image[None]  # scaled as bytes, as when the networks were trained
+    scaled = image[None]  # interpolated as uint8, as in the training of the networks
     if (inner_height, inner_width) != (image_height, image_width):
-        picture = functional.interpolate(picture, (inner_height, inner_width), mode="bilinear", antialias=True)
+        scaled = functional.interpolate(scaled, (inner_height, inner_width), mode="bilinear", antialias=True)
     canvas = torch.full((1, 3, height, width), _GREY, dtype=torch.uint8)
-    canvas[..., top : top + inner_height, left : left + inner_width] = picture
+    canvas[..., top : top + inner_height, left : left + inner_width] = scaled
     return canvas.to(torch.float32).div_(255), window

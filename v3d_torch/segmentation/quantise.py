@@ -1,8 +1,7 @@
-"""The network in 8-bit integers: half the time on processors that multiply these in vectors.
+"""Static 8-bit quantisation of a network's convolutions (Jacob et al., CVPR 2018).
 
-Static quantisation of the convolutions (Jacob et al., CVPR 2018): the range of every activation is taken from frames
-that the network is shown once. They are rendered here, so that nothing has to be downloaded and every machine takes the
-same.
+Integer convolutions are faster on processors with 8-bit vector instructions. The range of every activation is
+calibrated on rendered frames of the demo: nothing has to be downloaded, and every machine uses the same frames.
 """
 
 from __future__ import annotations
@@ -27,35 +26,37 @@ if TYPE_CHECKING:
     import onnx
 
 _VERSION = 3
-"""Of what this file makes of a network: raised with every change, so that older files in the cache are not used."""
+"""Version of the quantised files, part of their name: increase it when the quantisation changes, so that files of
+earlier versions in the cache are not used."""
 
-_EVERY = 15
-"""Every n-th frame of the demo calibrates: people from head to toe and cut, a dark and a bright background."""
+_CALIBRATION_INTERVAL = 15
+"""Frames of the demo from one calibration frame to the next: the chosen frames show people in full and cut off by the
+image border, on dark and on bright backgrounds."""
 
-_FIRST = 5
-"""Convolutions at the input that stay in floating point: their errors grow through all others. They take a tenth of the
-time, and without them two people in a hundred are missed."""
+_FIRST_FLOAT_CONVOLUTIONS = 5
+"""Number of convolutions at the input that stay in floating point: their errors propagate through all later layers, and
+without them people are missed."""
 
-_OWN = "com.microsoft"
-"""Operations of onnxruntime's own."""
+_ORT_DOMAIN = "com.microsoft"
+"""Domain of operators that are specific to onnxruntime."""
 
 
 def has_int8_instructions() -> bool:
-    """Whether this processor multiplies 8-bit integers in vectors; older ones overflow in 16 bits on the way."""
+    """Check whether the processor has 8-bit vector instructions; older x86 processors overflow in 16-bit sums."""
     return platform.machine() not in ("x86_64", "AMD64") or torch.cpu._is_vnni_supported()
 
 
 def quantised_path(path: Path) -> Path:
-    """The 8-bit sibling of a network, made on first use.
+    """Path of the 8-bit version of a network, beside the original; the file is written on first use.
 
     Args:
-        path: ONNX file with one input (1, 3, H, W) of RGB in [0, 1].
+        path: ONNX file with one input of shape (1, 3, H, W), RGB in [0, 1].
 
     Returns:
-        A file beside it with the same inputs and outputs.
+        An ONNX file with the same inputs and outputs.
 
     Raises:
-        OutputError: if the folder cannot be written.
+        OutputError: If the folder is not writable.
     """
     target = path.with_name(f"{path.stem}-int8-v{_VERSION}.onnx")
     if target.is_file():
@@ -69,59 +70,60 @@ def quantised_path(path: Path) -> Path:
 
 
 def _calibration_images() -> list[Tensor]:
-    # Imported where it is needed, once on a machine: half a second of every start else.
+    """Rendered colour images of the demo, each uint8, shape (3, H, W)."""
+    # A slow import, needed only when a network is quantised.
     from v3d_torch.datasets.demo.sequence import FRAMES, write_sequence
 
     with tempfile.TemporaryDirectory() as folder:
-        write_sequence(Path(folder), range(0, FRAMES, _EVERY))
+        write_sequence(Path(folder), range(0, FRAMES, _CALIBRATION_INTERVAL))
         return [read_colour(image) for image in sorted((Path(folder) / "rgb").iterdir())]
 
 
 def quantise(path: Path, images: Iterable[Tensor], target: Path) -> None:
-    """Write a network with its convolutions in 8-bit integers, for onnxruntime.
+    """Write a version of a network with 8-bit convolutions, for onnxruntime.
 
     Args:
-        path: ONNX file with one input (1, 3, H, W) of RGB in [0, 1].
-        images: that tell the range of every activation, uint8 RGB, each of shape :math:`(3, H, W)`.
-        target: to be written.
+        path: ONNX file with one input of shape (1, 3, H, W), RGB in [0, 1].
+        images: Calibration images, uint8 RGB, each of shape :math:`(3, H, W)`.
+        target: ONNX file to write.
     """
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
     model = onnx.load(path)
-    given = model.graph.input[0]
-    _, _, height, width = (size.dim_value for size in given.type.tensor_type.shape.dim)
-    canvases = ({given.name: letterbox(image, height, width)[0].numpy()} for image in images)
+    image_input = model.graph.input[0]
+    _, _, height, width = (size.dim_value for size in image_input.type.tensor_type.shape.dim)
+    canvases = ({image_input.name: letterbox(image, height, width)[0].numpy()} for image in images)
 
-    class Frames(CalibrationDataReader):  # type: ignore[misc]
+    class CalibrationCanvases(CalibrationDataReader):  # type: ignore[misc]
         def get_next(self) -> dict[str, NDArray[np.float32]] | None:
             return next(canvases, None)
 
-    logging.disable(logging.WARNING)  # it recommends to fuse what the exporter has fused
+    logging.disable(logging.WARNING)  # onnxruntime recommends a fusion that the exporter has already done
     try:
         quantize_static(
             str(path),
             str(target),
-            Frames(),
+            CalibrationCanvases(),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
-            nodes_to_exclude=_kept_exact(model.graph),
+            nodes_to_exclude=_float_convolutions(model.graph),
             per_channel=True,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
         )
     finally:
         logging.disable(logging.NOTSET)
-    small = onnx.load(target)
-    _fuse_activations(small)
-    onnx.save(small, target)
+    quantised = onnx.load(target)
+    _fuse_activations(quantised)
+    onnx.save(quantised, target)
 
 
 def _fuse_activations(model: onnx.ModelProto) -> None:
-    """Make one operation of each x * sigmoid(x).
+    """Replace each x * sigmoid(x) by one operator, in place.
 
-    onnxruntime does so itself, but not behind an integer convolution: there it turns x to floating point once for the
-    product and once for the sigmoid, and no longer sees that they are the same.
+    onnxruntime does not do so after an integer convolution: it dequantises x once for the product and once for the
+    sigmoid, and then does not recognise them as the same tensor.
     """
     import onnx
 
@@ -129,21 +131,23 @@ def _fuse_activations(model: onnx.ModelProto) -> None:
     sigmoids = {node.output[0]: node for node in graph.node if node.op_type == "Sigmoid"}
     for product in [node for node in graph.node if node.op_type == "Mul"]:
         for gate in sigmoids.keys() & set(product.input):
-            given = sigmoids[gate].input[0]
-            if given in product.input:
-                fused = onnx.helper.make_node("QuickGelu", [given], list(product.output), domain=_OWN, alpha=1.0)
+            x = sigmoids[gate].input[0]
+            if x in product.input:
+                # With alpha = 1, QuickGelu is x * sigmoid(x).
+                fused = onnx.helper.make_node("QuickGelu", [x], list(product.output), domain=_ORT_DOMAIN, alpha=1.0)
                 product.CopyFrom(fused)
                 graph.node.remove(sigmoids[gate])
-    if all(used.domain != _OWN for used in model.opset_import):
-        model.opset_import.append(onnx.helper.make_opsetid(_OWN, 1))
+    if all(opset.domain != _ORT_DOMAIN for opset in model.opset_import):
+        model.opset_import.append(onnx.helper.make_opsetid(_ORT_DOMAIN, 1))
 
 
-def _kept_exact(graph: onnx.GraphProto) -> list[str]:
-    """Convolutions that stay in floating point: the first ones, and those without activation, which give the results.
+def _float_convolutions(graph: onnx.GraphProto) -> list[str]:
+    """Names of the convolutions that stay in floating point: the first ones, and the output layers.
 
-    Boxes reach over hundreds of pixels, scores over hundredths: no eight bits hold both.
+    Output layers are the convolutions without an activation. Boxes range over hundreds of pixels and scores differ by
+    hundredths; 8 bits cannot represent both.
     """
     convolutions = [node for node in graph.node if node.op_type == "Conv"]
     activated = {name for node in graph.node if node.op_type == "Sigmoid" for name in node.input}
-    bare = [node for node in convolutions if node.output[0] not in activated]
-    return [node.name for node in [*convolutions[:_FIRST], *bare]]
+    output_layers = [node for node in convolutions if node.output[0] not in activated]
+    return [node.name for node in [*convolutions[:_FIRST_FLOAT_CONVOLUTIONS], *output_layers]]

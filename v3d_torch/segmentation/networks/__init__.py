@@ -1,4 +1,4 @@
-"""The published segmentation networks as plain torch modules."""
+"""YOLO segmentation networks as plain torch modules."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Self-attention over the cells of a small feature map: the position-sensitive blocks of YOLO11 and YOLO26.
+"""Self-attention over the cells of a feature map: the position-sensitive blocks of YOLO11 and YOLO26.
 
-The block was introduced with YOLOv10 (Wang et al., NeurIPS 2024, Sec. 3.3). Names of submodules are the checkpoints'.
+Source: partial self-attention of YOLOv10 (Wang et al., NeurIPS 2024, Sec. 3.3). Submodules have the names that they
+have in the published weights.
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ from torch import Tensor, nn
 from v3d_torch.segmentation.networks.blocks import Conv
 
 HEAD_CHANNELS = 64
-"""Channels of a value; queries and keys have half."""
+"""Channels of the values of one head; queries and keys have half as many."""
 
 
 class Attention(nn.Module):
-    """Multi-head attention among all cells, with a depthwise convolution of the values as the sense of place."""
+    """Multi-head attention between all cells, with a depthwise convolution of the values as position encoding.
+
+    Args:
+        channels: Input and output channels, a multiple of `HEAD_CHANNELS`.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -25,7 +30,7 @@ class Attention(nn.Module):
         self.pe = Conv(channels, channels, 3, groups=channels, activate=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Attend; shapes :math:`(B, C, H, W)` in and out."""
+        """Apply attention to a feature map of shape :math:`(B, C, H, W)`; the shape stays the same."""
         batch, channels, height, width = x.shape
         key_channels = HEAD_CHANNELS // 2
         qkv = self.qkv(x).view(batch, self.heads, 2 * HEAD_CHANNELS, height * width)
@@ -36,7 +41,11 @@ class Attention(nn.Module):
 
 
 class PSABlock(nn.Module):
-    """Attention, then a feed-forward network of twice the width, each with the identity beside it."""
+    """Attention, then a feed-forward network of twice the width, each with a residual connection.
+
+    Args:
+        channels: Input and output channels.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -44,13 +53,17 @@ class PSABlock(nn.Module):
         self.ffn = nn.Sequential(Conv(channels, 2 * channels), Conv(2 * channels, channels, activate=False))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Shapes :math:`(B, C, H, W)` in and out."""
+        """Apply the block to a feature map of shape :math:`(B, C, H, W)`; the shape stays the same."""
         x = x + self.attn(x)
         return x + self.ffn(x)
 
 
 class C2PSA(nn.Module):
-    """Half of the channels passes through attention, the other half goes past it."""
+    """Cross-stage block: attention on one half of the channels, the identity on the other half.
+
+    Args:
+        channels: Input and output channels.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -59,6 +72,6 @@ class C2PSA(nn.Module):
         self.m = nn.Sequential(PSABlock(channels // 2))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Shapes :math:`(B, C, H, W)` in and out."""
-        past, through = self.cv1(x).chunk(2, dim=1)
-        return self.cv2(torch.cat([past, self.m(through)], dim=1))
+        """Apply the block to a feature map of shape :math:`(B, C, H, W)`; the shape stays the same."""
+        bypass, attended = self.cv1(x).chunk(2, dim=1)
+        return self.cv2(torch.cat([bypass, self.m(attended)], dim=1))

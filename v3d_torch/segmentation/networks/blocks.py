@@ -1,8 +1,8 @@
-"""The convolutional blocks of the YOLO family, from YOLOv8 to YOLO26.
+"""Convolutional blocks of the YOLO family, from YOLOv8 to YOLO26.
 
-Written from the published architecture tables. Submodules carry the names of the published checkpoints (``cv1``,
-``m``, ...), so that a checkpoint's tensors load by name and any difference in structure shows as a missing tensor.
-All blocks take and return feature maps of shape :math:`(B, C, H, W)`.
+The blocks follow the published architecture tables. Submodules have the names that they have in the published weights
+(``cv1``, ``m``, ...): tensors are loaded by name, and a difference in structure shows as a missing tensor. All blocks
+take and return feature maps of shape :math:`(B, C, H, W)`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ class Conv(nn.Module):
     """Convolution, batch normalisation, SiLU.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
-        kernel: side of the kernel; the padding keeps the size at stride 1.
-        stride: step, pixels.
-        groups: groups of channels; ``inputs`` makes the convolution depthwise.
-        activate: whether SiLU follows.
+        inputs: Input channels.
+        outputs: Output channels.
+        kernel: Side of the kernel, cells; padding keeps the size of the map at stride 1.
+        stride: Stride, cells.
+        groups: Groups of channels; equal to ``inputs`` for a depthwise convolution.
+        activate: True to apply SiLU, False for a linear output.
     """
 
     def __init__(
@@ -37,7 +37,13 @@ class Conv(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """Two 3x3 convolutions over a hidden width, with or without the identity beside them."""
+    """Two 3x3 convolutions, with or without a residual connection.
+
+    Args:
+        channels: Input and output channels.
+        hidden: Channels between the two convolutions.
+        shortcut: True to add the input to the output.
+    """
 
     def __init__(self, channels: int, hidden: int, shortcut: bool) -> None:
         super().__init__()
@@ -46,19 +52,19 @@ class Bottleneck(nn.Module):
         self.shortcut = shortcut
 
     def forward(self, x: Tensor) -> Tensor:
-        """Residual of the two convolutions, or just them."""
+        """Apply both convolutions; add the input if configured."""
         y = self.cv2(self.cv1(x))
         return x + y if self.shortcut else y
 
 
 class C2f(nn.Module):
-    """Cross-stage block of YOLOv8: half of the channels runs through a chain, and every link of it is kept.
+    """Cross-stage block of YOLOv8: half of the channels passes a chain of modules; all intermediate maps are joined.
 
     Args:
-        inputs: channels in.
-        outputs: channels out.
-        hidden: channels of each half.
-        chain: the links, each from ``hidden`` to ``hidden`` channels.
+        inputs: Input channels.
+        outputs: Output channels.
+        hidden: Channels of each half.
+        chain: Modules of the chain, each with ``hidden`` input and output channels.
     """
 
     def __init__(self, inputs: int, outputs: int, hidden: int, chain: list[nn.Module]) -> None:
@@ -68,15 +74,19 @@ class C2f(nn.Module):
         self.m = nn.ModuleList(chain)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Split, run the chain, join all of its links."""
-        links = list(self.cv1(x).chunk(2, dim=1))
-        for link in self.m:
-            links.append(link(links[-1]))
-        return self.cv2(torch.cat(links, dim=1))
+        """Split the channels, apply the chain, join all maps."""
+        maps = list(self.cv1(x).chunk(2, dim=1))
+        for module in self.m:
+            maps.append(module(maps[-1]))
+        return self.cv2(torch.cat(maps, dim=1))
 
 
 class C3k(nn.Module):
-    """Cross-stage block with two bottlenecks on one of two parallel paths of half the width."""
+    """Cross-stage block with two parallel paths of half the width, one of them with two bottlenecks.
+
+    Args:
+        channels: Input and output channels.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -87,16 +97,16 @@ class C3k(nn.Module):
         self.m = nn.Sequential(*(Bottleneck(hidden, hidden, shortcut=True) for _ in range(2)))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Join the path with bottlenecks and the path without."""
+        """Apply both paths and join them."""
         return self.cv3(torch.cat([self.m(self.cv1(x)), self.cv2(x)], dim=1))
 
 
 class SPPF(nn.Module):
-    """Spatial pyramid pooling: three chained 5x5 maxima see 5, 9 and 13 cells.
+    """Spatial pyramid pooling: three chained 5x5 max poolings with receptive fields of 5, 9 and 13 cells.
 
     Args:
-        channels: channels in and out.
-        residual: YOLO26's form, with the identity beside it and no activation at its entry.
+        channels: Input and output channels.
+        residual: True for the form of YOLO26: a residual connection, and a linear first convolution.
     """
 
     def __init__(self, channels: int, residual: bool = False) -> None:
@@ -107,7 +117,7 @@ class SPPF(nn.Module):
         self.residual = residual
 
     def forward(self, x: Tensor) -> Tensor:
-        """Join the map and its three pooled versions."""
+        """Join a feature map and its three pooled versions."""
         maps = [self.cv1(x)]
         for _ in range(3):
             maps.append(self.m(maps[-1]))
@@ -116,8 +126,8 @@ class SPPF(nn.Module):
 
 
 class Concat(nn.Module):
-    """Feature maps of one size, joined along the channels."""
+    """Concatenation of feature maps of one size along the channels."""
 
     def forward(self, maps: list[Tensor]) -> Tensor:
-        """Join maps of shapes :math:`(B, C_i, H, W)`."""
+        """Concatenate maps of shapes :math:`(B, C_i, H, W)`."""
         return torch.cat(maps, dim=1)

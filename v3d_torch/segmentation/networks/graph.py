@@ -1,4 +1,4 @@
-"""A network as a table of layers, each with the layers that feed it, as the YOLO family is published."""
+"""Network defined by a table of layers and their inputs, the form in which the YOLO family is published."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from typing import Any
 from torch import Tensor, nn
 
 Sources = tuple[int, ...]
-"""Indices of the layers whose outputs a layer takes as a list, -1 for the one before; () for just the one before."""
+"""Indices of the layers whose outputs are the input list of a layer, -1 for the previous layer; () if the input is the
+output of the previous layer alone, without a list."""
 
 
 class LayerGraph(nn.Module):
-    """Layers run in order; the last one's output is the network's.
+    """Layers that run in order; the output of the last layer is the output of the network.
 
     Args:
-        layers: the sources of each layer and the layer.
+        layers: Sources and module of each layer.
     """
 
     def __init__(self, layers: list[tuple[Sources, nn.Module]]) -> None:
@@ -26,10 +27,11 @@ class LayerGraph(nn.Module):
         """Run the network.
 
         Args:
-            image: RGB in [0, 1], shape :math:`(B, 3, H, W)`, H and W multiples of 32.
+            image: Colour images, RGB in [0, 1], shape :math:`(B, 3, H, W)`, H and W multiples of 32.
 
         Returns:
-            What the head gives: predictions :math:`(B, 116, N)` and prototypes :math:`(B, 32, H/4, W/4)`.
+            Output of the head: predictions, shape :math:`(B, 116, N)`, and prototypes, shape
+            :math:`(B, 32, H/4, W/4)`; see `Segment`.
         """
         outputs: list[Any] = []
         x: Any = image

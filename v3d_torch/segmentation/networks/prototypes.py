@@ -1,4 +1,4 @@
-"""Mask prototypes: the images whose linear combinations are instance masks (YOLACT, Bolya et al., ICCV 2019)."""
+"""Mask prototypes: images whose linear combinations are instance masks (YOLACT, Bolya et al., ICCV 2019)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,16 @@ from torch import Tensor, nn
 from v3d_torch.segmentation.networks.blocks import Conv
 
 PROTOTYPES = 32
+"""Number of prototypes, and of mask coefficients of each prediction."""
 
 
 class Proto(nn.Module):
-    """Prototypes at a quarter of the image's size, from the finest level of the pyramid alone."""
+    """Prototypes at a quarter of the input size, from the finest level of the pyramid.
+
+    Args:
+        channels: Channels of the finest level.
+        hidden: Hidden channels.
+    """
 
     def __init__(self, channels: int, hidden: int = 64) -> None:
         super().__init__()
@@ -20,12 +26,16 @@ class Proto(nn.Module):
         self.cv3 = Conv(hidden, PROTOTYPES)
 
     def forward(self, pyramid: list[Tensor]) -> Tensor:
-        """Prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""
+        """Compute prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""
         return self.cv3(self.cv2(self.upsample(self.cv1(pyramid[0]))))
 
 
 class MultiScaleProto(Proto):
-    """YOLO26's prototypes: the coarser levels are reduced, enlarged and added before."""
+    """Prototypes of YOLO26, from the sum of the finest level and the upsampled coarser levels.
+
+    Args:
+        channels: Channels of the pyramid levels, finest first.
+    """
 
     def __init__(self, channels: tuple[int, int, int]) -> None:
         super().__init__(channels[0])
@@ -33,7 +43,7 @@ class MultiScaleProto(Proto):
         self.feat_fuse = Conv(channels[0], channels[0], 3)
 
     def forward(self, pyramid: list[Tensor]) -> Tensor:
-        """Prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""
+        """Compute prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""
         finest, *coarser = pyramid
         fused = finest
         for level, refine, coarse in zip((1, 2), self.feat_refine, coarser, strict=True):

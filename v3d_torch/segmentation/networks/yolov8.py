@@ -1,4 +1,4 @@
-"""YOLOv8n-seg, the network that the paper names (Sec. III-A)."""
+"""YOLOv8n-seg, the network of the paper (Sec. III-A)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from v3d_torch.segmentation.networks.prototypes import Proto
 
 
 def yolov8n_seg() -> LayerGraph:
-    """The nano model: a C2f backbone, a pyramid down and up again, a head with distributed distances."""
+    """Build the nano model, with random weights: C2f backbone, top-down and bottom-up pyramid, head with `DFL`."""
     return LayerGraph(
         [
             ((), Conv(3, 16, 3, 2)),  # 0
@@ -42,5 +42,6 @@ def yolov8n_seg() -> LayerGraph:
 
 
 def _stage(inputs: int, outputs: int, depth: int, shortcut: bool = True) -> C2f:
+    """C2f block with a chain of bottlenecks."""
     hidden = outputs // 2
     return C2f(inputs, outputs, hidden, [Bottleneck(hidden, hidden, shortcut) for _ in range(depth)])

@@ -1,4 +1,4 @@
-"""Reading of checkpoints: tensors come out, nothing in the file ever runs."""
+"""Reading of ``.pt`` weights: tensors are returned, no code of the file is executed."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import torch
 from torch import nn
 
 from v3d_torch.errors import WeightsError
-from v3d_torch.segmentation.pt_file import read_checkpoint
+from v3d_torch.segmentation.pt_weights import read_pt_weights
 from v3d_torch.segmentation.weights import sha256_of
 
 
 class Malicious:
-    """Runs a command when it is unpickled by a loader that allows it."""
+    """Object that creates a folder when a loader without restrictions unpickles it."""
 
     def __init__(self, victim: Path) -> None:
         self.victim = victim
@@ -30,22 +30,22 @@ class Malicious:
 
 @pytest.fixture
 def malicious(tmp_path: Path) -> tuple[Path, Path]:
-    """A checkpoint that makes a folder when it is loaded carelessly, and that folder."""
+    """File that creates a folder when it is loaded without restrictions, and that folder."""
     path, victim = tmp_path / "malicious.pt", tmp_path / "victim"
     torch.save({"model": Malicious(victim)}, path)
     return path, victim
 
 
-def test_the_malicious_file_would_work_on_a_careless_loader(malicious: tuple[Path, Path]) -> None:
+def test_malicious_file_is_effective_without_restrictions(malicious: tuple[Path, Path]) -> None:
     path, victim = malicious
     torch.load(path, weights_only=False)
     assert victim.is_dir()
 
 
-def test_unknown_names_are_refused_even_with_the_right_checksum(malicious: tuple[Path, Path]) -> None:
+def test_names_that_are_not_allowed_are_rejected_despite_correct_checksum(malicious: tuple[Path, Path]) -> None:
     path, victim = malicious
-    with pytest.raises(WeightsError, match=r"malicious\.pt.*safely"):
-        read_checkpoint(path, sha256_of(path))
+    with pytest.raises(WeightsError, match=r"malicious\.pt: cannot be read safely"):
+        read_pt_weights(path, sha256_of(path))
     assert not victim.exists()
 
 
@@ -58,29 +58,31 @@ def test_unknown_names_are_refused_even_with_the_right_checksum(malicious: tuple
         b"",
     ],
 )
-def test_bare_pickles_and_rubbish_are_refused(tmp_path: Path, content: bytes) -> None:
-    path, victim = tmp_path / "rubbish.pt", tmp_path / "victim"
+def test_other_pickles_and_arbitrary_bytes_are_rejected(tmp_path: Path, content: bytes) -> None:
+    path, victim = tmp_path / "invalid.pt", tmp_path / "victim"
     path.write_bytes(content.replace(b"{victim}", str(victim).encode()))
-    with pytest.raises(WeightsError, match=r"rubbish\.pt"):
-        read_checkpoint(path, sha256_of(path))
+    with pytest.raises(WeightsError, match=r"invalid\.pt"):
+        read_pt_weights(path, sha256_of(path))
     assert not victim.exists()
 
 
-def test_the_checksum_is_compared_before_anything_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checksum_is_verified_before_unpickling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "other.pt"
     torch.save({}, path)
 
     def never(*_: Any, **__: Any) -> None:
-        raise AssertionError("opened before the checksum was known")
+        raise AssertionError("unpickled before the checksum was verified")
 
     monkeypatch.setattr(torch, "load", never)
     monkeypatch.setattr(pickle, "Unpickler", never)
     with pytest.raises(WeightsError, match="checksum"):
-        read_checkpoint(path, "0" * 64)
+        read_pt_weights(path, "0" * 64)
 
 
-def test_foreign_modules_give_their_tensors_and_stay_inert(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tree of classes that exist only while it is written, as on the machine where a network was trained."""
+def test_tensors_of_unavailable_classes_are_read_without_their_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The module classes exist only while the file is written, as on the computer on which a network was trained."""
     foreign = ModuleType("ultralytics.nn.modules.conv")
 
     class Conv(nn.Module):
@@ -104,14 +106,14 @@ def test_foreign_modules_give_their_tensors_and_stay_inert(tmp_path: Path, monke
     monkeypatch.undo()
     assert foreign.__name__ not in sys.modules
 
-    tensors = read_checkpoint(path, sha256_of(path))
+    tensors = read_pt_weights(path, sha256_of(path))
     assert tensors.keys() == expected.keys()
     assert all(torch.equal(tensors[name], tensor) for name, tensor in expected.items())
     assert foreign.__name__ not in sys.modules
 
 
-def test_a_file_without_a_model_is_refused(tmp_path: Path) -> None:
+def test_file_without_a_model_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "empty.pt"
     torch.save({"epoch": 3}, path)
     with pytest.raises(WeightsError, match="safely"):
-        read_checkpoint(path, sha256_of(path))
+        read_pt_weights(path, sha256_of(path))

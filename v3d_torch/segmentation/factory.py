@@ -1,0 +1,64 @@
+"""Construction of the segmenter that a configuration selects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from v3d_torch.config import SegmentationConfig
+from v3d_torch.errors import ConfigError
+from v3d_torch.segmentation.mask_files import MaskFolder
+from v3d_torch.segmentation.upright import UprightSegmenter
+from v3d_torch.segmentation.yolo import YOLOSegmenter
+from v3d_torch.types import Instances, RGBDFrame, Segmenter
+
+
+class NoSegmentation:
+    """Segmenter that never finds an instance: the baseline without masks."""
+
+    def __call__(self, frame: RGBDFrame) -> Instances:
+        """Return an empty set of instances of the frame's size."""
+        return Instances.empty(*frame.image.shape[1:])
+
+
+def make_segmenter(config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None) -> Segmenter:
+    """Create the segmenter for one run, with upright images for the network if configured.
+
+    Use a new one for each run: `UprightSegmenter` accumulates votes over the frames of a run. Arguments and errors are
+    those of `make_instance_source`.
+    """
+    return keep_upright(make_instance_source(config, weights, masks_dir), config)
+
+
+def keep_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
+    """Wrap a network in `UprightSegmenter` if configured; return any other source unchanged."""
+    return UprightSegmenter(source) if config.upright and config.source == "yolo" else source
+
+
+def make_instance_source(
+    config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None
+) -> Segmenter:
+    """Create the source of instances, which segments each image independently of all others.
+
+    Args:
+        config: Configuration of the segmentation; ``config.source`` selects the kind of source.
+        weights: Weights of the network, see `YOLOSegmenter`; allowed only if the source is the network.
+        masks_dir: Folder of id images, see `MaskFolder`; required if masks are the source, else not allowed.
+
+    Raises:
+        ConfigError: If ``weights`` or ``masks_dir`` does not fit the source, or the folder of masks is not given.
+        WeightsError: If the weights of the network are not available.
+        InputError: If the folder contains no masks.
+    """
+    for option, value, source in (("weights", weights, "yolo"), ("masks", masks_dir, "masks")):
+        if value is not None and config.source != source:
+            raise ConfigError(
+                f"--{option} {value}: not used with segmentation.source={config.source}; remove it, or add"
+                f" --segmenter {source}"
+            )
+    if config.source == "none":
+        return NoSegmentation()
+    if config.source == "masks":
+        if masks_dir is None:
+            raise ConfigError("segmentation.source=masks: the folder of the id images is missing; name it with --masks")
+        return MaskFolder(masks_dir)
+    return YOLOSegmenter(config, weights)
