@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from v3d_torch.features.orb import Features
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
 PREFETCHED_FRAMES = 4

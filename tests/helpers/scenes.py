@@ -23,9 +23,10 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.feature_support import FeatureSupport
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionClassifier, MotionState, TrackedObject
+from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.unlabelled import unlabelled_instances
 from v3d_torch.types import Instances
 

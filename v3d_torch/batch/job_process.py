@@ -8,7 +8,7 @@ from collections.abc import Callable
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
 from v3d_torch.runs.logged_run import log_to, run_logged
 from v3d_torch.runs.request import RunRequest

@@ -23,7 +23,7 @@ from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import GroundTruthWarning, InputError, OutputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.mapping.map_io import StoredMap
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.logged_run import describe_motion, log_to, run_logged

@@ -19,7 +19,7 @@ from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.static_views import StaticView
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionState, TrackedObject
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline, RunRecord, Snapshot
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.state import CLASSES, OF_SLAM, State, gather, put_back, refresh

@@ -11,7 +11,7 @@ from v3d_torch.errors import ConfigError, ViewerError
 from v3d_torch.types import RGBDFrame
 
 if TYPE_CHECKING:
-    from v3d_torch.objects.motion_classifier import FrameObjects
+    from v3d_torch.objects.frame_objects import FrameObjects
     from v3d_torch.slam import V3DSLAM
 
 
