@@ -21,7 +21,7 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import NumericsError
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
-from v3d_torch.objects.free_space_check import NewlyOccupied
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.runs.logged_run import run_logged
 from v3d_torch.runs.numerics_check import STAGES, CheckedSLAM, CheckedStage, check_finite
 from v3d_torch.runs.state import OF_SLAM, gather, put_back, refresh

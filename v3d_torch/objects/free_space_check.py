@@ -23,6 +23,7 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 
 _POSE_ERROR = 0.01
 """Reprojection error of a view's pose, as a fraction of the image width: 0.6 degrees of a Kinect's field of view."""
@@ -149,45 +150,6 @@ def vacated_fractions(
     zeros = free.new_zeros(len(clouds))
     known = zeros.index_add(0, owner, (~free.isnan()).to(free.dtype))
     return (zeros.index_add(0, owner, free.nan_to_num()) / known).masked_fill(known < config.min_points, torch.nan)
-
-
-@dataclass(frozen=True)
-class NewlyOccupied:
-    """Pixels whose point lies in space that earlier views observed as free.
-
-    Attributes:
-        appeared: For each of B baselines, 1 if the space was free, 0 if it was occupied, NaN if unknown; float64, every
-            ``stride``-th pixel, shape :math:`(B, h, w)`.
-        stride: Step between the pixels, pixels.
-    """
-
-    appeared: Tensor
-    stride: int
-
-    @property
-    def previously_occupied(self) -> Tensor:
-        """Pixels whose space was occupied over at least one baseline and free over none, bool, shape :math:`(h, w)`."""
-        return (self.appeared == 0).any(dim=0) & ~(self.appeared == 1).any(dim=0)
-
-    def fractions(self, masks: Sequence[Tensor], min_pixels: int) -> Tensor:
-        """Return the fraction of each object's pixels that appeared.
-
-        Args:
-            masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
-            min_pixels: Minimum number of known pixels of an object.
-
-        Returns:
-            Fraction for each object and baseline, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
-        """
-        step, appeared = self.stride, self.appeared.flatten(1)
-        if not masks:
-            return appeared.new_zeros(0, len(appeared))
-        inside = np.stack([mask.numpy()[::step, ::step] for mask in masks]).reshape(len(masks), -1)
-        # float32 counts pixels exactly and is faster.
-        indicators = torch.cat([appeared == 1, ~appeared.isnan()]).to(torch.float32)
-        counts = torch.from_numpy(inside.astype(np.float32)) @ indicators.T
-        new, known = counts.to(appeared.dtype).chunk(2, dim=1)
-        return (new / known).masked_fill(known < min_pixels, torch.nan)
 
 
 class FreeSpaceCheck:

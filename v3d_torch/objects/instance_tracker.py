@@ -86,9 +86,8 @@ class InstanceTracker(torch.nn.Module):
         # Predict each track, and check whether the object is visible there.
         predicted = self._predict_silhouettes(stamp, T_wc)
         predicted_masks = [self._predict_mask(silhouette, depth, step) for silhouette in predicted.values()]
-        predicted_coarse = dict(
-            zip(predicted, _flatten(torch.stack(predicted_masks)) if predicted else (), strict=True)
-        )
+        rows = _flatten(torch.stack(predicted_masks)) if predicted_masks else ()
+        predicted_coarse = dict(zip(predicted, rows, strict=True))
         visible = torch.tensor(
             [s.visible_fraction(depth, _DEPTH_TOLERANCE) > _MIN_VISIBLE_FRACTION for s in predicted.values()]
         )

@@ -1,8 +1,8 @@
 """Mask refinement: pixels of an object beyond the mask of the network.
 
 A network draws coarse contours, and of a person who is partly in the image it often segments the head and misses an
-arm. Depth corrects both. The rim of a mask belongs to the object if its depth agrees with the object's points. A surface
-that continues from there without a depth edge also belongs to the object, unless it was there before.
+arm. Depth corrects both. The rim of a mask belongs to the object if its depth agrees with the object's points. A
+surface that continues from there without a depth edge also belongs to the object, unless it was there before.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView, NewlyOccupied
+from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.mask_ops import dilate, upsample_nearest
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
 from v3d_torch.objects.track import Track
 

@@ -13,7 +13,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
-from v3d_torch.objects.free_space_check import DepthView, NewlyOccupied
+from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
 from v3d_torch.objects.motion_evidence import (
@@ -23,6 +23,7 @@ from v3d_torch.objects.motion_evidence import (
     free_space_evidence,
     hough_vote_evidence,
 )
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.track import Track
 from v3d_torch.segmentation.coco import LIVING, PERSON, THINGS
@@ -33,8 +34,8 @@ _STATIC_FRACTION = 0.1
 hundredths of an object."""
 
 _MIN_MISSED_SCORE = 0.3
-"""A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones or
-one strong one: the network labels rotated furniture as people in single frames."""
+"""A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones
+or one strong one: the network labels rotated furniture as people in single frames."""
 
 
 class MotionClassifier:

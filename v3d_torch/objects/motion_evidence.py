@@ -12,8 +12,9 @@ import torch
 
 from v3d_torch.config import ChamferConfig, FreeSpaceConfig, VotingConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView, NewlyOccupied, vacated_fractions
+from v3d_torch.objects.free_space_check import DepthView, vacated_fractions
 from v3d_torch.objects.intra_object_motion import intra_object_motion
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.objects.voting import vote_with_free_space
 
@@ -22,8 +23,8 @@ MOVED_FRACTION = 0.5
 occlusion affect only a part of a static object."""
 
 DEFORMED_FRACTION = 0.1
-"""An object has deformed if at least this fraction of its visible points appeared or vacated. Silhouettes err by a pixel
-or two, which is some hundredths of a person; a torso of 0.4 m that sways by 4 cm reaches this fraction."""
+"""An object has deformed if at least this fraction of its visible points appeared or vacated. Silhouettes err by a
+pixel or two, which is some hundredths of a person; a torso of 0.4 m that sways by 4 cm reaches this fraction."""
 
 DetectionPairs = dict[Track, tuple[Detection3D, Detection3D]]
 """Earlier and newest detection of each object that has both."""

@@ -18,8 +18,8 @@ _CENTROID_SIGMA = 0.05
 mask contour is smaller."""
 
 _PARTIAL_SIGMA = 0.45
-"""Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to the
-hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
+"""Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
+the hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
 
 _HISTORY = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import NewlyOccupied
 from v3d_torch.objects.mask_ops import upsample_nearest
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from v3d_torch.config import VotingConfig
 
 _STATIC_VOTER_RATIO = 0.5
-"""Beside the free-space check, an object votes only if its own centroid moved by less than this fraction of the distance
-threshold. Then at least half of every change that counts as a vote is motion of the other object."""
+"""Beside the free-space check, an object votes only if its own centroid moved by less than this fraction of the
+distance threshold. Then at least half of every change that counts as a vote is motion of the other object."""
 
 
 class Votes(NamedTuple):
@@ -21,8 +21,8 @@ class Votes(NamedTuple):
     Attributes:
         votes: Number of votes for each object, :math:`V(O_i) = \sum_j I_{ij}`, dtype of the centroids, shape
             :math:`(..., K)`.
-        pair: Indicator :math:`I_{ij}`, the vote of object j for object i, shape :math:`(..., K, K)`; symmetric, 0 on the
-            diagonal and for objects that are not present.
+        pair: Indicator :math:`I_{ij}`, the vote of object j for object i, shape :math:`(..., K, K)`; symmetric, 0 on
+            the diagonal and for objects that are not present.
         change: Absolute change of the distance between objects i and j, metres, shape :math:`(..., K, K)`; 0 on the
             diagonal and for objects that are not present.
         dynamic: Objects with enough votes, bool, shape :math:`(..., K)`.
@@ -59,8 +59,8 @@ def hough_vote(
             :math:`\sigma((change - T_d) / temperature)`. None for the step function of the paper.
 
     Returns:
-        Votes. ``change`` is differentiable in both centroids. With a temperature, ``pair`` and ``votes`` are so too, and
-        also in threshold and temperature if these are tensors.
+        Votes. ``change`` is differentiable in both centroids. With a temperature, ``pair`` and ``votes`` are
+        differentiable too, also in threshold and temperature if these are tensors.
     """
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
