@@ -373,7 +373,7 @@ def test_missed_object_is_predicted_with_its_mask_and_then_removed(rate: float) 
     gap = 0
     while True:
         gap += 1
-        hidden = Board(-0.5 + step * (frames + gap - 1), 2.0, observed=False)
+        hidden = Board(-0.5 + step * (frames + gap - 1), 2.0, detected=False)
         tracks = track_boards(hidden, Board(-1.4, 3.0, label=CHAIR))
         missed = [track for track in tracks if track.missed]
         if not missed:
