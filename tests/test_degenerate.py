@@ -29,7 +29,7 @@ from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.chamfer import chamfer_distance
 from v3d_torch.objects.dbscan import dbscan
-from v3d_torch.objects.deformation import intra_object_motion
+from v3d_torch.objects.intra_object_motion import intra_object_motion
 from v3d_torch.objects.voting import hough_vote
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.optim.pose_refinement import refine_pose

@@ -13,10 +13,10 @@ from .mapping.static_views import StaticViews
 from .objects.assignment import match_instances
 from .objects.chamfer import ChamferDistance, chamfer_distance
 from .objects.dbscan import DBSCAN, dbscan
-from .objects.deformation import Deformation, IntraObjectMotion, intra_object_motion
+from .objects.frame_objects import MotionState, TrackedObject
 from .objects.instance_tracker import InstanceTracker
+from .objects.intra_object_motion import Deformation, IntraObjectMotion, intra_object_motion
 from .objects.largest_clusters import LargestClusters, largest_clusters
-from .objects.motion_classifier import MotionState, TrackedObject
 from .objects.voting import HoughVoting, Votes, hough_vote
 from .reconstruction.mesh import Mesh, fuse_mesh
 from .reconstruction.point_map import PointMap, fuse_points

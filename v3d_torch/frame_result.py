@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from v3d_torch.features.features import Features
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
 

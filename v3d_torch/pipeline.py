@@ -21,7 +21,7 @@ from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.mapping.static_views import StaticViews
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionState, TrackedObject
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
 from v3d_torch.runtime.process import trim_memory
 from v3d_torch.segmentation.coco import class_name

@@ -18,7 +18,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.features.features import Features
-from v3d_torch.frame_result import PREFETCHED_FRAMES
+from v3d_torch.slam import PREFETCHED_FRAMES
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Loop
 from v3d_torch.mapping.map_columns import to_columns

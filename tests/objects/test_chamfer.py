@@ -20,13 +20,13 @@ DTYPES = [torch.float32, torch.float64]
 
 
 def matrix_reference(p: Tensor, q: Tensor) -> Tensor:
-    """The paper's equation with every distance written out."""
+    """Return the paper's equation with a full distance matrix."""
     squares = (p[:, None] - q[None]).square().sum(dim=-1)
     return squares.amin(dim=1).mean() + squares.amin(dim=0).mean()
 
 
 def random_pair(batch: int, n: int, m: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-    """Clouds of an object 3 m away, where float32 matrix products lose the digits of squared distances."""
+    """Return clouds of an object 3 m offset: float32 matrix products lose the digits of squared distances there."""
     generator = torch.Generator().manual_seed(n + m)
     offset = torch.tensor([0.0, 0.0, 3.0], dtype=dtype)
     p = torch.rand(batch, n, 3, generator=generator, dtype=dtype) + offset
@@ -35,7 +35,7 @@ def random_pair(batch: int, n: int, m: int, dtype: torch.dtype = torch.float64) 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (1, 40), (300, 200)])
-def test_equals_the_equation(n: int, m: int, dtype: torch.dtype) -> None:
+def test_chamfer_distance_equals_the_equation(n: int, m: int, dtype: torch.dtype) -> None:
     p, q = random_pair(3, n, m, dtype)
     distance = chamfer_distance(p, q)
     assert distance.dtype == dtype
@@ -53,28 +53,30 @@ SHAPES = {"box": (1.0, 1.0, 1.0), "sheet": (1.0, 2.0, 0.01), "line": (1.0, 0.0, 
     m=st.integers(1, 20_000),
     shape=st.sampled_from(sorted(SHAPES)),
     cells=st.sampled_from([0, 30]),
-    away=st.sampled_from([0.0, 3.0, 1000.0]),
+    offset=st.sampled_from([0.0, 3.0, 1000.0]),
     dtype=st.sampled_from(DTYPES),
 )
-@example(seed=0, n=20_000, m=15_000, shape="sheet", cells=0, away=3.0, dtype=torch.float32)
-def test_equals_a_kd_tree(seed: int, n: int, m: int, shape: str, cells: int, away: float, dtype: torch.dtype) -> None:
+@example(seed=0, n=20_000, m=15_000, shape="sheet", cells=0, offset=3.0, dtype=torch.float32)
+def test_chamfer_distance_equals_kd_tree(
+    seed: int, n: int, m: int, shape: str, cells: int, offset: float, dtype: torch.dtype
+) -> None:
     generator = np.random.default_rng(seed)
     p, q = (generator.random((count, 3)) * SHAPES[shape] for count in (n, m))
-    if cells:  # on a lattice many points coincide, and many are equally near
+    if cells:  # on a lattice, many points coincide and many distances are equal
         p, q = np.round(p * cells) / cells, np.round(q * cells) / cells
-    p, q = (torch.from_numpy(cloud + away)[None].to(dtype) for cloud in (p, q))
+    p, q = (torch.from_numpy(cloud + offset)[None].to(dtype) for cloud in (p, q))
     a, b = p[0].double().numpy(), q[0].double().numpy()
     expected = sum(np.square(KDTree(y).query(x)[0]).mean() for x, y in [(a, b), (b, a)])
     assert chamfer_distance(p, q).item() == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-def test_far_from_the_origin_float64_keeps_its_digits() -> None:
+def test_float64_far_from_the_origin_keeps_its_digits() -> None:
     p, q = random_pair(2, 300, 200)
     torch.testing.assert_close(chamfer_distance(p + 1e6, q + 1e6), chamfer_distance(p, q), rtol=1e-6, atol=0.0)
 
 
-def test_clouds_of_a_batch_may_lie_far_from_each_other() -> None:
-    """Each pair is seen from itself: from another's place its points would be one in float32."""
+def test_clouds_of_a_batch_far_from_each_other_keep_their_digits() -> None:
+    """Each pair has its own origin: relative to another pair its points would be equal in float32."""
     p, q = random_pair(3, 200, 150)
     offsets = torch.tensor([0.0, 1e6, -3e6], dtype=torch.float64)[:, None, None]
     torch.testing.assert_close(chamfer_distance(p + offsets, q + offsets), chamfer_distance(p, q), rtol=1e-5, atol=0)
@@ -84,7 +86,7 @@ def test_memory_is_linear() -> None:
     status = Path("/proc/self/status")
     p, q = random_pair(1, 20_000, 15_000, torch.float32)
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+        Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     except OSError:
         pytest.skip("the peak of memory can be reset on Linux only")
 
@@ -101,7 +103,9 @@ def test_memory_is_linear() -> None:
     p=st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=1, max_size=80),
     q=st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=1, max_size=80),
 )
-def test_any_clouds(p: list[tuple[int, int, int]], q: list[tuple[int, int, int]]) -> None:
+def test_chamfer_distance_of_random_clouds_is_symmetric_and_exact(
+    p: list[tuple[int, int, int]], q: list[tuple[int, int, int]]
+) -> None:
     clouds = [torch.tensor(cloud, dtype=torch.float64)[None] for cloud in (p, q)]
     distance = chamfer_distance(*clouds)
     torch.testing.assert_close(distance[0], matrix_reference(clouds[0][0], clouds[1][0]))
@@ -116,7 +120,7 @@ def test_convention_sum_of_mean_squares() -> None:
     assert chamfer_distance(p, q).tolist() == [8.5]
 
 
-def test_padding_does_not_matter() -> None:
+def test_padding_does_not_change_the_distance() -> None:
     p, q = random_pair(4, 60, 50)
     generator = torch.Generator().manual_seed(1)
     p_valid = torch.rand(4, 60, generator=generator) < 0.6
@@ -127,7 +131,7 @@ def test_padding_does_not_matter() -> None:
         torch.testing.assert_close(distance[b], matrix_reference(p[b, p_valid[b]], q[b, q_valid[b]]))
 
 
-def test_empty_is_undefined_and_leaves_gradients_alone() -> None:
+def test_empty_cloud_gives_nan_and_finite_gradients_elsewhere() -> None:
     p, q = (cloud.requires_grad_() for cloud in random_pair(3, 6, 5))
     q_valid = torch.ones(3, 5, dtype=torch.bool)
     q_valid[1] = False
@@ -149,7 +153,7 @@ def test_gradcheck() -> None:
     assert torch.autograd.gradcheck(lambda p, q: chamfer_distance(p, q, p_valid), (p, q))
 
 
-def test_order_of_points_does_not_matter_and_runs_repeat() -> None:
+def test_distance_is_repeatable_and_independent_of_point_order() -> None:
     p, q = random_pair(2, 400, 300, torch.float32)
     shuffled = torch.randperm(400, generator=torch.Generator().manual_seed(2))
     distance = chamfer_distance(p, q)
@@ -157,7 +161,7 @@ def test_order_of_points_does_not_matter_and_runs_repeat() -> None:
     torch.testing.assert_close(distance, chamfer_distance(p[:, shuffled], q))
 
 
-def test_threads_change_no_byte() -> None:
+def test_number_of_threads_does_not_change_the_distance() -> None:
     p, q = random_pair(3, 4000, 3000)
     threads = torch.get_num_threads()
     distances = []
@@ -171,10 +175,10 @@ def test_threads_change_no_byte() -> None:
 
 
 @pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e30])
-def test_refuses_points_that_are_not_finite(bad: float) -> None:
+def test_non_finite_points_are_rejected(bad: float) -> None:
     p, q = random_pair(1, 4, 4)
     q[0, 1, 0] = bad
-    message = r"^A point of a cloud to be compared is not finite; mark points without depth as not valid\.$"
+    message = r"^chamfer_distance: a valid point is not finite; mark points without depth as invalid$"
     with pytest.raises(InputError, match=message):
         chamfer_distance(p, q)
 
@@ -186,7 +190,7 @@ def test_refuses_points_that_are_not_finite(bad: float) -> None:
         *[((4, 3), (5, 3), None, None), ((2, 4, 3), (2, 5, 3), (2, 3), None), ((2, 4, 3), (2, 5, 3), None, (1, 5))],
     ],
 )
-def test_refuses_other_shapes(
+def test_wrong_shapes_are_rejected(
     p: tuple[int, ...], q: tuple[int, ...], p_valid: tuple[int, ...] | None, q_valid: tuple[int, ...] | None
 ) -> None:
     valid = [None if shape is None else torch.ones(shape, dtype=torch.bool) for shape in (p_valid, q_valid)]
@@ -194,7 +198,7 @@ def test_refuses_other_shapes(
         chamfer_distance(torch.zeros(p), torch.zeros(q), *valid)
 
 
-def test_the_module_looks_at_both_masks() -> None:
+def test_module_uses_both_masks() -> None:
     p, q = random_pair(2, 6, 5)
     masks = torch.arange(6) < torch.tensor([[4], [6]]), torch.arange(5) < torch.tensor([[5], [2]])
     for p_valid in (masks[0], None):

@@ -1,4 +1,4 @@
-"""The features' word: an object whose features fit the camera's motion as well as the rest's stands still."""
+"""Feature support: objects whose features fit the camera motion as well as the features outside."""
 
 from __future__ import annotations
 
@@ -14,57 +14,59 @@ HEIGHT, WIDTH = 40, 60
 
 
 def scene(fitting: float, outside: float = 0.5, count: int = 100) -> tuple[FeatureSupport, Tensor]:
-    """So many features on the left half, an object, and on the right; of each half a share fits."""
+    """Return features and the mask of an object, the left half; a given fraction of either half fits the motion."""
     generator = torch.Generator().manual_seed(0)
     rows = torch.randint(0, HEIGHT, (2 * count,), generator=generator)
     columns = torch.randint(0, WIDTH // 2, (2 * count,), generator=generator)
     columns[count:] += WIDTH // 2
-    fits = torch.zeros(2 * count, dtype=torch.bool)
-    fits[: round(fitting * count)] = True
-    fits[count : count + round(outside * count)] = True
+    inlier = torch.zeros(2 * count, dtype=torch.bool)
+    inlier[: round(fitting * count)] = True
+    inlier[count : count + round(outside * count)] = True
     mask = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, :, : WIDTH // 2] = True
-    return FeatureSupport(torch.stack([columns, rows], dim=1), fits), mask
+    return FeatureSupport(torch.stack([columns, rows], dim=1), inlier), mask
 
 
-@pytest.mark.parametrize(("fitting", "vouched"), [(0.5, True), (0.25, True), (0.24, False), (0.0, False), (1.0, True)])
-def test_half_as_many_as_elsewhere_are_enough(fitting: float, vouched: bool) -> None:
-    witnesses, mask = scene(fitting)
-    assert witnesses.supports(mask, 0.5, 10).tolist() == [vouched]
+@pytest.mark.parametrize(
+    ("fitting", "supported"), [(0.5, True), (0.25, True), (0.24, False), (0.0, False), (1.0, True)]
+)
+def test_object_with_half_the_outside_inlier_ratio_is_supported(fitting: float, supported: bool) -> None:
+    support, mask = scene(fitting)
+    assert support.supports(mask, 0.5, 10).tolist() == [supported]
 
 
-@pytest.mark.parametrize(("count", "vouched"), [(9, False), (10, True)])
-def test_too_few_vouch_for_nobody(count: int, vouched: bool) -> None:
-    witnesses, mask = scene(1.0, count=count)
-    assert witnesses.supports(mask, 0.5, 10).tolist() == [vouched]
+@pytest.mark.parametrize(("count", "supported"), [(9, False), (10, True)])
+def test_too_few_inliers_support_no_object(count: int, supported: bool) -> None:
+    support, mask = scene(1.0, count=count)
+    assert support.supports(mask, 0.5, 10).tolist() == [supported]
 
 
-def test_an_object_over_the_whole_image_has_nothing_to_compare_with() -> None:
-    """What fits then fits a motion that is the object's own: by the number alone."""
-    witnesses, _ = scene(0.5)
+def test_object_over_the_whole_image_is_supported_by_the_number_of_inliers() -> None:
+    """Without features outside of the object, only the number of inliers decides."""
+    support, _ = scene(0.5)
     everything = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
-    assert witnesses.supports(everything, 0.5, 10).tolist() == [True]
+    assert support.supports(everything, 0.5, 10).tolist() == [True]
 
 
-def test_no_features_and_no_objects() -> None:
-    nobody = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
-    assert nobody.supports(torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).tolist() == [False, False]
-    witnesses, _ = scene(0.5)
-    assert witnesses.supports(torch.zeros(0, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).shape == (0,)
+def test_no_features_and_no_objects_are_accepted() -> None:
+    no_features = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
+    assert no_features.supports(torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).tolist() == [False, False]
+    support, _ = scene(0.5)
+    assert support.supports(torch.zeros(0, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).shape == (0,)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 4), st.floats(0.1, 1.0), st.integers(1, 8))
-def test_same_as_counting_one_by_one(seed: int, objects: int, share: float, least: int) -> None:
+def test_support_equals_counting_one_by_one(seed: int, objects: int, min_ratio: float, min_inliers: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     masks = torch.rand(objects, HEIGHT, WIDTH, generator=generator) > 0.7
     pixel = torch.stack([torch.randint(0, n, (60,), generator=generator) for n in (WIDTH, HEIGHT)], dim=1)
-    fits = torch.rand(60, generator=generator) > 0.5
-    told = FeatureSupport(pixel, fits).supports(masks, share, least)
-    elsewhere = [bool(f) for (u, v), f in zip(pixel.tolist(), fits, strict=True) if not masks[:, v, u].any()]
-    usual = sum(elsewhere) / max(len(elsewhere), 1)
-    for mask, vouched in zip(masks, told.tolist(), strict=True):
-        there = [bool(f) for (u, v), f in zip(pixel.tolist(), fits, strict=True) if mask[v, u]]
-        margin = sum(there) - share * usual * len(there)
+    inlier = torch.rand(60, generator=generator) > 0.5
+    supported_objects = FeatureSupport(pixel, inlier).supports(masks, min_ratio, min_inliers)
+    outside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if not masks[:, v, u].any()]
+    outside_ratio = sum(outside) / max(len(outside), 1)
+    for mask, supported in zip(masks, supported_objects.tolist(), strict=True):
+        inside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if mask[v, u]]
+        margin = sum(inside) - min_ratio * outside_ratio * len(inside)
         if abs(margin) > 1e-4:
-            assert vouched == (sum(there) >= least and margin > 0)
+            assert supported == (sum(inside) >= min_inliers and margin > 0)

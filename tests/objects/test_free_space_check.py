@@ -1,4 +1,4 @@
-"""The background's word: what of an object is looked through, what came where nothing was, what cannot be told."""
+"""Free-space check: vacated points, newly occupied pixels, and unknown ones."""
 
 from __future__ import annotations
 
@@ -18,228 +18,232 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.objects import free_space_check as module
 from v3d_torch.objects.free_space_check import (
     DepthView,
     FreeSpaceCheck,
-    NewlyOccupied,
     is_free_space,
     vacated_fractions,
 )
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 CONFIG = FreeSpaceConfig()
 WALL, OBJECT = 4.0, 2.0
-RIM = 2  # 1 % of 160 pixels: so near to something seen at its depth or before it, a place is not looked through
+RIM = 2  # 1 % of 160 pixels: this near to something at its depth or before it, a position is not free
 HERE = torch.eye(4, dtype=torch.float64)
 TWISTS = st.tuples(*[st.floats(-2.0, 2.0)] * 3, *[st.floats(-1.5, 1.5)] * 3)
 
 
 @pytest.fixture(autouse=True)
 def every_fourth_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As with a camera of the usual size."""
-    monkeypatch.setattr(FreeSpaceCheck, "_ROW", CAMERA.width // 4)
+    """Check every 4th pixel, as with a camera of the usual size."""
+    monkeypatch.setattr(module, "_COLUMNS", CAMERA.width // 4)
 
 
 def surface(columns: tuple[int, int], rows: tuple[int, int] = (40, 80), z: float = OBJECT) -> Tensor:
-    """Points of a board parallel to the image, one per pixel, (P, 3): columns and rows end before the second number."""
+    """Return points of a board parallel to the image, one per pixel, (P, 3); columns and rows are half-open."""
     return z * CAMERA.rays[rows[0] : rows[1], columns[0] : columns[1]].reshape(-1, 3)
 
 
 def view(*boards: tuple[tuple[int, int], float], wall: float = WALL, T_wc: Tensor = HERE, at: float = 0.0) -> DepthView:
-    """Boards, each (columns, depth), before a wall; the later ones are painted over the earlier."""
+    """Return a view of boards, each (columns, depth), in front of a wall; later boards cover earlier ones."""
     depth = torch.full((1, CAMERA.height, CAMERA.width), wall)
     for (left, right), z in boards:
         depth[0, 40:80, left:right] = z
     return DepthView(at, depth, invert(T_wc))
 
 
-def share(cloud: Tensor, seen: DepthView, **config: float) -> float:
-    return float(vacated_fractions([cloud], seen, CAMERA, FreeSpaceConfig(**config))[0])
+def vacated_fraction(cloud: Tensor, observed: DepthView, **config: float) -> float:
+    return float(vacated_fractions([cloud], observed, CAMERA, FreeSpaceConfig(**config))[0])
 
 
-# ---------------------------------------------------------------- what is looked through
+# ---------------------------------------------------------------- vacated points
 
 
 @pytest.mark.parametrize(("height", "width", "side"), [(120, 160, 5), (48, 64, 3), (20, 30, 1), (480, 640, 13)])
-def test_nearest_is_the_least_measured_depth_around(height: int, width: int, side: int) -> None:
+def test_nearest_depth_is_the_minimum_measured_depth_around(height: int, width: int, side: int) -> None:
     depth = torch.rand(1, height, width, generator=torch.Generator().manual_seed(0)) + 0.5
     depth[depth < 0.7] = 0.0
     measured = np.where(depth[0] > 0, depth[0], np.inf)
     expected = np.where(depth[0] > 0, minimum_filter(measured, side, mode="constant", cval=np.inf), 0.0)
-    assert torch.equal(DepthView(0.0, depth, HERE).nearest, torch.from_numpy(expected.astype(np.float32)))
+    assert torch.equal(DepthView(0.0, depth, HERE).nearest_depth, torch.from_numpy(expected.astype(np.float32)))
 
 
 def turned(degrees: float) -> Tensor:
-    """World to a camera that is turned to the right."""
+    """Return the world-to-camera pose of a camera that is turned to the right."""
     return se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, -math.radians(degrees), 0.0], dtype=torch.float64))
 
 
-def test_the_faster_the_camera_turns_the_farther_a_place_may_be_off() -> None:
-    """3 degrees in 0.1 s: in the 0.02 s between colour and depth 0.6 degrees, times the focal length in pixels."""
+def test_misalignment_grows_with_the_rotation_rate() -> None:
+    """3 degrees in 0.1 s are 0.6 degrees in the 0.02 s between colour and depth, times the focal length in pixels."""
     depth = torch.full((1, CAMERA.height, CAMERA.width), WALL)
-    watching = FreeSpaceCheck(FreeSpaceConfig(depth_sync_error=0.02), CAMERA)
-    assert watching.make_view(0.0, depth, HERE).shift == 0  # nothing to measure a turn by
-    watching.remember(view())
-    assert watching.make_view(0.1, depth, HERE).shift == 0
-    assert watching.make_view(0.1, depth, turned(3.0)).shift == round(math.radians(0.6) * CAMERA.fx)
-    assert watching.make_view(0.1, depth, turned(60.0)).shift == round(math.radians(12.0) * CAMERA.fx)
-    assert FreeSpaceCheck(FreeSpaceConfig(depth_sync_error=0.0), CAMERA).make_view(0.1, depth, turned(60.0)).shift == 0
+    check = FreeSpaceCheck(FreeSpaceConfig(depth_sync_error=0.02), CAMERA)
+    assert check.make_view(0.0, depth, HERE).misalignment == 0  # no earlier view
+    check.remember(view())
+    assert check.make_view(0.1, depth, HERE).misalignment == 0
+    assert check.make_view(0.1, depth, turned(3.0)).misalignment == round(math.radians(0.6) * CAMERA.fx)
+    assert check.make_view(0.1, depth, turned(60.0)).misalignment == round(math.radians(12.0) * CAMERA.fx)
+    assert (
+        FreeSpaceCheck(FreeSpaceConfig(depth_sync_error=0.0), CAMERA).make_view(0.1, depth, turned(60.0)).misalignment
+        == 0
+    )
     moved = torch.eye(4, dtype=torch.float64)
     moved[0, 3] = 0.5
-    assert watching.make_view(0.1, depth, moved).shift == 0
+    assert check.make_view(0.1, depth, moved).misalignment == 0
 
 
-@pytest.mark.parametrize(("shift", "expected"), [(0, 1.0), (6, 0.0)])
-def test_a_place_beside_something_is_not_looked_through_by_a_camera_that_turns(shift: int, expected: float) -> None:
-    """The box was 5 pixels beside the place, no more than its depth may be off: nothing has left."""
-    seen = replace(view(((65, 85), OBJECT)), shift=shift)
-    assert share(surface((57, 63)), seen) == expected
+@pytest.mark.parametrize(("misalignment", "expected"), [(0, 1.0), (6, 0.0)])
+def test_misaligned_pixels_beside_a_surface_are_not_free(misalignment: int, expected: float) -> None:
+    """The box is 5 pixels beside the points, within the misalignment of its depth: nothing is vacated."""
+    observed = replace(view(((65, 85), OBJECT)), misalignment=misalignment)
+    assert vacated_fraction(surface((57, 63)), observed) == expected
 
 
-def test_all_are_still_there() -> None:
-    assert share(surface((60, 80)), view(((60, 80), OBJECT))) == 0.0
+def test_static_object_has_vacated_nothing() -> None:
+    assert vacated_fraction(surface((60, 80)), view(((60, 80), OBJECT))) == 0.0
 
 
-def test_all_have_gone() -> None:
-    assert share(surface((60, 80)), view()) == 1.0
+def test_removed_object_has_vacated_everything() -> None:
+    assert vacated_fraction(surface((60, 80)), view()) == 1.0
 
 
 @pytest.mark.parametrize("step", [0, 1, 2, 3, 5, 10, 20, 22, 30])
-def test_share_is_what_a_step_aside_uncovers_but_for_the_rim(step: int) -> None:
+def test_vacated_fraction_is_the_uncovered_part_without_the_rim(step: int) -> None:
     expected = min(max(step - RIM, 0), 20) / 20
-    assert share(surface((60, 80)), view(((60 + step, 80 + step), OBJECT))) == pytest.approx(expected)
+    assert vacated_fraction(surface((60, 80)), view(((60 + step, 80 + step), OBJECT))) == pytest.approx(expected)
 
 
-def test_hidden_points_have_no_say() -> None:
-    """Of 20 columns 3 are looked through, 5 are there or beside what is; 12 are behind something near or at its rim."""
-    seen = view(((65, 80), OBJECT), ((70, 80), 1.0))
-    told = is_free_space(surface((60, 80)).double(), seen, CAMERA, CONFIG).reshape(40, 20)
+def test_hidden_points_are_unknown() -> None:
+    """Of 20 columns 3 are free, 5 are occupied or beside something occupied, and 12 are hidden or at a rim."""
+    observed = view(((65, 80), OBJECT), ((70, 80), 1.0))
+    known = is_free_space(surface((60, 80)).double(), observed, CAMERA, CONFIG).reshape(40, 20)
     expected = torch.tensor([1.0] * 3 + [0.0] * 5 + [torch.nan] * 12, dtype=torch.float64).expand(40, 20)
-    torch.testing.assert_close(told, expected, rtol=0, atol=0, equal_nan=True)
-    assert share(surface((60, 80)), seen) == pytest.approx(3 / 8)
+    torch.testing.assert_close(known, expected, rtol=0, atol=0, equal_nan=True)
+    assert vacated_fraction(surface((60, 80)), observed) == pytest.approx(3 / 8)
 
 
-def test_an_occluder_that_hides_all_leaves_nothing_to_tell() -> None:
-    assert math.isnan(share(surface((60, 80)), view(((50, 90), 1.0))))
+def test_fully_occluded_object_is_unknown() -> None:
+    assert math.isnan(vacated_fraction(surface((60, 80)), view(((50, 90), 1.0))))
 
 
-def test_points_beside_the_image_have_no_say() -> None:
-    """The camera has moved right by 60 pixels: the left half of the board is out of its sight, 3 of 10 are gone."""
+def test_points_outside_of_the_image_are_unknown() -> None:
+    """The camera has moved right by 60 pixels: the left half of the board is invisible, 3 of 10 columns are vacated."""
     T_wc = HERE.clone()
     T_wc[0, 3] = 60 * OBJECT / CAMERA.fx
-    seen = view(((0, 5), OBJECT), T_wc=T_wc)
-    assert share(surface((50, 70)), seen) == pytest.approx(0.3)
+    observed = view(((0, 5), OBJECT), T_wc=T_wc)
+    assert vacated_fraction(surface((50, 70)), observed) == pytest.approx(0.3)
 
 
-def test_points_up_to_the_border_have_a_say() -> None:
+def test_points_at_the_image_border_are_known() -> None:
     for columns, rows in (((150, 160), (40, 80)), ((0, 10), (40, 80)), ((60, 80), (110, 120)), ((60, 80), (0, 10))):
-        assert share(surface(columns, rows), view()) == 1.0
+        assert vacated_fraction(surface(columns, rows), view()) == 1.0
 
 
-def test_points_behind_the_camera_have_no_say() -> None:
+def test_points_behind_the_camera_are_unknown() -> None:
     T_wc = HERE.clone()
     T_wc[2, 3] = OBJECT + 1.0
-    assert math.isnan(share(surface((60, 80)), view(T_wc=T_wc)))
+    assert math.isnan(vacated_fraction(surface((60, 80)), view(T_wc=T_wc)))
 
 
-def test_points_nearer_than_the_camera_can_measure_have_no_say() -> None:
+def test_points_nearer_than_min_depth_are_unknown() -> None:
     near = surface((60, 80), z=0.29)
-    assert math.isnan(share(near, view()))
-    assert share(near, view(), min_depth=0.2) == 1.0
+    assert math.isnan(vacated_fraction(near, view()))
+    assert vacated_fraction(near, view(), min_depth=0.2) == 1.0
 
 
-def test_pixels_without_depth_have_no_say() -> None:
-    seen = view(((60, 80), OBJECT))
-    seen.depth[0, 40:80, 60:70] = 0.0
-    seen.depth[0, 40:80, 70:75] = WALL
-    assert share(surface((60, 80)), seen) == pytest.approx((5 - RIM) / 10)
+def test_pixels_without_depth_are_unknown() -> None:
+    observed = view(((60, 80), OBJECT))
+    observed.depth[0, 40:80, 60:70] = 0.0
+    observed.depth[0, 40:80, 70:75] = WALL
+    assert vacated_fraction(surface((60, 80)), observed) == pytest.approx((5 - RIM) / 10)
 
 
-@pytest.mark.parametrize(("points", "told"), [(29, False), (30, True)])
-def test_fewest_points_that_tell(points: int, told: bool) -> None:
-    assert math.isnan(share(surface((60, 80))[:points], view())) is not told
+@pytest.mark.parametrize(("points", "known"), [(29, False), (30, True)])
+def test_fraction_needs_min_points(points: int, known: bool) -> None:
+    assert math.isnan(vacated_fraction(surface((60, 80))[:points], view())) is not known
 
 
-def test_no_points_tell_nothing() -> None:
-    assert math.isnan(share(torch.zeros(0, 3), view()))
+def test_empty_cloud_is_unknown() -> None:
+    assert math.isnan(vacated_fraction(torch.zeros(0, 3), view()))
 
 
 @pytest.mark.parametrize(
-    ("z", "behind", "gone"),
+    ("z", "behind", "vacated"),
     [
-        (1.0, 0.039, 0.0),  # within the 4 cm that always count as the same
+        (1.0, 0.039, 0.0),  # within the minimum tolerance of 4 cm
         (1.0, 0.041, 1.0),
-        (3.0, 0.089, 0.0),  # 1 cm times 3 squared
+        (3.0, 0.089, 0.0),  # within 1 cm times 3 squared
         (3.0, 0.091, 1.0),
     ],
 )
-def test_tolerance_grows_with_the_square_of_depth_from_a_least_one_on(z: float, behind: float, gone: float) -> None:
-    assert share(surface((60, 80), z=z), view(wall=z + behind)) == gone
+def test_tolerance_grows_with_the_square_of_depth_above_a_minimum(z: float, behind: float, vacated: float) -> None:
+    assert vacated_fraction(surface((60, 80), z=z), view(wall=z + behind)) == vacated
 
 
 @pytest.mark.parametrize("z", [1.0, 3.0])
-def test_tolerance_towards_the_camera_is_the_same(z: float) -> None:
-    """A little nearer than expected is the point itself, seen; much nearer hides it."""
+def test_tolerance_is_the_same_towards_the_camera(z: float) -> None:
+    """A depth slightly nearer than expected is the point itself; a much nearer depth hides the point."""
     tolerance = max(0.04, 0.01 * z * z)
-    assert share(surface((60, 80), z=z), view(wall=z - 0.9 * tolerance)) == 0.0
-    assert math.isnan(share(surface((60, 80), z=z), view(wall=z - 1.1 * tolerance)))
+    assert vacated_fraction(surface((60, 80), z=z), view(wall=z - 0.9 * tolerance)) == 0.0
+    assert math.isnan(vacated_fraction(surface((60, 80), z=z), view(wall=z - 1.1 * tolerance)))
 
 
-def test_an_object_that_has_come_out_of_hiding_has_vacated_nothing() -> None:
-    """Of where it was nothing is in sight, of where it came to all was: the two views tell different things."""
+def test_reappearing_object_has_vacated_nothing() -> None:
+    """The old position is hidden, the new one was visible: the two views give different evidence."""
     screen = ((50, 90), 1.0)
-    assert math.isnan(share(surface((60, 80)), view(screen, ((100, 120), OBJECT))))
-    assert share(surface((100, 120)), view(screen)) == 1.0
+    assert math.isnan(vacated_fraction(surface((60, 80)), view(screen, ((100, 120), OBJECT))))
+    assert vacated_fraction(surface((100, 120)), view(screen)) == 1.0
 
 
-def test_an_object_cut_by_the_image_border_has_vacated_nothing() -> None:
-    """The camera passes a still board, of which ever less is seen: its centroid jumps, its places do not."""
+def test_object_cut_by_the_image_border_has_vacated_nothing() -> None:
+    """The camera passes a static board that leaves the image: its centroid moves, its points do not."""
     T_wc = HERE.clone()
-    T_wc[0, 3] = -15 * OBJECT / CAMERA.fx  # to the left: the board at the right border slides out
-    assert share(surface((130, 160)), view(((145, 160), OBJECT), T_wc=T_wc)) == 0.0
+    T_wc[0, 3] = -15 * OBJECT / CAMERA.fx  # to the left: the board leaves the image at the right border
+    assert vacated_fraction(surface((130, 160)), view(((145, 160), OBJECT), T_wc=T_wc)) == 0.0
 
 
-def test_a_still_object_that_something_passes_has_vacated_nothing() -> None:
+def test_static_object_behind_a_passing_one_has_vacated_nothing() -> None:
     covered = view(((60, 80), OBJECT), ((55, 72), 1.2))
-    assert share(surface((60, 80)), covered) == 0.0
+    assert vacated_fraction(surface((60, 80)), covered) == 0.0
 
 
 @settings(max_examples=50, deadline=None)
 @given(TWISTS, st.integers(RIM, 20))
-def test_share_does_not_depend_on_the_choice_of_the_world(xi: tuple[float, ...], step: int) -> None:
-    """Depth is chosen so that rounding of float32 points decides no pixel and no tolerance."""
+def test_vacated_fraction_does_not_depend_on_the_world_frame(xi: tuple[float, ...], step: int) -> None:
+    """The depth is chosen so that float32 rounding changes no pixel and no comparison."""
     T_new_old = se3_exp(torch.tensor(xi, dtype=torch.float64))
     cloud = surface((60, 80)).double()
     moved = cloud @ T_new_old[:3, :3].T + T_new_old[:3, 3]
-    seen = view(((60 + step, 80 + step), OBJECT), T_wc=T_new_old)
-    assert share(moved.float(), seen) == pytest.approx((step - RIM) / 20)
+    observed = view(((60 + step, 80 + step), OBJECT), T_wc=T_new_old)
+    assert vacated_fraction(moved.float(), observed) == pytest.approx((step - RIM) / 20)
 
 
 @pytest.mark.parametrize("pixel", [(20, 30), (20, 610), (450, 30), (460, 620), (240, 320)])
-def test_points_are_looked_for_where_a_bent_ray_meets_the_image(pixel: tuple[int, int]) -> None:
-    """The strong lens of TUM's fr1. A wall behind something near with a hole: one pixel alone looks through it."""
+def test_points_are_projected_with_lens_distortion(pixel: tuple[int, int]) -> None:
+    """A strong lens distortion. A wall behind a near surface with a hole: a single pixel is free."""
     camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
     v, u = pixel
     depth = torch.full((1, 480, 640), 1.0)
     depth[0, v - 6 : v + 7, u - 6 : u + 7] = WALL
     around = OBJECT * camera.rays[v - 1 : v + 2, u - 1 : u + 2].double().reshape(9, 3)
-    told = is_free_space(around, DepthView(0.0, depth, HERE), camera, CONFIG)
-    assert told[4] == 1.0 and told.isnan().sum() == 8
+    known = is_free_space(around, DepthView(0.0, depth, HERE), camera, CONFIG)
+    assert known[4] == 1.0 and known.isnan().sum() == 8
 
 
 @pytest.mark.parametrize("degrees", [30, 35, 45, 58, 60, 62, 75, 89])
-def test_a_lens_folds_nothing_from_afar_into_the_image(degrees: float) -> None:
-    """Bonn's polynomial lens maps a ray at 60 degrees to a pixel; the image ends at 31."""
+def test_lens_distortion_does_not_fold_points_into_the_image(degrees: float) -> None:
+    """The distortion polynomial maps a ray at 60 degrees into the image, which ends at 31 degrees."""
     lens = (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
     camera = PinholeCamera(542.822841, 542.576870, 315.593520, 237.756098, distortion=lens)
     aside = math.tan(math.radians(degrees))
     points = OBJECT * torch.tensor([[aside, 0.0, 1.0], [-aside, 0.0, 1.0], [0.0, aside, 1.0]], dtype=torch.float64)
-    told = is_free_space(points, DepthView(0.0, torch.full((1, 480, 640), WALL), HERE), camera, CONFIG)
-    assert told.isnan().tolist() == [degrees > 30.5, degrees > 30.5, True]
+    known = is_free_space(points, DepthView(0.0, torch.full((1, 480, 640), WALL), HERE), camera, CONFIG)
+    assert known.isnan().tolist() == [degrees > 30.5, degrees > 30.5, True]
 
 
-def test_a_view_of_another_pose_sees_the_same_slanted_floor() -> None:
-    """A floor seen from two poses: no plane parallel to an image, no pixel on the same place, and nothing has moved."""
+def test_static_slanted_floor_is_not_vacated() -> None:
+    """A static floor in views from two poses, parallel to neither image, with no pixel at the same point."""
     tilted = se3_exp(torch.tensor([0.0, 0.0, 0.0, -0.5, 0.0, 0.0], dtype=torch.float64))
     turned = se3_exp(torch.tensor([0.3, -0.1, 0.2, -0.45, 0.15, 0.1], dtype=torch.float64))
     clouds, views = [], []
@@ -250,48 +254,50 @@ def test_a_view_of_another_pose_sees_the_same_slanted_floor() -> None:
         views.append(DepthView(0.0, depth[None].float(), invert(T_wc)))
         clouds.append((direction * depth[..., None] + T_wc[:3, 3])[depth > 0].float())
     assert float(((clouds[0][:, 1] - 1.2).abs()).max()) < 1e-5
-    assert share(clouds[0], views[1]) < 0.001
-    assert share(clouds[1], views[0]) < 0.001
+    assert vacated_fraction(clouds[0], views[1]) < 0.001
+    assert vacated_fraction(clouds[1], views[0]) < 0.001
 
 
-def test_shares_of_several_clouds_are_those_of_each() -> None:
+def test_vacated_fractions_of_several_clouds_are_independent() -> None:
     clouds = [surface((60, 80)), torch.zeros(0, 3), surface((50, 70)), surface((0, 20))]
-    seen = view(((65, 85), OBJECT))
-    together = vacated_fractions(clouds, seen, CAMERA, CONFIG)
-    torch.testing.assert_close(together.tolist(), [share(cloud, seen) for cloud in clouds], equal_nan=True)
-    assert vacated_fractions([], seen, CAMERA, CONFIG).shape == (0,)
+    observed = view(((65, 85), OBJECT))
+    together = vacated_fractions(clouds, observed, CAMERA, CONFIG)
+    torch.testing.assert_close(
+        together.tolist(), [vacated_fraction(cloud, observed) for cloud in clouds], equal_nan=True
+    )
+    assert vacated_fractions([], observed, CAMERA, CONFIG).shape == (0,)
 
 
-# ---------------------------------------------------------------- what came
+# ---------------------------------------------------------------- newly occupied pixels
 
 BOX = 10, 20, 15, 25
-"""Rows and columns of the box in arrivals, every fourth pixel: rows 40 to 80, columns 60 to 100 of the image."""
+"""Rows and columns of the box in `NewlyOccupied`: rows 40 to 80, columns 60 to 100 of the image."""
 WITH_BOX = ((60, 100), OBJECT)
 
 
-def watch(*views: DepthView, **config: object) -> FreeSpaceCheck:
-    """A watch that has seen views."""
-    watching = FreeSpaceCheck(FreeSpaceConfig(**config), CAMERA)
-    for seen in views:
-        watching.remember(seen)
-    return watching
+def check_with(*views: DepthView, **config: object) -> FreeSpaceCheck:
+    """Return a free-space check with stored views."""
+    check = FreeSpaceCheck(FreeSpaceConfig(**config), CAMERA)
+    for observed in views:
+        check.remember(observed)
+    return check
 
 
-def box(came: Tensor) -> Tensor:
+def box(appeared: Tensor) -> Tensor:
     top, bottom, left, right = BOX
-    return came[..., top:bottom, left:right]
+    return appeared[..., top:bottom, left:right]
 
 
-def around(came: Tensor) -> Tensor:
-    """All pixels but the box's and those beside it."""
+def around(appeared: Tensor) -> Tensor:
+    """Return all pixels except those of the box and beside it."""
     top, bottom, left, right = BOX
-    outside = torch.ones(came.shape[-2:], dtype=torch.bool)
+    outside = torch.ones(appeared.shape[-2:], dtype=torch.bool)
     outside[top - 1 : bottom + 1, left - 1 : right + 1] = False
-    return came[..., outside]
+    return appeared[..., outside]
 
 
 def room(T_wc: Tensor, *, with_box: bool, at: float) -> DepthView:
-    """A wall at z = 4 m and a box at 2 m of 0.6 x 0.6 m, by the rays of a camera that may be anywhere."""
+    """Return a view of a wall at z = 4 m and a box of 0.6 x 0.6 m at 2 m from any camera pose."""
     direction = CAMERA.rays.double() @ T_wc[:3, :3].T
     hit = T_wc[:3, 3] + direction * ((OBJECT - T_wc[2, 3]) / direction[..., 2])[..., None]
     on_box = with_box & (hit[..., :2].abs() < 0.3).all(dim=-1)
@@ -299,158 +305,180 @@ def room(T_wc: Tensor, *, with_box: bool, at: float) -> DepthView:
     return DepthView(at, depth[None].float(), invert(T_wc))
 
 
-def test_a_box_that_comes_has_come_and_the_wall_around_it_has_not() -> None:
-    came = watch(view(at=0.0))(view(WITH_BOX, at=0.3)).appeared
-    assert came.shape == (2, 30, 40) and came.dtype == torch.float64
-    assert (box(came[0]) == 1).all()
-    assert (around(came[0]) == 0).all()
-    assert came[1].isnan().all()  # nothing was seen 0.9 s ago
+def test_new_box_has_appeared_and_the_wall_has_not() -> None:
+    appeared = check_with(view(at=0.0))(view(WITH_BOX, at=0.3)).appeared
+    assert appeared.shape == (2, 30, 40) and appeared.dtype == torch.float64
+    assert (box(appeared[0]) == 1).all()
+    assert (around(appeared[0]) == 0).all()
+    assert appeared[1].isnan().all()  # no view from 0.9 s ago
 
 
-def test_a_box_that_stood_there_has_not_come() -> None:
-    """At its rim it hides the wall: there it cannot be told."""
-    came = watch(view(WITH_BOX, at=0.0))(view(WITH_BOX, at=0.9)).appeared
-    assert (box(came) == 0).all() and (around(came) == 0).all()
-    assert not (came == 1).any()
+def test_static_box_has_not_appeared() -> None:
+    """At the rim of the box the wall was hidden, and its pixels are unknown."""
+    appeared = check_with(view(WITH_BOX, at=0.0))(view(WITH_BOX, at=0.9)).appeared
+    assert (box(appeared) == 0).all() and (around(appeared) == 0).all()
+    assert not (appeared == 1).any()
 
 
-def test_what_a_box_uncovers_cannot_be_told() -> None:
-    """The wall behind was hidden: that the box has left is not for the watch to say."""
-    came = watch(view(WITH_BOX, at=0.0))(view(at=0.3)).appeared[0]
-    assert box(came).isnan().all()
-    assert (around(came) == 0).all()
+def test_uncovered_wall_is_unknown() -> None:
+    """The wall behind the box was hidden, so its pixels are unknown."""
+    appeared = check_with(view(WITH_BOX, at=0.0))(view(at=0.3)).appeared[0]
+    assert box(appeared).isnan().all()
+    assert (around(appeared) == 0).all()
 
 
-def test_what_comes_out_from_behind_a_screen_cannot_be_told() -> None:
-    came = watch(view(((50, 110), 1.0), at=0.0))(view(WITH_BOX, at=0.3)).appeared[0]
-    assert box(came).isnan().all()
+def test_box_uncovered_by_a_screen_is_unknown() -> None:
+    appeared = check_with(view(((50, 110), 1.0), at=0.0))(view(WITH_BOX, at=0.3)).appeared[0]
+    assert box(appeared).isnan().all()
 
 
-def test_what_was_out_of_view_cannot_be_told() -> None:
+def test_pixels_outside_of_the_earlier_view_are_unknown() -> None:
     turned = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, math.pi / 2, 0.0], dtype=torch.float64))
-    assert watch(view(at=0.0, T_wc=turned))(view(WITH_BOX, at=0.3)).appeared.isnan().all()
+    assert check_with(view(at=0.0, T_wc=turned))(view(WITH_BOX, at=0.3)).appeared.isnan().all()
 
 
-def test_without_depth_then_nothing_can_be_told() -> None:
-    assert watch(view(wall=0.0, at=0.0))(view(WITH_BOX, at=0.3)).appeared.isnan().all()
+def test_pixels_without_earlier_depth_are_unknown() -> None:
+    assert check_with(view(wall=0.0, at=0.0))(view(WITH_BOX, at=0.3)).appeared.isnan().all()
 
 
-@pytest.mark.parametrize(("z", "told"), [(0.0, False), (0.29, False), (0.31, True), (2.9, True), (3.1, False)])
-def test_only_what_has_a_depth_within_the_range_now_can_have_come(z: float, told: bool) -> None:
-    came = watch(view(at=0.0), max_depth=3.0)(view(((60, 100), z), at=0.3)).appeared[0]
-    assert (~box(came).isnan()).all() if told else box(came).isnan().all()
-    assert around(came).isnan().all()  # the wall is beyond the range
+@pytest.mark.parametrize(("z", "known"), [(0.0, False), (0.29, False), (0.31, True), (2.9, True), (3.1, False)])
+def test_pixels_outside_of_the_depth_range_are_unknown(z: float, known: bool) -> None:
+    appeared = check_with(view(at=0.0), max_depth=3.0)(view(((60, 100), z), at=0.3)).appeared[0]
+    assert (~box(appeared).isnan()).all() if known else box(appeared).isnan().all()
+    assert around(appeared).isnan().all()  # the wall is beyond the maximum depth
 
 
-def test_nothing_is_told_where_nothing_is_remembered() -> None:
-    assert watch()(view(WITH_BOX)).appeared.isnan().all()
+def test_all_pixels_are_unknown_without_stored_views() -> None:
+    assert check_with()(view(WITH_BOX)).appeared.isnan().all()
 
 
-def test_the_view_itself_is_not_what_it_is_compared_with() -> None:
-    seen = view(WITH_BOX, at=0.0)
-    assert watch(seen)(seen).appeared.isnan().all()
+def test_view_is_not_compared_with_itself() -> None:
+    observed = view(WITH_BOX, at=0.0)
+    assert check_with(observed)(observed).appeared.isnan().all()
 
 
-def test_turned_off_there_is_nothing_to_compare_with() -> None:
-    arrivals = watch(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
-    assert arrivals.appeared.shape == (0, 30, 40)
-    assert arrivals.fractions([torch.ones(120, 160, dtype=torch.bool)], 1).shape == (1, 0)
+def test_disabled_check_compares_nothing() -> None:
+    newly_occupied = check_with(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
+    assert newly_occupied.appeared.shape == (0, 30, 40)
+    assert newly_occupied.fractions([torch.ones(120, 160, dtype=torch.bool)], 1).shape == (1, 0)
 
 
-def test_a_pose_that_is_a_guess_tells_nothing() -> None:
-    watching, now = watch(view(at=0.0)), view(WITH_BOX, at=0.9)
-    assert watching(now, trusted=False).appeared.numel() == 0
-    assert watching(now).appeared.shape[0] == 2
+def test_view_with_guessed_pose_is_not_compared() -> None:
+    check, now = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
+    assert check(now, trusted=False).appeared.numel() == 0
+    assert check(now).appeared.shape[0] == 2
 
 
 @pytest.mark.parametrize("rate", [5, 10, 30])
-def test_each_baseline_is_as_long_as_it_says(rate: int) -> None:
-    """The box has come at 2 s: over 0.3 s for so long, and over 0.9 s; before it, for ever, it was not there."""
-    watching = watch()
+def test_box_appears_for_the_time_of_each_baseline(rate: int) -> None:
+    """The box appears at 2 s, and is newly occupied over each baseline for the time of the baseline."""
+    check = check_with()
     steps = {baseline: -(-round(baseline * 1000) * rate // 1000) for baseline in (0.3, 0.9)}  # whole frames
     for frame in range(4 * rate):
         now = view(*[WITH_BOX] * (frame >= 2 * rate), at=frame / rate)
-        came = watching(now).appeared
-        for row, baseline in zip(came, (0.3, 0.9), strict=True):
+        appeared = check(now).appeared
+        for row, baseline in zip(appeared, (0.3, 0.9), strict=True):
             expected = 2 * rate <= frame < 2 * rate + steps[baseline]
             if frame < steps[baseline]:
                 assert row.isnan().all()
             else:
                 assert (box(row) == expected).all() and (around(row) == 0).all()
-        watching.remember(now)
+        check.remember(now)
 
 
-def test_what_is_older_than_the_longest_baseline_is_forgotten() -> None:
-    watching, kept = watch(), []
+def test_views_older_than_the_longest_baseline_are_dropped() -> None:
+    check, references = check_with(), []
     for frame in range(100):
-        seen = view(at=frame / 10)
-        kept.append(weakref.ref(seen))
-        watching.remember(seen)
-    del seen
+        observed = view(at=frame / 10)
+        references.append(weakref.ref(observed))
+        check.remember(observed)
+    del observed
     gc.collect()
-    assert 10 <= sum(ref() is not None for ref in kept) <= 13
+    assert 10 <= sum(ref() is not None for ref in references) <= 13
 
 
 MOVES = [(0.3, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.5, 0.0, 0.0, 0.0), (0.1, -0.1, 0.2, 0.05, -0.1, 0.1)]
 
 
 @pytest.mark.parametrize("twist", MOVES)
-def test_in_a_still_room_nothing_comes_however_the_camera_moves(twist: tuple[float, ...]) -> None:
+def test_nothing_appears_in_a_static_room_under_camera_motion(twist: tuple[float, ...]) -> None:
     T_wc = se3_exp(torch.tensor(twist, dtype=torch.float64))
     for then, now in ((HERE, T_wc), (T_wc, HERE)):
-        came = watch(room(then, with_box=True, at=0.0))(room(now, with_box=True, at=0.3)).appeared[0]
-        assert not (came == 1).any()
-        assert (came == 0).double().mean() > 0.6
+        appeared = check_with(room(then, with_box=True, at=0.0))(room(now, with_box=True, at=0.3)).appeared[0]
+        assert not (appeared == 1).any()
+        assert (appeared == 0).double().mean() > 0.6
 
 
 @pytest.mark.parametrize("twist", MOVES)
-def test_a_box_has_come_however_the_camera_moves(twist: tuple[float, ...]) -> None:
+def test_new_box_appears_under_camera_motion(twist: tuple[float, ...]) -> None:
     T_wc = se3_exp(torch.tensor(twist, dtype=torch.float64))
     now = room(T_wc, with_box=True, at=0.3)
-    came = watch(room(HERE, with_box=False, at=0.0))(now).appeared[0]
+    appeared = check_with(room(HERE, with_box=False, at=0.0))(now).appeared[0]
     on_box = now.depth[0, ::4, ::4] < 3.0
     assert on_box.sum() > 80
-    assert torch.equal(came == 1, on_box)
+    assert torch.equal(appeared == 1, on_box)
 
 
 @settings(max_examples=20, deadline=None)
 @given(TWISTS)
-def test_a_world_that_is_moved_takes_its_views_along(twist: tuple[float, ...]) -> None:
-    """A closed loop moves the map and the camera in it: what came, and what did not, stays the same."""
+def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> None:
+    """A loop correction moves the map and the camera: the newly occupied pixels stay the same."""
     T_new_old = se3_exp(torch.tensor(twist, dtype=torch.float64))
-    watching = watch(view(at=0.0), view(WITH_BOX, at=0.6))
-    expected = watching(view(WITH_BOX, at=0.9)).appeared
+    check = check_with(view(at=0.0), view(WITH_BOX, at=0.6))
+    expected = check(view(WITH_BOX, at=0.9)).appeared
     assert (box(expected[0]) == 0).all() and (box(expected[1]) == 1).all()
-    watching.move_world(T_new_old)
-    came = watching(view(WITH_BOX, at=0.9, T_wc=T_new_old)).appeared
-    torch.testing.assert_close(came, expected, rtol=0, atol=0, equal_nan=True)
+    check.move_world(T_new_old)
+    appeared = check(view(WITH_BOX, at=0.9, T_wc=T_new_old)).appeared
+    torch.testing.assert_close(appeared, expected, rtol=0, atol=0, equal_nan=True)
 
 
-# ---------------------------------------------------------------- an object's share of it
+# ---------------------------------------------------------------- fractions of objects
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 5), st.integers(1, 40))
-def test_share_of_an_object_is_the_mean_of_what_is_told(seed: int, baselines: int, stride: int, least: int) -> None:
+def test_fraction_of_an_object_is_the_mean_of_its_known_pixels(
+    seed: int, baselines: int, stride: int, min_pixels: int
+) -> None:
     rng = np.random.default_rng(seed)
-    came = rng.choice([0.0, 1.0, np.nan], (baselines, 7, 9), p=[0.3, 0.2, 0.5])
+    appeared = rng.choice([0.0, 1.0, np.nan], (baselines, 7, 9), p=[0.3, 0.2, 0.5])
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
-    shares = NewlyOccupied(torch.from_numpy(came), stride).fractions([torch.from_numpy(mask) for mask in masks], least)
-    assert shares.dtype == torch.float64 and shares.shape == (3, baselines)
-    for row, mask in zip(shares, masks, strict=True):
+    fractions = NewlyOccupied(torch.from_numpy(appeared), stride).fractions(
+        [torch.from_numpy(mask) for mask in masks], min_pixels
+    )
+    assert fractions.dtype == torch.float64 and fractions.shape == (3, baselines)
+    for row, mask in zip(fractions, masks, strict=True):
         within = [
-            [came[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(baselines)
+            [appeared[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(baselines)
         ]
-        told = [[value for value in values if not math.isnan(value)] for values in within]
-        expected = [sum(values) / len(values) if len(values) >= least else math.nan for values in told]
+        known = [[value for value in values if not math.isnan(value)] for values in within]
+        expected = [sum(values) / len(values) if len(values) >= min_pixels else math.nan for values in known]
         torch.testing.assert_close(row, torch.tensor(expected).double(), equal_nan=True, rtol=1e-6, atol=0)
 
 
-def test_share_of_half_a_box_is_a_half() -> None:
-    """The mask covers the box that came and as much of the wall beside it, which did not."""
-    arrivals = watch(view(at=0.0))(view(WITH_BOX, at=0.3))
+def test_fraction_of_half_a_box_is_one_half() -> None:
+    """The mask covers the box that appeared and an equal area of the static wall beside it."""
+    newly_occupied = check_with(view(at=0.0))(view(WITH_BOX, at=0.3))
     mask = torch.zeros(120, 160, dtype=torch.bool)
     mask[40:80, 60:140] = True
-    (shares,) = arrivals.fractions([mask], CONFIG.min_points)
-    assert shares[0] == 0.5 and shares[1].isnan()
-    assert arrivals.fractions([mask], 201)[0, 0].isnan()
+    (fractions,) = newly_occupied.fractions([mask], CONFIG.min_points)
+    assert fractions[0] == 0.5 and fractions[1].isnan()
+    assert newly_occupied.fractions([mask], 201)[0, 0].isnan()
+
+
+# ---------------------------------------------------------------- state
+
+
+def test_state_dict_continues_with_identical_results() -> None:
+    original, continued = check_with(view(at=0.0), view(WITH_BOX, at=0.6)), check_with(view(WITH_BOX, at=0.1))
+    continued.load_state_dict(original.state_dict())
+    for stamp in (0.9, 1.2, 1.5):
+        current = original.make_view(stamp, view(WITH_BOX).depth, turned(stamp))
+        other = continued.make_view(stamp, view(WITH_BOX).depth, turned(stamp))
+        assert current.misalignment == other.misalignment
+        torch.testing.assert_close(
+            original(current).appeared, continued(other).appeared, rtol=0, atol=0, equal_nan=True
+        )
+        original.remember(current)
+        continued.remember(other)
+    assert not original(view(WITH_BOX, at=1.8)).appeared.isnan().all()

@@ -1,4 +1,4 @@
-"""The largest clusters, against counting in Python."""
+"""Largest clusters against counting in Python."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from v3d_torch.objects.largest_clusters import largest_clusters
     min_points=st.integers(1, 6),
     data=st.data(),
 )
-def test_equals_counting(labels: list[int], n: int, min_points: int, data: st.DataObject) -> None:
+def test_selection_equals_counting(labels: list[int], n: int, min_points: int, data: st.DataObject) -> None:
     valid = data.draw(st.lists(st.booleans(), min_size=len(labels), max_size=len(labels)))
     sizes = Counter(label for label, present in zip(labels, valid, strict=True) if present and label >= 0)
-    best = sorted(sizes, key=lambda label: (-sizes[label], label))[:n]
-    kept = {label for label in best if sizes[label] >= min_points}
-    expected = [present and label in kept for label, present in zip(labels, valid, strict=True)]
+    largest = sorted(sizes, key=lambda label: (-sizes[label], label))[:n]
+    selected = {label for label in largest if sizes[label] >= min_points}
+    expected = [present and label in selected for label, present in zip(labels, valid, strict=True)]
     row = torch.tensor([labels], dtype=torch.int64), torch.tensor([valid], dtype=torch.bool)
     assert largest_clusters(*row, n, min_points)[0].tolist() == expected
 
 
 def test_convention_ties_go_to_the_lowest_label() -> None:
     labels = torch.tensor([[1, 1, 0, 0, 2, -1]])
-    kept = largest_clusters(labels, torch.ones(1, 6, dtype=torch.bool))
-    assert kept.tolist() == [[False, False, True, True, False, False]]
+    selected = largest_clusters(labels, torch.ones(1, 6, dtype=torch.bool))
+    assert selected.tolist() == [[False, False, True, True, False, False]]
 
 
-def test_number_per_cloud_and_padding() -> None:
+def test_number_of_clusters_per_cloud_ignores_padding() -> None:
     labels = torch.tensor([[0, 0, 0, 1, 1, 2], [3, 3, 0, 3, -1, -1], [-1, -1, -1, -1, -1, -1]])
     valid = torch.tensor([[True] * 6, [True] * 3 + [False] * 3, [True] * 6])
-    kept = largest_clusters(labels, valid, torch.tensor([2, 1, 3]))
-    assert kept.tolist() == [[True] * 5 + [False], [True, True] + [False] * 4, [False] * 6]
+    selected = largest_clusters(labels, valid, torch.tensor([2, 1, 3]))
+    assert selected.tolist() == [[True] * 5 + [False], [True, True] + [False] * 4, [False] * 6]
 
 
-def test_empty() -> None:
+def test_empty_clouds_have_no_clusters() -> None:
     for shape in [(0, 3), (2, 0)]:
-        kept = largest_clusters(torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.bool))
-        assert kept.shape == shape and kept.dtype == torch.bool
+        selected = largest_clusters(torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.bool))
+        assert selected.shape == shape and selected.dtype == torch.bool

@@ -1,7 +1,8 @@
-"""Who moves, on rooms of boxes with known truth: walkers, swayers, and all that only looks as if it moved."""
+"""Motion classification in rooms of boxes with ground truth: walkers, swaying people, and apparent motion."""
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.scenes import NO_WITNESSES
+from helpers.scenes import NO_FEATURES, ObjectStage
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -19,21 +20,21 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.feature_support import FeatureSupport
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
-from v3d_torch.objects.instance_clouds import InstanceBackProjector, InstanceClouds
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionClassifier, MotionState, TrackedObject
-from v3d_torch.objects.unlabelled import unlabelled_instances
+from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.types import Instances
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 STRIDE = "objects.clouds.stride=1"  # a quarter of the usual resolution
-NAMED_ONLY = "objects.free_space.min_unlabelled_area=100.0"  # square metres: what the network misses is not proposed
+NO_UNLABELLED = "objects.free_space.min_unlabelled_area=100.0"  # square metres: no unlabelled instances
 PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
 HERE = torch.eye(4, dtype=torch.float64)
 WALL = 5.0
 DOG, CHAIR, TV = 16, 56, 62
-LEAST_PIXELS = 25  # the network finds nothing smaller
+MIN_PIXELS = 25  # smallest object that the network detects
 
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]  # centre and size, metres, along the axes of the world
@@ -41,18 +42,18 @@ Box = tuple[Vector, Vector]  # centre and size, metres, along the axes of the wo
 
 @dataclass(frozen=True)
 class Thing:
-    """An object made of boxes that may move: ``boxes`` of a time in seconds."""
+    """Object made of boxes that can move: ``boxes`` is a function of time in seconds."""
 
     label: int
     boxes: Callable[[float], list[Box]]
 
 
-def still(centre: Vector, size: Vector = (0.5, 0.6, 0.5), label: int = CHAIR) -> Thing:
+def static_box(centre: Vector, size: Vector = (0.5, 0.6, 0.5), label: int = CHAIR) -> Thing:
     return Thing(label, lambda _: [(centre, size)])
 
 
 def walker(start: Vector, velocity: Vector, stop: float = math.inf, label: int = PERSON) -> Thing:
-    """Somebody 1.5 m tall who walks on until ``stop`` seconds."""
+    """Person 1.5 m tall who walks until ``stop`` seconds."""
 
     def boxes(t: float) -> list[Box]:
         t = min(t, stop)
@@ -62,8 +63,8 @@ def walker(start: Vector, velocity: Vector, stop: float = math.inf, label: int =
     return Thing(label, boxes)
 
 
-def swayer(centre: Vector) -> Thing:
-    """Somebody whose arms go up and down on both sides alike, once in 1.2 s: the middle stays where it is."""
+def swaying_person(centre: Vector) -> Thing:
+    """Person who moves both arms symmetrically, once in 1.2 s: the centroid stays in place."""
 
     def boxes(t: float) -> list[Box]:
         x, y, z = centre
@@ -73,11 +74,11 @@ def swayer(centre: Vector) -> Thing:
     return Thing(PERSON, boxes)
 
 
-CHAIRS = (still((-1.1, 0.4, 2.8)), still((1.1, 0.3, 3.2)), still((0.2, -0.7, 4.2), (0.8, 0.5, 0.2), TV))
+CHAIRS = (static_box((-1.1, 0.4, 2.8)), static_box((1.1, 0.3, 3.2)), static_box((0.2, -0.7, 4.2), (0.8, 0.5, 0.2), TV))
 
 
-def photograph(things: list[Thing], t: float, T_wc: Tensor, noise: float) -> tuple[Tensor, Tensor]:
-    """Depth (1, H, W), with the noise of a structured-light camera, and the thing at each pixel, -1 = the wall."""
+def render(things: list[Thing], t: float, T_wc: Tensor, noise: float) -> tuple[Tensor, Tensor]:
+    """Return the noisy depth of a structured-light camera, (1, H, W), and the thing at each pixel, -1 = the wall."""
     origin = T_wc[:3, 3]
     direction = CAMERA.rays.double() @ T_wc[:3, :3].T  # of unit depth: a distance along it is a depth
     depth = (WALL - origin[2]) / direction[..., 2]
@@ -94,9 +95,9 @@ def photograph(things: list[Thing], t: float, T_wc: Tensor, noise: float) -> tup
     return (depth + error)[None].float(), owner
 
 
-def found(owner: Tensor, things: list[Thing], hidden: set[int], score: float = 1.0) -> Instances:
-    """What a network sees that misses ``hidden`` things and all small ones, and is so sure of the others."""
-    seen = [i for i in range(len(things)) if i not in hidden and int((owner == i).sum()) >= LEAST_PIXELS]
+def detect(owner: Tensor, things: list[Thing], hidden: set[int], score: float = 1.0) -> Instances:
+    """Return the instances of a network that misses ``hidden`` things and all small ones, with a given score."""
+    seen = [i for i in range(len(things)) if i not in hidden and int((owner == i).sum()) >= MIN_PIXELS]
     if not seen:
         return Instances.empty(CAMERA.height, CAMERA.width)
     labels = torch.tensor([things[i].label for i in seen])
@@ -104,12 +105,12 @@ def found(owner: Tensor, things: list[Thing], hidden: set[int], score: float = 1
     return Instances(masks, labels, torch.full((len(seen),), score), torch.zeros(len(seen), 4))
 
 
-def away_from(mask: Tensor) -> Tensor:
-    """Pixels to the nearest one of a mask, 0 within."""
+def distance_to(mask: Tensor) -> Tensor:
+    """Return the distance to the nearest pixel of a mask, 0 inside, pixels."""
     return torch.from_numpy(distance_transform_edt(~mask))
 
 
-def standing(_: float) -> Tensor:
+def static_camera(_: float) -> Tensor:
     return HERE
 
 
@@ -120,251 +121,232 @@ def handheld(t: float) -> Tensor:
     )
 
 
-class Stage:
-    """The object stage in the order of `V3DSLAM`; ``instances`` are those of the last frame, the unnamed among them."""
-
-    def __init__(self, config: ObjectsConfig) -> None:
-        self._config = config
-        self._watch = FreeSpaceCheck(config.free_space, CAMERA)
-        self._lift = InstanceBackProjector(config.clouds, CAMERA)
-        self._judge = MotionClassifier(config, CAMERA)
-        self.instances = Instances.empty(CAMERA.height, CAMERA.width)
-        self.witnesses = NO_WITNESSES
-
-    def __call__(
-        self, stamp: float, named: Instances, depth: Tensor, T_wc: Tensor, lifted: Tensor | None = None
-    ) -> FrameObjects:
-        """Judge a frame; clouds are of the depth ``lifted`` where the background is to see another one."""
-        view = self._watch.make_view(stamp, depth, invert(T_wc))
-        arrivals = self._watch(view)
-        unnamed = unlabelled_instances(arrivals, named, depth, CAMERA, self._config.free_space.min_unlabelled_area)
-        self.instances = named.concatenate(unnamed)
-        clouds = self._lift(depth if lifted is None else lifted, self.instances)
-        scene = self._judge(self.instances, clouds, view, arrivals, self.witnesses)
-        self._watch.remember(view)
-        return scene
-
-    def move_world(self, T_new_old: Tensor) -> None:
-        self._judge.tracker.move_world(T_new_old)
-        self._watch.move_world(T_new_old)
-
-
 @dataclass(frozen=True)
 class Frame:
-    """What was shown and what came of it."""
+    """Ground truth of a frame and the result of the object stage."""
 
     stamp: float
     owner: Tensor
-    scene: FrameObjects
+    result: FrameObjects
 
     def __getitem__(self, number: int) -> TrackedObject:
-        """The object with this id: where all things are seen at the start, things have the ids 1, 2, 3 ..."""
-        (judged,) = [judged for judged in self.scene.objects if judged.id == number]
-        return judged
+        """Return the object with this id: if all things are detected at the start, they have the ids 1, 2, 3 ..."""
+        (obj,) = [obj for obj in self.result.objects if obj.id == number]
+        return obj
 
 
-def play(
+def simulate(
     *things: Thing,
     seconds: float,
     rate: float = 15.0,
-    camera: Callable[[float], Tensor] = standing,
+    camera: Callable[[float], Tensor] = static_camera,
     overrides: tuple[str, ...] = (),
     path: Path | None = None,
     hidden: Callable[[float], set[int]] = lambda _: set(),
     score: float = 1.0,
-    grown: float = 0.0,
+    mask_growth: float = 0.0,
     noise: float = 0.0014,
     correction: tuple[float, Tensor] | None = None,
 ) -> list[Frame]:
-    """Show things to the object stage.
+    """Run the object stage on moving things.
 
-    ``dilate`` is by how many pixels the network draws its masks too large, or too small if negative; ``correction`` is a
-    time and by what the map is corrected then.
+    Args:
+        things: Things in the room.
+        seconds: Length of the run, seconds.
+        rate: Frame rate, Hz.
+        camera: Camera-to-world pose at a time in seconds.
+        overrides: Overrides of the configuration.
+        path: Configuration file.
+        hidden: Things that the network misses at a time in seconds.
+        score: Score of all detections.
+        mask_growth: Distance by which the network draws its masks too large, pixels; too small if negative.
+        noise: Depth noise, 1/m.
+        correction: Time of a correction of the world, seconds, and the correction.
     """
-    stage = Stage(load_config(path, (STRIDE, *overrides)).objects)
+    stage = ObjectStage(load_config(path, (STRIDE, *overrides)).objects)
     T_new_old, frames = HERE, []
     for index in range(round(seconds * rate) + 1):
         t = index / rate
         if correction is not None and T_new_old is HERE and t >= correction[0]:
             T_new_old = correction[1]
             stage.move_world(T_new_old)
-        depth, owner = photograph(list(things), t, camera(t), noise)
-        named = found(owner, list(things), hidden(t), score)
+        depth, owner = render(list(things), t, camera(t), noise)
+        named = detect(owner, list(things), hidden(t), score)
         drawn = (
-            torch.stack([away_from(mask) - away_from(~mask) <= grown for mask in named.masks]) if grown else named.masks
+            torch.stack([distance_to(mask) - distance_to(~mask) <= mask_growth for mask in named.masks])
+            if mask_growth
+            else named.masks
         )
-        scene = stage(t, replace(named, masks=drawn), depth, T_new_old @ camera(t))
-        frames.append(Frame(t, owner, scene))
+        result = stage(t, replace(named, masks=drawn), depth, T_new_old @ camera(t))
+        frames.append(Frame(t, owner, result))
     return frames
 
 
-def verdicts(frames: list[Frame], number: int) -> set[MotionState]:
-    return {judged.motion_state for frame in frames for judged in frame.scene.objects if judged.id == number}
+def motion_states(frames: list[Frame], number: int) -> set[MotionState]:
+    return {obj.motion_state for frame in frames for obj in frame.result.objects if obj.id == number}
 
 
-def of_class(frames: list[Frame], label: int, *but: int) -> set[MotionState]:
-    """Verdicts on a class but for some ids: what comes out of cover may have a new one."""
-    objects = [judged for frame in frames for judged in frame.scene.objects]
-    return {judged.motion_state for judged in objects if judged.label == label and judged.id not in but}
+def states_of_class(frames: list[Frame], label: int, *but: int) -> set[MotionState]:
+    """Return the motion states of a class except for some ids: an object that reappears can have a new id."""
+    objects = [obj for frame in frames for obj in frame.result.objects]
+    return {obj.motion_state for obj in objects if obj.label == label and obj.id not in but}
 
 
-def first(frames: list[Frame], number: int, verdict: MotionState) -> float:
-    """When an object is first judged so, seconds."""
-    return next((frame.stamp for frame in frames if frame[number].motion_state is verdict), math.inf)
+def first_time(frames: list[Frame], number: int, motion_state: MotionState) -> float:
+    """Return the first time at which an object has a motion state, seconds."""
+    return next((frame.stamp for frame in frames if frame[number].motion_state is motion_state), math.inf)
 
 
 def ids(frames: list[Frame]) -> set[int]:
-    return {judged.id for frame in frames for judged in frame.scene.objects}
+    return {obj.id for frame in frames for obj in frame.result.objects}
 
 
 RATES = pytest.mark.parametrize("rate", [5.0, 30.0])
-CAMERAS = pytest.mark.parametrize("camera", [standing, handheld])
+CAMERAS = pytest.mark.parametrize("camera", [static_camera, handheld])
 
 
 @RATES
 @CAMERAS
-def test_a_walker_among_what_stands_is_dynamic_and_nothing_else_is(
-    rate: float, camera: Callable[[float], Tensor]
-) -> None:
-    """0.9 m/s, at 30 frames a second 3 cm a frame: no more than noise from frame to frame, found within 0.4 s."""
-    frames = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1)), seconds=1.0, rate=rate, camera=camera)
-    assert first(frames, 4, MotionState.DYNAMIC) <= 0.4 + 1e-6
+def test_walker_is_the_only_dynamic_object(rate: float, camera: Callable[[float], Tensor]) -> None:
+    """0.9 m/s is 3 cm per frame at 30 Hz, no more than the noise; the walker is dynamic within 0.4 s."""
+    frames = simulate(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1)), seconds=1.0, rate=rate, camera=camera)
+    assert first_time(frames, 4, MotionState.DYNAMIC) <= 0.4 + 1e-6
     assert frames[-1][4].motion_state is MotionState.DYNAMIC
     assert frames[-1][4].votes >= 2
-    ballots = {ballot for frame in frames for ballot in frame.scene.vote_pairs}
-    assert any(elected == 4 for _, elected in ballots) and 4 not in {voter for voter, _ in ballots}
-    assert {4} == {judged.id for frame in frames for judged in frame.scene.objects if judged.label == PERSON}
-    assert of_class(frames, CHAIR) == of_class(frames, TV) == {MotionState.STATIC}
+    vote_pairs = {pair for frame in frames for pair in frame.result.vote_pairs}
+    assert any(candidate == 4 for _, candidate in vote_pairs) and 4 not in {voter for voter, _ in vote_pairs}
+    assert {4} == {obj.id for frame in frames for obj in frame.result.objects if obj.label == PERSON}
+    assert states_of_class(frames, CHAIR) == states_of_class(frames, TV) == {MotionState.STATIC}
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.9), (0.0, 0.0, -0.6), (0.5, 0.0, 0.7)])
-def test_a_walker_along_the_line_of_sight_is_found_as_well(velocity: Vector) -> None:
-    frames = play(*CHAIRS, walker((-0.2, 0.1, 2.2), velocity), seconds=0.6)
-    assert first(frames, 4, MotionState.DYNAMIC) <= 0.4 + 1e-6
-    assert all(verdicts(frames, number) == {MotionState.STATIC} for number in (1, 2, 3))
+def test_walker_along_the_line_of_sight_is_dynamic(velocity: Vector) -> None:
+    frames = simulate(*CHAIRS, walker((-0.2, 0.1, 2.2), velocity), seconds=0.6)
+    assert first_time(frames, 4, MotionState.DYNAMIC) <= 0.4 + 1e-6
+    assert all(motion_states(frames, number) == {MotionState.STATIC} for number in (1, 2, 3))
 
 
 @CAMERAS
 @pytest.mark.parametrize("second", [(-0.8, 0.0, 0.0), (0.8, 0.0, 0.3)])
-def test_two_walkers_do_not_outvote_what_stands(camera: Callable[[float], Tensor], second: Vector) -> None:
+def test_two_walkers_do_not_outvote_static_chairs(camera: Callable[[float], Tensor], second: Vector) -> None:
     start = (0.5, 0.0, 3.4) if second[0] < 0 else (-0.9, 0.0, 3.4)
     things = (*CHAIRS[:2], walker((-0.4, 0.1, 2.2), (0.8, 0.0, 0.0)), walker(start, second))
-    frames = play(*things, seconds=0.8, camera=camera)
+    frames = simulate(*things, seconds=0.8, camera=camera)
     assert ids(frames) == {1, 2, 3, 4}
-    assert first(frames, 3, MotionState.DYNAMIC) <= 0.45
-    assert first(frames, 4, MotionState.DYNAMIC) <= 0.6  # it is covered for a while
-    assert verdicts(frames, 1) == verdicts(frames, 2) == {MotionState.STATIC}
-    # Each walker's distance to each chair changes, but who moves is no witness: the chairs have no vote at all.
+    assert first_time(frames, 3, MotionState.DYNAMIC) <= 0.45
+    assert first_time(frames, 4, MotionState.DYNAMIC) <= 0.6  # it is occluded for a while
+    assert motion_states(frames, 1) == motion_states(frames, 2) == {MotionState.STATIC}
+    # Each walker's distance to each chair changes, but moving objects do not vote: the chairs have no votes.
     assert {frame[number].votes for frame in frames for number in (1, 2)} == {0}
 
 
 @CAMERAS
-def test_one_object_alone(camera: Callable[[float], Tensor]) -> None:
-    """Nobody else has a vote: the background decides."""
-    walking = play(walker((-0.5, 0.1, 2.5), (0.9, 0.0, 0.0)), seconds=0.6, camera=camera)
-    assert first(walking, 1, MotionState.DYNAMIC) <= 0.4 + 1e-6
-    assert verdicts(play(CHAIRS[0], seconds=1.2, camera=camera), 1) == {MotionState.STATIC}
+def test_single_object_is_classified_by_free_space(camera: Callable[[float], Tensor]) -> None:
+    """No other object can vote: the free-space check decides."""
+    walking = simulate(walker((-0.5, 0.1, 2.5), (0.9, 0.0, 0.0)), seconds=0.6, camera=camera)
+    assert first_time(walking, 1, MotionState.DYNAMIC) <= 0.4 + 1e-6
+    assert motion_states(simulate(CHAIRS[0], seconds=1.2, camera=camera), 1) == {MotionState.STATIC}
 
 
 @pytest.mark.parametrize("label", [CHAIR, PERSON])
-def test_what_a_walker_passes_in_front_of_stands(label: int) -> None:
-    """It is cut, then covered, then comes out: its centroid jumps all the time."""
-    standing_still = still((0.2, 0.3, 3.2), (0.9, 0.7, 0.4), label)
-    frames = play(standing_still, CHAIRS[0], walker((-0.45, 0.1, 2.0), (1.0, 0.0, 0.0)), seconds=1.3)
+def test_object_occluded_by_a_walker_is_not_dynamic(label: int) -> None:
+    """The object is occluded from one side to the other: its centroid jumps in every frame."""
+    standing_still = static_box((0.2, 0.3, 3.2), (0.9, 0.7, 0.4), label)
+    frames = simulate(standing_still, CHAIRS[0], walker((-0.45, 0.1, 2.0), (1.0, 0.0, 0.0)), seconds=1.3)
     pixels = [int((frame.owner == 0).sum()) for frame in frames]
     assert 50 < min(pixels) < 0.5 * pixels[0]
-    shown = [judged for frame in frames for judged in frame.scene.objects if judged.label == label and judged.id != 3]
-    x = torch.tensor([float(judged.centroid[0]) for judged in shown if label == PERSON or judged.id != 2])
+    shown = [obj for frame in frames for obj in frame.result.objects if obj.label == label and obj.id != 3]
+    x = torch.tensor([float(obj.centroid[0]) for obj in shown if label == PERSON or obj.id != 2])
     assert float((x - x[0]).abs().max()) > 0.15
-    assert of_class(frames, CHAIR) == {MotionState.STATIC}
-    assert of_class(frames, PERSON, 3) <= {MotionState.UNKNOWN, MotionState.STATIC}
+    assert states_of_class(frames, CHAIR) == {MotionState.STATIC}
+    assert states_of_class(frames, PERSON, 3) <= {MotionState.UNKNOWN, MotionState.STATIC}
     assert frames[-1][3].motion_state is MotionState.DYNAMIC
 
 
 @pytest.mark.parametrize("label", [CHAIR, PERSON])
-def test_what_the_image_border_cuts_as_the_camera_turns_stands(label: int) -> None:
-    """0.6 rad/s; the wide box slides out of the image, and its centroid along it."""
+def test_object_cut_by_the_image_border_is_not_dynamic(label: int) -> None:
+    """0.6 rad/s: the wide box leaves the image, and its centroid moves along the box."""
 
     def turning(t: float) -> Tensor:
         return se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.6 * t, 0.0], dtype=torch.float64))
 
-    wide = still((-0.8, 0.3, 2.6), (1.0, 0.4, 0.6), label)
-    frames = play(wide, CHAIRS[1], still((0.4, -0.5, 3.5)), seconds=0.9, camera=turning)
+    wide = static_box((-0.8, 0.3, 2.6), (1.0, 0.4, 0.6), label)
+    frames = simulate(wide, CHAIRS[1], static_box((0.4, -0.5, 3.5)), seconds=0.9, camera=turning)
     assert int((frames[-1].owner == 0).sum()) < 0.4 * int((frames[0].owner == 0).sum())
     assert float((frames[-1][1].centroid - frames[0][1].centroid).norm()) > 0.15
-    assert verdicts(frames, 1) == {
+    assert motion_states(frames, 1) == {
         MotionState.STATIC if label == CHAIR else MotionState.UNKNOWN
-    }  # not yet for a second
-    assert verdicts(frames, 2) == verdicts(frames, 3) == {MotionState.STATIC}
+    }  # less than a second of evidence
+    assert motion_states(frames, 2) == motion_states(frames, 3) == {MotionState.STATIC}
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.3), (0.9, 0.0, 0.0)])
-def test_a_chair_that_is_pushed_is_dynamic(velocity: Vector) -> None:
-    """Things have no gait to tell them by: they must leave their places."""
+def test_pushed_chair_is_dynamic(velocity: Vector) -> None:
+    """Rigid things are dynamic only if they vacate their places."""
     x, y, z = velocity
     pushed = Thing(CHAIR, lambda t: [((-0.4 + x * t, 0.3 + y * t, 2.5 + z * t), (0.5, 0.6, 0.5))])
-    frames = play(*CHAIRS, pushed, seconds=0.8)
-    assert first(frames, 4, MotionState.DYNAMIC) <= 0.4 + 1e-6
-    assert all(verdicts(frames, number) == {MotionState.STATIC} for number in (1, 2, 3))
+    frames = simulate(*CHAIRS, pushed, seconds=0.8)
+    assert first_time(frames, 4, MotionState.DYNAMIC) <= 0.4 + 1e-6
+    assert all(motion_states(frames, number) == {MotionState.STATIC} for number in (1, 2, 3))
 
 
-def test_a_chair_that_is_pushed_slowly_aside_is_dynamic_within_a_second() -> None:
-    """0.4 m/s: in 0.3 s it has left a quarter of its half metre, in a second four fifths."""
+def test_slowly_pushed_chair_is_dynamic_within_a_second() -> None:
+    """0.4 m/s: the chair vacates a quarter of its half metre in 0.3 s, and four fifths in a second."""
     pushed = Thing(CHAIR, lambda t: [((-0.6 + 0.4 * t, 0.3, 2.2), (0.5, 0.6, 0.5))])
-    frames = play(*CHAIRS, pushed, seconds=1.4)
-    assert all(verdicts(frames, number) == {MotionState.STATIC} for number in (1, 2, 3))
-    assert first(frames, 4, MotionState.DYNAMIC) <= 1.1
+    frames = simulate(*CHAIRS, pushed, seconds=1.4)
+    assert all(motion_states(frames, number) == {MotionState.STATIC} for number in (1, 2, 3))
+    assert first_time(frames, 4, MotionState.DYNAMIC) <= 1.1
 
 
 @CAMERAS
-def test_a_swayer_deforms_and_is_not_dynamic(camera: Callable[[float], Tensor]) -> None:
-    frames = play(*CHAIRS, swayer((0.0, 0.1, 2.4)), seconds=2.0, camera=camera)
-    assert MotionState.DYNAMIC not in verdicts(frames, 4)
-    assert first(frames, 4, MotionState.DEFORMING) <= 0.6
+def test_swaying_person_is_deforming_and_not_dynamic(camera: Callable[[float], Tensor]) -> None:
+    frames = simulate(*CHAIRS, swaying_person((0.0, 0.1, 2.4)), seconds=2.0, camera=camera)
+    assert MotionState.DYNAMIC not in motion_states(frames, 4)
+    assert first_time(frames, 4, MotionState.DEFORMING) <= 0.6
     assert {frame[4].motion_state for frame in frames if frame.stamp > 0.6} == {MotionState.DEFORMING}
     assert max(frame[4].chamfer for frame in frames if frame.stamp >= 0.3) > 0.025
     for number in (1, 2, 3):
-        assert verdicts(frames, number) == {MotionState.STATIC}
+        assert motion_states(frames, number) == {MotionState.STATIC}
 
 
-def test_chamfer_of_somebody_who_stands_is_noise_and_things_have_none() -> None:
+def test_chamfer_of_standing_person_is_noise_and_of_things_is_nan() -> None:
     things = (*CHAIRS, walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)))
-    frames = play(*things, seconds=0.8, camera=handheld)
+    frames = simulate(*things, seconds=0.8, camera=handheld)
     assert all(math.isnan(frame[4].chamfer) for frame in frames if frame.stamp < 0.29)
     assert all(0 < frame[4].chamfer < 0.02 for frame in frames if frame.stamp > 0.31)
     assert all(math.isnan(frame[number].chamfer) for frame in frames for number in (1, 2, 3))
 
 
-def test_chamfer_is_asked_of_those_alone_whom_the_votes_leave_as_static() -> None:
-    """Somebody who walks changes shape all the time; who has come to rest is measured again once the vote lapses."""
+def test_chamfer_is_measured_only_if_the_vote_is_static() -> None:
+    """A walking person is dynamic and not compared; a person at rest is compared again when the dynamic state ends."""
     rests, hold = 1.2, 0.4
     somebody = walker((-0.8, 0.1, 2.4), (0.9, 0.0, 0.0), stop=rests)
-    frames = play(*CHAIRS, somebody, seconds=2.6, overrides=(f"objects.static_mask.hold_dynamic_time={hold}",))
+    frames = simulate(*CHAIRS, somebody, seconds=2.6, overrides=(f"objects.static_mask.hold_dynamic_time={hold}",))
     walks = [frame[4] for frame in frames if 0.5 < frame.stamp < rests]
-    assert {judged.motion_state for judged in walks} == {MotionState.DYNAMIC}
-    assert all(math.isnan(judged.chamfer) for judged in walks)
+    assert {obj.motion_state for obj in walks} == {MotionState.DYNAMIC}
+    assert all(math.isnan(obj.chamfer) for obj in walks)
     assert all(frame[4].motion_state is not MotionState.DYNAMIC or math.isnan(frame[4].chamfer) for frame in frames)
     assert all(frame[4].chamfer < 0.02 for frame in frames if frame.stamp > 2.4)
 
 
-SHORT = ("objects.voting.baselines=[0.0, 0.3]", "objects.free_space.baselines=[0.3]")  # looks back 0.3 s and no more
+SHORT = ("objects.voting.baselines=[0.0, 0.3]", "objects.free_space.baselines=[0.3]")  # compares over 0.3 s only
 
 
 @RATES
-def test_a_verdict_holds_and_ends(rate: float) -> None:
-    """The walk ends after 0.8 s; the last pair of views that shows it, 0.3 or 0.4 s apart, after 1.1 or 1.2 s."""
+def test_dynamic_state_is_held_and_ends(rate: float) -> None:
+    """The walk ends after 0.8 s. The last pair of views that shows motion, 0.3 or 0.4 s apart, is at 1.1 or 1.2 s."""
     thing = walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.8)
-    frames = play(*CHAIRS, thing, seconds=2.4, rate=rate, overrides=(*SHORT, "objects.chamfer.enabled=false"))
+    frames = simulate(*CHAIRS, thing, seconds=2.4, rate=rate, overrides=(*SHORT, "objects.chamfer.enabled=false"))
     dynamic = [frame.stamp for frame in frames if frame[4].motion_state is MotionState.DYNAMIC]
     assert dynamic == [frame.stamp for frame in frames if dynamic[0] <= frame.stamp <= dynamic[-1]]
     assert 0.8 + 1.0 <= dynamic[-1] < 0.8 + 0.4 + 1.0 + 1e-6
     assert {frame[4].motion_state for frame in frames if frame.stamp > 2.25} == {MotionState.STATIC}
 
 
-def test_a_verdict_holds_for_the_configured_time() -> None:
+def test_dynamic_state_is_held_for_the_configured_time() -> None:
     thing = walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.6)
     short, long = (
-        play(
+        simulate(
             *CHAIRS,
             thing,
             seconds=1.7,
@@ -377,44 +359,42 @@ def test_a_verdict_holds_for_the_configured_time() -> None:
         for hold in (0.2, 0.6)
     )
     ends = [max(frame.stamp for frame in run if frame[4].motion_state is MotionState.DYNAMIC) for run in (short, long)]
-    assert ends[1] - ends[0] == pytest.approx(0.4, abs=1.01 / 15)  # a frame more or less by rounding
+    assert ends[1] - ends[0] == pytest.approx(0.4, abs=1.01 / 15)  # one frame of rounding
 
 
 def flashing(t: float) -> list[Box]:
-    """For a single frame its depth is wrong."""
+    """Box with a wrong depth in a single frame."""
     return [((-0.2, 0.3, 2.5 if abs(t - 0.6) > 0.01 else 2.0), (0.5, 0.6, 0.5))]
 
 
-@pytest.mark.parametrize(("least", "label", "held"), [(3, PERSON, False), (2, PERSON, True), (2, CHAIR, False)])
-def test_a_verdict_is_held_after_enough_frames_with_evidence_on_who_may_pause(
-    least: int, label: int, held: bool
-) -> None:
-    """Two frames show a motion, though there was none: that in which the depth is wrong, and that 0.3 s later."""
+@pytest.mark.parametrize(("min_frames", "label", "held"), [(3, PERSON, False), (2, PERSON, True), (2, CHAIR, False)])
+def test_dynamic_state_of_living_object_is_held_after_enough_evidence(min_frames: int, label: int, held: bool) -> None:
+    """Two frames stage a false motion: the frame with the wrong depth, and the frame 0.3 s later."""
     overrides = (
-        f"objects.static_mask.confirm_dynamic_frames={least}",
+        f"objects.static_mask.confirm_dynamic_frames={min_frames}",
         "objects.voting.baselines=[0.3]",
         "objects.chamfer.enabled=false",
     )
-    frames = play(*CHAIRS, Thing(label, flashing), seconds=1.5, overrides=overrides)
+    frames = simulate(*CHAIRS, Thing(label, flashing), seconds=1.5, overrides=overrides)
     dynamic = [index for index, frame in enumerate(frames) if frame[4].motion_state is MotionState.DYNAMIC]
-    # At 15 frames a second 0.3 s are 5 frames, and the second that a verdict is held 15.
+    # At 15 Hz, 0.3 s are 5 frames, and the state is held for 15 frames.
     assert dynamic == ([9, *range(14, len(frames))] if held else [9, 14])
 
 
 @RATES
-def test_a_person_is_unknown_until_seen_still_for_long_enough(rate: float) -> None:
-    """The background knows after its longest baseline, 0.9 s, or 1 s at 5 frames a second; without it it is 1 s."""
+def test_standing_person_is_unknown_before_static(rate: float) -> None:
+    """The free-space check decides after its longest baseline, 0.9 s, or 1 s at 5 Hz; without it after 1 s."""
     things = (walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)), CHAIRS[0])
-    for told, known in (("true", math.ceil(0.9 * rate) / rate), ("false", 1.0)):
-        overrides = (f"objects.free_space.enabled={told}", "objects.chamfer.enabled=false")
-        for frame in play(*things, seconds=1.4, rate=rate, camera=handheld, overrides=overrides):
+    for enabled, known in (("true", math.ceil(0.9 * rate) / rate), ("false", 1.0)):
+        overrides = (f"objects.free_space.enabled={enabled}", "objects.chamfer.enabled=false")
+        for frame in simulate(*things, seconds=1.4, rate=rate, camera=handheld, overrides=overrides):
             assert frame[1].motion_state is (MotionState.UNKNOWN if frame.stamp < known - 1e-9 else MotionState.STATIC)
             assert frame[2].motion_state is MotionState.STATIC
 
 
 @pytest.mark.parametrize(("fitting", "motion_state"), [(1.0, MotionState.STATIC), (0.2, MotionState.UNKNOWN)])
-def test_a_person_whose_features_fit_the_motion_is_none_or_stands(fitting: float, verdict: MotionState) -> None:
-    """Rolled furniture over most of the image: at first sight all that tells are the features on it."""
+def test_person_with_supporting_features_is_static(fitting: float, motion_state: MotionState) -> None:
+    """Rotated furniture over most of the image: in the first frame, only the features on it are evidence."""
     depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
     mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
     mask[:, :, : 3 * CAMERA.width // 4] = True
@@ -424,191 +404,189 @@ def test_a_person_whose_features_fit_the_motion_is_none_or_stands(fitting: float
     fits = torch.rand(len(pixel), generator=torch.Generator().manual_seed(0)) < 0.8
     on_person = mask[0, pixel[:, 1], pixel[:, 0]]
     fits[on_person] &= torch.rand(int(on_person.sum()), generator=torch.Generator().manual_seed(1)) < fitting
-    stage = Stage(ObjectsConfig())
-    stage.witnesses = FeatureSupport(pixel, fits)
-    (judged,) = stage(0.0, person, depth, HERE).objects
-    assert judged.motion_state is verdict
+    stage = ObjectStage(ObjectsConfig())
+    stage.feature_support = FeatureSupport(pixel, fits)
+    (obj,) = stage(0.0, person, depth, HERE).objects
+    assert obj.motion_state is motion_state
 
 
 @pytest.mark.parametrize("label", [PERSON, DOG])
-@pytest.mark.parametrize(("told", "motion_state"), [("true", MotionState.STATIC), ("false", MotionState.UNKNOWN)])
-def test_what_stood_there_already_is_static_at_first_sight(label: int, told: str, verdict: MotionState) -> None:
-    """The network finds it after 1 s only, when the background knows long since that nothing has come."""
+@pytest.mark.parametrize(("enabled", "motion_state"), [("true", MotionState.STATIC), ("false", MotionState.UNKNOWN)])
+def test_new_detection_of_old_surface_is_static_at_once(label: int, enabled: str, motion_state: MotionState) -> None:
+    """The network detects the object only after 1 s, when the free-space check has all its baselines."""
     thing = walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0), label=label)
-    overrides = (f"objects.free_space.enabled={told}",)
-    frames = play(
+    overrides = (f"objects.free_space.enabled={enabled}",)
+    frames = simulate(
         *CHAIRS, thing, seconds=1.1, camera=handheld, hidden=lambda t: {3} if t < 1.05 else set(), overrides=overrides
     )
     assert ids(frames[:-1]) == {1, 2, 3}
-    assert frames[-1][4].motion_state is verdict
+    assert frames[-1][4].motion_state is motion_state
 
 
-@pytest.mark.parametrize(("told", "motion_state"), [("true", MotionState.DYNAMIC), ("false", MotionState.UNKNOWN)])
-def test_who_has_come_is_dynamic_at_first_sight(told: str, verdict: MotionState) -> None:
-    """Nobody has a distance to an object that was not there before; the background saw that its place was empty."""
+@pytest.mark.parametrize(("enabled", "motion_state"), [("true", MotionState.DYNAMIC), ("false", MotionState.UNKNOWN)])
+def test_new_detection_in_free_space_is_dynamic_at_once(enabled: str, motion_state: MotionState) -> None:
+    """A new object has no earlier distances for a vote, but its place was free space."""
     thing = walker((-0.6, 0.1, 2.3), (0.9, 0.0, 0.0))
-    overrides = (NAMED_ONLY, f"objects.free_space.enabled={told}")
-    frames = play(
+    overrides = (NO_UNLABELLED, f"objects.free_space.enabled={enabled}")
+    frames = simulate(
         *CHAIRS, thing, seconds=0.6, camera=handheld, hidden=lambda t: {3} if t < 0.59 else set(), overrides=overrides
     )
     assert ids(frames[:-1]) == {1, 2, 3}
-    assert frames[-1][4].motion_state is verdict
+    assert frames[-1][4].motion_state is motion_state
     assert frames[-1][4].votes == 0
-    assert not frames[-1].scene.static_mask[frames[-1].owner == 3].any()
+    assert not frames[-1].result.static_mask[frames[-1].owner == 3].any()
 
 
 @CAMERAS
-def test_a_walker_whom_the_network_never_finds_is_left_out_all_the_same(camera: Callable[[float], Tensor]) -> None:
+def test_walker_missed_by_the_network_is_masked(camera: Callable[[float], Tensor]) -> None:
     thing = walker((-0.8, 0.1, 2.3), (0.9, 0.0, 0.0))
-    frames = play(*CHAIRS, thing, seconds=1.5, camera=camera, hidden=lambda _: {3})
+    frames = simulate(*CHAIRS, thing, seconds=1.5, camera=camera, hidden=lambda _: {3})
     late = [frame for frame in frames if frame.stamp > 0.5]
-    left_out = torch.cat([~frame.scene.static_mask[frame.owner == 3] for frame in late])
-    assert float(left_out.double().mean()) > 0.9
-    assert of_class(late, UNLABELLED) == {MotionState.DYNAMIC}
-    away = [frame.scene.static_mask[away_from(frame.owner == 3) > 20] for frame in frames]
-    assert torch.cat(away).all()
-    assert of_class(frames, CHAIR) == of_class(frames, TV) == {MotionState.STATIC}
+    masked = torch.cat([~frame.result.static_mask[frame.owner == 3] for frame in late])
+    assert float(masked.double().mean()) > 0.9
+    assert states_of_class(late, UNLABELLED) == {MotionState.DYNAMIC}
+    distance = [frame.result.static_mask[distance_to(frame.owner == 3) > 20] for frame in frames]
+    assert torch.cat(distance).all()
+    assert states_of_class(frames, CHAIR) == states_of_class(frames, TV) == {MotionState.STATIC}
 
 
 @pytest.mark.parametrize(
     ("score", "sightings", "motion_state"),
     [(0.2, 1, MotionState.STATIC), (0.2, 2, MotionState.UNKNOWN), (0.4, 1, MotionState.UNKNOWN)],
 )
-def test_what_was_seen_weakly_and_once_is_not_left_out_when_missed(
-    score: float, sightings: int, verdict: MotionState
-) -> None:
+def test_missed_object_with_low_score_is_static(score: float, sightings: int, motion_state: MotionState) -> None:
     things = (*CHAIRS, walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)))
-    frames = play(*things, seconds=0.2, score=score, hidden=lambda t: {3} if 15 * t > sightings - 0.5 else set())
+    frames = simulate(*things, seconds=0.2, score=score, hidden=lambda t: {3} if 15 * t > sightings - 0.5 else set())
     for index, frame in enumerate(frames):
         assert frame[4].missed is (index >= sightings)
-        assert frame[4].motion_state is (verdict if frame[4].missed else MotionState.UNKNOWN)
-        usable = frame.scene.static_mask[frame.owner == 3]
+        assert frame[4].motion_state is (motion_state if frame[4].missed else MotionState.UNKNOWN)
+        usable = frame.result.static_mask[frame.owner == 3]
         assert usable.all() if frame[4].motion_state is MotionState.STATIC else float(usable.double().mean()) < 0.05
 
 
-def test_who_was_seen_weakly_but_moving_stays_left_out_when_missed() -> None:
-    """Eleven sightings with scores of 0.02 are 0.22 together, less than the 0.3 of one who stands."""
+def test_missed_object_with_low_score_that_moved_is_dynamic() -> None:
+    """Eleven detections with scores of 0.02 add up to 0.22, less than the 0.3 that a static object needs."""
     thing = walker((-0.6, 0.1, 2.3), (0.9, 0.0, 0.0))
     hidden = {"score": 0.02, "hidden": lambda t: {3} if t > 0.69 else set()}
-    frame = play(*CHAIRS, thing, seconds=0.8, overrides=(NAMED_ONLY,), **hidden)[-1]  # type: ignore[arg-type]
+    frame = simulate(*CHAIRS, thing, seconds=0.8, overrides=(NO_UNLABELLED,), **hidden)[-1]  # type: ignore[arg-type]
     assert frame[4].missed
     assert frame[4].motion_state is MotionState.DYNAMIC
 
 
-def test_who_stopped_and_is_missed_where_he_stands_is_static_at_once() -> None:
-    """The verdict of his walk would be held to the end: the last evidence is 0.9 s after it, 1 s is held."""
+def test_missed_object_that_stopped_is_static_at_once() -> None:
+    """Without the rule the dynamic state would last to the end: 0.9 s until the last evidence, and 1 s held."""
     thing = walker((-0.6, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.5)
-    frames = play(*CHAIRS, thing, seconds=1.7, hidden=lambda t: {3} if t > 1.55 else set())
+    frames = simulate(*CHAIRS, thing, seconds=1.7, hidden=lambda t: {3} if t > 1.55 else set())
     for frame in frames:
         if frame.stamp > 1.45:
             assert frame[4].missed is (frame.stamp > 1.55)
             assert frame[4].motion_state is (MotionState.STATIC if frame[4].missed else MotionState.DYNAMIC)
 
 
-def test_the_static_mask_leaves_out_who_moves_or_might_up_to_the_seam_and_nothing_else() -> None:
-    """What lies beside them is metres behind: the margin takes none of it, but for the seam of 2 pixels."""
-    things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), swayer((1.0, 0.0, 2.0)))
-    frame = play(*things, seconds=0.9)[-1]
+def test_static_mask_excludes_moving_and_unknown_objects_only() -> None:
+    """The background is metres behind the objects: only the dilation of 2 pixels masks a part of it."""
+    things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), swaying_person((1.0, 0.0, 2.0)))
+    frame = simulate(*things, seconds=0.9)[-1]
     assert [frame[number].motion_state for number in (4, 5)] == [MotionState.DYNAMIC, MotionState.DEFORMING]
-    late = play(*things, seconds=0.1)[-1]
+    late = simulate(*things, seconds=0.1)[-1]
     assert [late[number].motion_state for number in (4, 5)] == [MotionState.UNKNOWN, MotionState.UNKNOWN]
     for shown in (frame, late):
-        away = away_from(shown.owner >= 3)
-        assert not shown.scene.static_mask[away <= 1].any()  # a side seen as a sliver is no part of the cloud
-        assert shown.scene.static_mask[away >= 3].all()
-        # Chairs stay usable as well.
-        assert int(((shown.owner >= 0) & (shown.owner < 3) & (away >= 3)).sum()) > 500
+        distance = distance_to(shown.owner >= 3)
+        assert not shown.result.static_mask[distance <= 1].any()  # a side seen at a grazing angle is not in the cloud
+        assert shown.result.static_mask[distance >= 3].all()
+        # Chairs stay in the static mask.
+        assert int(((shown.owner >= 0) & (shown.owner < 3) & (distance >= 3)).sum()) > 500
 
 
-@pytest.mark.parametrize("grown", [-3, 4])
-def test_the_outline_of_a_mover_follows_the_depth_and_not_the_mask(grown: int) -> None:
-    """Too small a mask leaves his rim to the margin, too large a one takes a slice of the wall along."""
-    frames = play(*CHAIRS[:2], walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), seconds=0.6, grown=grown)
+@pytest.mark.parametrize("mask_growth", [-3, 4])
+def test_refined_mask_follows_the_depth(mask_growth: int) -> None:
+    """A mask that is too small misses the rim, and one that is too large includes a part of the wall."""
+    frames = simulate(*CHAIRS[:2], walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), seconds=0.6, mask_growth=mask_growth)
     for frame in frames:
         assert frame[3].motion_state is not MotionState.STATIC
-        assert int((frame[3].mask ^ (frame.owner == 2)).sum()) > 250  # is drawn wrong indeed
-        away = away_from(frame.owner == 2)
-        assert not frame.scene.static_mask[away <= 1].any()  # a side seen as a sliver is no part of the cloud
-        assert frame.scene.static_mask[away >= 3].all()
+        assert int((frame[3].mask ^ (frame.owner == 2)).sum()) > 250  # the mask is wrong
+        distance = distance_to(frame.owner == 2)
+        assert not frame.result.static_mask[distance <= 1].any()  # a side seen at a grazing angle is not in the cloud
+        assert frame.result.static_mask[distance >= 3].all()
 
 
-def test_the_margin_bounds_how_far_his_own_depth_is_followed() -> None:
-    frame = play(
+def test_depth_margin_limits_the_refined_mask() -> None:
+    frame = simulate(
         *CHAIRS[:2],
         walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)),
         seconds=0.1,
-        grown=-6,
+        mask_growth=-6,
         overrides=(
             "objects.static_mask.depth_margin=2",
             "objects.static_mask.surface_margin=0",
             "objects.static_mask.dilation=0",
         ),
     )[-1]
-    own, away = frame.owner == 2, away_from(frame[3].mask)
-    assert frame.scene.static_mask[own & (away >= 3)].all()
-    assert float(frame.scene.static_mask[own & (away <= 2)].double().mean()) < 0.02
-    assert int((own & (away >= 3)).sum()) > 100
+    own, distance = frame.owner == 2, distance_to(frame[3].mask)
+    assert frame.result.static_mask[own & (distance >= 3)].all()
+    assert float(frame.result.static_mask[own & (distance <= 2)].double().mean()) < 0.02
+    assert int((own & (distance >= 3)).sum()) > 100
 
 
-def test_pixels_without_depth_beside_a_mover_are_left_out_within_the_margin() -> None:
-    """Nobody knows whose they are: a structured-light camera loses the rim of what is near."""
+def test_pixels_without_depth_are_masked_within_the_margin() -> None:
+    """A structured-light camera has no depth beside near objects."""
     thing = walker((-0.1, 0.1, 2.3), (0.0, 0.0, 0.0))
-    depth, owner = photograph([thing], 0.0, HERE, 0.0)
-    away = away_from(owner == 0)
-    depth[0, (away > 0) & (away < 20)] = 0.0
-    stage = Stage(
+    depth, owner = render([thing], 0.0, HERE, 0.0)
+    distance = distance_to(owner == 0)
+    depth[0, (distance > 0) & (distance < 20)] = 0.0
+    stage = ObjectStage(
         load_config(None, (STRIDE, "objects.static_mask.depth_margin=5", "objects.static_mask.dilation=0")).objects
     )
-    static = stage(0.0, found(owner, [thing], set()), depth, HERE).static_mask
-    assert not static[away <= 4].any()
-    assert static[away >= 6].all()
+    static = stage(0.0, detect(owner, [thing], set()), depth, HERE).static_mask
+    assert not static[distance <= 4].any()
+    assert static[distance >= 6].all()
 
 
-def test_a_margin_and_a_seam_of_nothing_leave_out_the_object_itself() -> None:
+def test_zero_margin_and_dilation_mask_the_object_only() -> None:
     overrides = ("objects.static_mask.depth_margin=0", "objects.static_mask.dilation=0")
-    frame = play(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), seconds=0.2, overrides=overrides)[-1]
-    assert frame.scene.static_mask[frame.owner != 3].all()
-    assert not frame.scene.static_mask[
-        away_from(frame.owner != 3) > 1
-    ].any()  # a side seen as a sliver is not in the cloud
+    frame = simulate(*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), seconds=0.2, overrides=overrides)[-1]
+    assert frame.result.static_mask[frame.owner != 3].all()
+    assert not frame.result.static_mask[
+        distance_to(frame.owner != 3) > 1
+    ].any()  # a side seen at a grazing angle is not in the cloud
 
 
-def test_features_on_the_deforming_are_kept_when_asked_for() -> None:
-    things = (*CHAIRS, swayer((0.0, 0.1, 2.4)))
-    kept, left_out = (
-        play(*things, seconds=0.8, overrides=(f"objects.chamfer.keep_deforming_features={include}",))[-1]
+def test_keep_deforming_features_keeps_deforming_objects_in_the_mask() -> None:
+    things = (*CHAIRS, swaying_person((0.0, 0.1, 2.4)))
+    included, masked = (
+        simulate(*things, seconds=0.8, overrides=(f"objects.chamfer.keep_deforming_features={include}",))[-1]
         for include in ("true", "false")
     )
-    assert kept[4].motion_state is left_out[4].motion_state is MotionState.DEFORMING
-    assert kept.scene.static_mask.all()
-    assert not left_out.scene.static_mask[left_out.owner == 3].any()
+    assert included[4].motion_state is masked[4].motion_state is MotionState.DEFORMING
+    assert included.result.static_mask.all()
+    assert not masked.result.static_mask[masked.owner == 3].any()
 
 
-def test_somebody_who_stands_is_tracked_on_but_not_mapped() -> None:
+def test_static_person_is_in_static_mask_but_not_in_mask_without_people() -> None:
     things = (CHAIRS[0], walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)))
-    scene = (frame := play(*things, seconds=1.2)[-1]).scene
+    result = (frame := simulate(*things, seconds=1.2)[-1]).result
     assert frame[2].motion_state is MotionState.STATIC
-    assert scene.static_mask.all()
-    away = away_from(frame.owner == 1)
-    assert not scene.static_without_people[away <= 2].any()
-    assert scene.static_without_people[away >= 3].all()
+    assert result.static_mask.all()
+    distance = distance_to(frame.owner == 1)
+    assert not result.static_without_people[distance <= 2].any()
+    assert result.static_without_people[distance >= 3].all()
 
 
-def test_a_missed_walker_goes_on_as_what_came_and_has_no_name() -> None:
+def test_missed_walker_continues_as_unlabelled_instance() -> None:
     things = (*CHAIRS, walker((-0.8, 0.1, 2.3), (0.9, 0.0, 0.0)))
-    frames = play(*things, seconds=1.6, hidden=lambda t: {3} if t > 0.65 else set())
+    frames = simulate(*things, seconds=1.6, hidden=lambda t: {3} if t > 0.65 else set())
     for frame in frames:
-        if frame.stamp > 0.65:  # more than the half second that it would be predicted
+        if frame.stamp > 0.65:  # later than the maximum time of prediction, half a second
             assert frame[4].motion_state is MotionState.DYNAMIC
             assert not frame[4].missed
-            assert frame[4].label == PERSON  # as it was seen most of the time
-            assert float((~frame.scene.static_mask)[frame.owner == 3].double().mean()) > 0.9
+            assert frame[4].label == PERSON  # the class of most detections
+            assert float((~frame.result.static_mask)[frame.owner == 3].double().mean()) > 0.9
     assert ids(frames) == {1, 2, 3, 4}
 
 
-def test_a_missed_walker_stays_left_out_where_it_must_be_and_is_then_forgotten() -> None:
+def test_missed_walker_is_masked_where_predicted_and_then_removed() -> None:
     things = (*CHAIRS, walker((-0.6, 0.1, 2.3), (0.9, 0.0, 0.0)))
-    frames = play(*things, seconds=1.4, hidden=lambda t: {3} if t > 0.65 else set(), overrides=(NAMED_ONLY,))
+    frames = simulate(*things, seconds=1.4, hidden=lambda t: {3} if t > 0.65 else set(), overrides=(NO_UNLABELLED,))
     for frame in frames[:-1]:
         if 0.65 < frame.stamp < 1.1:
             assert frame[4].missed
@@ -616,32 +594,36 @@ def test_a_missed_walker_stays_left_out_where_it_must_be_and_is_then_forgotten()
             assert math.isnan(frame[4].chamfer)
             true_x = -0.6 + 0.9 * frame.stamp
             assert float(frame[4].centroid[0]) == pytest.approx(true_x, abs=0.1)
-            left_out = (~frame.scene.static_mask)[frame.owner == 3]
-            assert float(left_out.double().mean()) > 0.98
-    assert 4 not in {judged.id for judged in frames[-1].scene.objects}
-    assert frames[-1].scene.static_mask.all()
+            masked = (~frame.result.static_mask)[frame.owner == 3]
+            assert float(masked.double().mean()) > 0.98
+    assert 4 not in {obj.id for obj in frames[-1].result.objects}
+    assert frames[-1].result.static_mask.all()
 
 
-def test_without_voting_nothing_is_dynamic_and_without_chamfer_nothing_deforms() -> None:
+def test_disabled_voting_and_chamfer_give_no_motion() -> None:
     things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)))
-    no_voting = play(*things, seconds=0.5, overrides=("objects.voting.enabled=false",))
-    assert MotionState.DYNAMIC not in verdicts(no_voting, 4)
+    no_voting = simulate(*things, seconds=0.5, overrides=("objects.voting.enabled=false",))
+    assert MotionState.DYNAMIC not in motion_states(no_voting, 4)
     assert {frame[4].votes for frame in no_voting} == {0}
-    no_chamfer = play(*CHAIRS, swayer((0.0, 0.1, 2.4)), seconds=0.8, overrides=("objects.chamfer.enabled=false",))
-    assert MotionState.DEFORMING not in verdicts(no_chamfer, 4)
+    no_chamfer = simulate(
+        *CHAIRS, swaying_person((0.0, 0.1, 2.4)), seconds=0.8, overrides=("objects.chamfer.enabled=false",)
+    )
+    assert MotionState.DEFORMING not in motion_states(no_chamfer, 4)
     assert all(math.isnan(frame[4].chamfer) for frame in no_chamfer)
 
 
-@pytest.mark.parametrize("thing", [walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1), stop=0.5), swayer((0.0, 0.1, 2.4))])
-def test_verdicts_do_not_change_when_the_world_is_corrected_under_them(thing: Thing) -> None:
+@pytest.mark.parametrize(
+    "thing", [walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1), stop=0.5), swaying_person((0.0, 0.1, 2.4))]
+)
+def test_world_correction_keeps_motion_states(thing: Thing) -> None:
     T_new_old = se3_exp(torch.tensor([0.7, -0.2, 1.5, 0.2, -0.8, 0.4], dtype=torch.float64))
     overrides = ("objects.static_mask.hold_dynamic_time=0.2",)
     arguments = {"seconds": 1.2, "camera": handheld, "overrides": overrides}
-    never = play(*CHAIRS, thing, **arguments)  # type: ignore[arg-type]
-    then = play(*CHAIRS, thing, correction=(0.5, T_new_old), **arguments)  # type: ignore[arg-type]
-    assert ids(never) == ids(then) == {1, 2, 3, 4}
-    assert len(verdicts(never, 4)) > 1
-    for old, new in zip(never, then, strict=True):
+    uncorrected = simulate(*CHAIRS, thing, **arguments)  # type: ignore[arg-type]
+    corrected = simulate(*CHAIRS, thing, correction=(0.5, T_new_old), **arguments)  # type: ignore[arg-type]
+    assert ids(uncorrected) == ids(corrected) == {1, 2, 3, 4}
+    assert len(motion_states(uncorrected, 4)) > 1
+    for old, new in zip(uncorrected, corrected, strict=True):
         for number in (1, 2, 3, 4):
             assert old[number].motion_state is new[number].motion_state
             assert old[number].votes == new[number].votes
@@ -651,19 +633,19 @@ def test_verdicts_do_not_change_when_the_world_is_corrected_under_them(thing: Th
         torch.testing.assert_close(new[4].centroid, expected, rtol=0.0, atol=1e-5)
 
 
-# The paper's literal rules, on centroids that are given: four objects on the corners of a rectangle of 0.6 m by 0.8 m.
+# The paper's literal rules on given centroids: four objects on the corners of a rectangle of 0.6 m by 0.8 m.
 CORNERS = torch.tensor([[0.0, 0.0, 2.0], [0.6, 0.0, 2.0], [0.0, 0.8, 2.0], [0.6, 0.8, 2.0]])
 
 
-class Literal:
-    """The object stage with configs/paper.yaml, shown a small ball of points at each of some places."""
+class PaperStage:
+    """Object stage with configs/paper.yaml; every object is a small ball of points around its centroid."""
 
     def __init__(self) -> None:
         config = load_config(PAPER).objects
-        self._judge = MotionClassifier(config, CAMERA)
-        self._watch = FreeSpaceCheck(config.free_space, CAMERA)
+        self._classify = MotionClassifier(config, CAMERA)
+        self._free_space_check = FreeSpaceCheck(config.free_space, CAMERA)
         self._frame = -1
-        self.ballots: list[tuple[int, int]] = []
+        self.vote_pairs: list[tuple[int, int]] = []
 
     def __call__(self, centroids: Tensor, T_wc: Tensor = HERE) -> dict[int, TrackedObject]:
         self._frame += 1
@@ -677,142 +659,165 @@ class Literal:
         clouds = InstanceClouds(centroids[:, None] + ball, torch.ones(count, 64, dtype=torch.bool), centroids, masks)
         instances = Instances(masks, torch.full((count,), CHAIR), torch.ones(count), torch.zeros(count, 4))
         view = DepthView(self._frame / 30, torch.full((1, CAMERA.height, CAMERA.width), WALL), invert(T_wc))
-        scene = self._judge(instances, clouds, view, self._watch(view), NO_WITNESSES)
-        self._watch.remember(view)
-        self.ballots = scene.vote_pairs
-        return {judged.id: judged for judged in scene.objects}
+        result = self._classify(instances, clouds, view, self._free_space_check(view), NO_FEATURES)
+        self._free_space_check.remember(view)
+        self.vote_pairs = result.vote_pairs
+        return {obj.id: obj for obj in result.objects}
 
 
-def test_literal_rules_equal_algorithm_1_by_hand() -> None:
+def test_paper_rules_equal_algorithm_1_by_hand() -> None:
     """A moves 0.1 m towards C. Distances of A: to B 0.6 -> 0.608, to C 0.8 -> 0.7, to D 1.0 -> 0.922.
 
-    With T_d = 0.05 m that is a vote each between A and C, and A and D; with T_v = 2 only A, who has both, is dynamic.
+    With T_d = 0.05 m, A and C vote for each other, and so do A and D. With T_v = 2 only A, with two votes, is dynamic.
     """
-    show = Literal()
-    assert {judged.votes for judged in show(CORNERS).values()} == {0}
+    stage = PaperStage()
+    assert {obj.votes for obj in stage(CORNERS).values()} == {0}
     moved = CORNERS.clone()
     moved[0, 1] = 0.1
-    judged = show(moved)
-    assert {number: judged[number].votes for number in judged} == {1: 2, 2: 0, 3: 1, 4: 1}
-    assert show.ballots == [(1, 3), (1, 4), (3, 1), (4, 1)]  # who voted, for whom
-    for number, place in enumerate(moved, start=1):
-        torch.testing.assert_close(judged[number].cloud.mean(dim=0), place, rtol=0.0, atol=1e-5)
-    assert [judged[number].motion_state is MotionState.DYNAMIC for number in (1, 2, 3, 4)] == [
+    objects = stage(moved)
+    assert {number: objects[number].votes for number in objects} == {1: 2, 2: 0, 3: 1, 4: 1}
+    assert stage.vote_pairs == [(1, 3), (1, 4), (3, 1), (4, 1)]  # voter, candidate
+    for number, centroid in enumerate(moved, start=1):
+        torch.testing.assert_close(objects[number].cloud.mean(dim=0), centroid, rtol=0.0, atol=1e-5)
+    assert [objects[number].motion_state is MotionState.DYNAMIC for number in (1, 2, 3, 4)] == [
         True,
         False,
         False,
         False,
     ]
-    # Consecutive frames only, and a verdict for its frame only: in the next, where all stand, nobody moves.
-    judged = show(moved)
-    assert {judged[number].votes for number in judged} == {0} and show.ballots == []
-    assert {judged[number].motion_state for number in judged} == {MotionState.STATIC}
+    # Consecutive frames only, and no memory: in the next frame all objects stand still and are static.
+    objects = stage(moved)
+    assert {objects[number].votes for number in objects} == {0} and stage.vote_pairs == []
+    assert {objects[number].motion_state for number in objects} == {MotionState.STATIC}
 
 
-def test_literal_rules_let_two_movers_outvote_the_others() -> None:
-    """A and D go 0.1 m up and down: B and C get a vote of each, two in all, and are taken for dynamic as well.
+def test_paper_rules_let_two_moving_objects_outvote_the_others() -> None:
+    """A and D move 0.1 m up and down: B and C get votes from both and become dynamic as well.
 
     Distances: AB 0.6 -> 0.608, AC 0.8 -> 0.9, AD 1.0 -> 1.166, BD 0.8 -> 0.9, CD 0.6 -> 0.608, BC as it was. So A and
     D have two votes, B and C one. With A also 0.1 m to the left: AB 0.7071, AC 0.906: two votes for B and C.
     """
-    show = Literal()
-    show(CORNERS)
+    stage = PaperStage()
+    stage(CORNERS)
     moved = CORNERS.clone()
     moved[0, 1] -= 0.1
     moved[3, 1] += 0.1
-    judged = show(moved)
-    assert [judged[number].votes for number in (1, 2, 3, 4)] == [2, 1, 1, 2]
-    show = Literal()
-    show(CORNERS)
+    objects = stage(moved)
+    assert [objects[number].votes for number in (1, 2, 3, 4)] == [2, 1, 1, 2]
+    stage = PaperStage()
+    stage(CORNERS)
     moved[0, 0] -= 0.1
     moved[3, 0] += 0.1
-    judged = show(moved)
-    assert [judged[number].votes for number in (1, 2, 3, 4)] == [3, 2, 2, 3]
-    assert {judged[number].motion_state for number in judged} == {MotionState.DYNAMIC}
+    objects = stage(moved)
+    assert [objects[number].votes for number in (1, 2, 3, 4)] == [3, 2, 2, 3]
+    assert {objects[number].motion_state for number in objects} == {MotionState.DYNAMIC}
 
 
-def test_literal_rules_need_no_pose() -> None:
-    """The camera is said to have moved when it has not: no distance between two objects changes."""
+def test_paper_rules_need_no_pose() -> None:
+    """The given pose is wrong, but no distance between two objects changes."""
     wrong = se3_exp(torch.tensor([0.06, 0.02, -0.05, 0.02, 0.03, -0.05], dtype=torch.float64))
-    show = Literal()
-    show(CORNERS)
-    judged = show(CORNERS, wrong)
-    assert [judged[number].votes for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
-    assert MotionState.DYNAMIC not in {judged[number].motion_state for number in judged}
+    stage = PaperStage()
+    stage(CORNERS)
+    objects = stage(CORNERS, wrong)
+    assert [objects[number].votes for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    assert MotionState.DYNAMIC not in {objects[number].motion_state for number in objects}
 
 
-def test_literal_rules_give_no_vote_to_what_the_frame_before_has_not() -> None:
-    """Algorithm 1 compares keys of both frames. A moved while the network missed it."""
-    show = Literal()
-    show(CORNERS)
-    show(CORNERS[1:])
+def test_paper_rules_give_no_vote_to_objects_missing_in_the_previous_frame() -> None:
+    """Algorithm 1 compares the keys of both frames. A moved while the network missed it."""
+    stage = PaperStage()
+    stage(CORNERS)
+    stage(CORNERS[1:])
     moved = CORNERS.clone()
     moved[0, 1] = 0.1
-    judged = show(moved)
-    assert [judged[number].votes for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
+    objects = stage(moved)
+    assert [objects[number].votes for number in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
-def test_where_the_background_cannot_tell_nothing_is_dynamic() -> None:
-    """A box steps on by 6 cm a frame while the depth of all images is lost, so that no place can be looked at."""
-    stage = Stage(load_config(None, (STRIDE,)).objects)
+def test_nothing_is_dynamic_without_free_space_evidence() -> None:
+    """A box moves by 6 cm per frame, but the images have no depth for the free-space check."""
+    stage = ObjectStage(load_config(None, (STRIDE,)).objects)
     nothing = torch.zeros(1, CAMERA.height, CAMERA.width)
     for frame in range(12):
-        things = [still((0.06 * frame - 0.3, 0.2, 3.0)), still((0.8, 0.2, 3.0))]
-        depth, owner = photograph(things, frame / 30, HERE, 0.0)
-        scene = stage(frame / 30, found(owner, things, set()), nothing, HERE, lifted=depth)
-        assert [judged.motion_state for judged in scene.objects] == [MotionState.STATIC, MotionState.STATIC]
+        things = [static_box((0.06 * frame - 0.3, 0.2, 3.0)), static_box((0.8, 0.2, 3.0))]
+        depth, owner = render(things, frame / 30, HERE, 0.0)
+        result = stage(frame / 30, detect(owner, things, set()), nothing, HERE, cloud_depth=depth)
+        assert [obj.motion_state for obj in result.objects] == [MotionState.STATIC, MotionState.STATIC]
 
 
-def test_nothing_to_see() -> None:
-    frames = play(seconds=0.2)
-    assert all(frame.scene.objects == [] for frame in frames)
-    assert all(frame.scene.static_mask.all() for frame in frames)
-    assert frames[0].scene.static_mask.shape == (CAMERA.height, CAMERA.width)
+def test_empty_scene_gives_empty_result() -> None:
+    frames = simulate(seconds=0.2)
+    assert all(frame.result.objects == [] for frame in frames)
+    assert all(frame.result.static_mask.all() for frame in frames)
+    assert frames[0].result.static_mask.shape == (CAMERA.height, CAMERA.width)
 
 
 def test_objects_without_depth_are_static_things_and_unknown_people() -> None:
-    stage = Stage(load_config(None, (STRIDE,)).objects)
+    stage = ObjectStage(load_config(None, (STRIDE,)).objects)
     things = [CHAIRS[0], walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0))]
     for frame in range(12):
-        _, owner = photograph(things, 0.0, HERE, 0.0)
+        _, owner = render(things, 0.0, HERE, 0.0)
         nothing = torch.zeros(1, CAMERA.height, CAMERA.width)
-        scene = stage(frame / 30, found(owner, things, set()), nothing, HERE)
-        assert [judged.motion_state for judged in scene.objects] == [MotionState.STATIC, MotionState.UNKNOWN]
-        assert all(torch.isnan(judged.centroid).all() and math.isnan(judged.chamfer) for judged in scene.objects)
-        assert not scene.static_mask[owner == 1].any()
+        result = stage(frame / 30, detect(owner, things, set()), nothing, HERE)
+        assert [obj.motion_state for obj in result.objects] == [MotionState.STATIC, MotionState.UNKNOWN]
+        assert all(torch.isnan(obj.centroid).all() and math.isnan(obj.chamfer) for obj in result.objects)
+        assert not result.static_mask[owner == 1].any()
 
 
-def test_hundred_objects_of_which_one_moves() -> None:
-    """Every 0.2 m a box of 0.14 m in a plane at 2 m; the one in the middle goes towards the camera."""
+def test_one_moving_object_among_a_hundred_is_dynamic() -> None:
+    """A grid of small boxes in a plane at 2 m; one in the middle moves towards the camera."""
     places = [(0.22 * c - 1.0, 0.17 * r - 0.77) for r in range(10) for c in range(10)]
-    things = [still((x, y, 2.0), (0.17, 0.13, 0.02), TV) for x, y in places]
+    things = [static_box((x, y, 2.0), (0.17, 0.13, 0.02), TV) for x, y in places]
     x, y = places[44]
     things[44] = Thing(TV, lambda t: [((x, y, 2.0 - 0.9 * t), (0.17, 0.13, 0.02))])
-    overrides = ("objects.free_space.min_points=4",)  # of the smaller images: a box has 6 of every 4th pixel
-    frames = play(*things, seconds=0.4, rate=10.0, noise=0.0, overrides=overrides)
+    overrides = ("objects.free_space.min_points=4",)  # for the smaller images: a box has 6 of every 4th pixel
+    frames = simulate(*things, seconds=0.4, rate=10.0, noise=0.0, overrides=overrides)
     assert ids(frames) == set(range(1, 101))
-    moving = {judged.id for judged in frames[-1].scene.objects if judged.motion_state is not MotionState.STATIC}
+    moving = {obj.id for obj in frames[-1].result.objects if obj.motion_state is not MotionState.STATIC}
     assert moving == {45}
 
 
-def test_equal_stamps_are_taken_in() -> None:
-    stage = Stage(ObjectsConfig.model_validate({"clouds": {"stride": 1}}))
+def test_equal_stamps_are_accepted() -> None:
+    stage = ObjectStage(ObjectsConfig.model_validate({"clouds": {"stride": 1}}))
     for _ in range(3):
-        depth, owner = photograph(list(CHAIRS), 0.0, handheld(0.3), 0.0)
-        scene = stage(5.0, found(owner, list(CHAIRS), set()), depth, handheld(0.3))
-        assert [judged.id for judged in scene.objects] == [1, 2, 3]
-        assert {judged.motion_state for judged in scene.objects} == {MotionState.STATIC}
+        depth, owner = render(list(CHAIRS), 0.0, handheld(0.3), 0.0)
+        result = stage(5.0, detect(owner, list(CHAIRS), set()), depth, handheld(0.3))
+        assert [obj.id for obj in result.objects] == [1, 2, 3]
+        assert {obj.motion_state for obj in result.objects} == {MotionState.STATIC}
 
 
-def test_same_bytes_again() -> None:
-    things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1)))
-    first_run, second_run = (play(*things, seconds=0.5, camera=handheld) for _ in range(2))
+def assert_identical(a: FrameObjects, b: FrameObjects) -> None:
+    assert torch.equal(a.static_mask, b.static_mask)
     no_tensors: dict[str, Any] = dict.fromkeys(("mask", "centroid", "cloud"))
+    for one, other in zip(a.objects, b.objects, strict=True):
+        assert one.centroid.numpy().tobytes() == other.centroid.numpy().tobytes()
+        assert one.cloud.numpy().tobytes() == other.cloud.numpy().tobytes()
+        assert replace(one, **no_tensors) == replace(other, **no_tensors) or (
+            math.isnan(one.chamfer) and math.isnan(other.chamfer) and one.motion_state is other.motion_state
+        )
+
+
+def test_repeated_runs_are_identical() -> None:
+    things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.1)))
+    first_run, second_run = (simulate(*things, seconds=0.5, camera=handheld) for _ in range(2))
     for a, b in zip(first_run, second_run, strict=True):
-        assert torch.equal(a.scene.static_mask, b.scene.static_mask)
-        for one, other in zip(a.scene.objects, b.scene.objects, strict=True):
-            assert one.centroid.numpy().tobytes() == other.centroid.numpy().tobytes()
-            assert one.cloud.numpy().tobytes() == other.cloud.numpy().tobytes()
-            assert replace(one, **no_tensors) == replace(other, **no_tensors) or (
-                math.isnan(one.chamfer) and math.isnan(other.chamfer) and one.motion_state is other.motion_state
-            )
+        assert_identical(a.result, b.result)
+
+
+def test_state_dict_continues_with_identical_results() -> None:
+    """A walker who stops, a swaying person, and a missed object: all of the state matters after the copy."""
+    things = [*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.5), swaying_person((1.0, 0.0, 2.0))]
+    config = load_config(None, (STRIDE,)).objects
+    original, continued = ObjectStage(config), ObjectStage(config)
+    states = set()
+    for index in range(24):
+        t = index / 15
+        if index == 10:
+            continued.load_state_dict(copy.deepcopy(original.state_dict()))
+        depth, owner = render(things, t, handheld(t), 0.0014)
+        instances = detect(owner, things, {1} if index in (9, 10, 11) else set())
+        result = original(t, instances, depth, handheld(t))
+        if index >= 10:
+            assert_identical(result, continued(t, instances, depth, handheld(t)))
+            states |= {obj.motion_state for obj in result.objects}
+    assert states == {MotionState.STATIC, MotionState.DYNAMIC, MotionState.DEFORMING}

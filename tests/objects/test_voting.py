@@ -1,4 +1,4 @@
-"""Hough voting against Algorithm 1 of the paper as it is printed, with dictionaries."""
+"""Hough voting against Algorithm 1 of the paper, implemented literally with dictionaries."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Objects = dict[str, tuple[float, float, float]]
 
 
 def pairwise_center_dist(objects: Objects) -> dict[tuple[str, str], float]:
-    """Distance from every object to every other; the first of a key is the object that gets the vote."""
+    """Return all pairwise distances; the first object of a key is the one that gets the vote."""
     return {(i, j): math.dist(objects[i], objects[j]) for i in objects for j in objects if i != j}
 
 
 def algorithm_1(previous: Objects, current: Objects, T_d: float, T_v: int) -> tuple[dict[str, int], set[str]]:
-    """Accumulator and dynamic objects."""
+    """Return the accumulator and the dynamic objects."""
     dist_p, dist_c = pairwise_center_dist(previous), pairwise_center_dist(current)
     accumulator: dict[str, int] = defaultdict(int)
     for k_p in dist_p:
@@ -35,7 +35,7 @@ def algorithm_1(previous: Objects, current: Objects, T_d: float, T_v: int) -> tu
 
 
 def scene(count: int, moving: list[int], by: float, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Objects in a room from two poses of the camera; some have moved ``by`` metres along x."""
+    """Return the centroids of objects from two camera poses; some have moved ``by`` metres along x."""
     generator = torch.Generator().manual_seed(seed)
     world = 3 * torch.rand(count, 3, generator=generator, dtype=torch.float64)
     moved = world.clone()
@@ -50,16 +50,18 @@ def scene(count: int, moving: list[int], by: float, seed: int = 0) -> tuple[Tens
     data=st.data(),
     T_v=st.integers(1, 4),
 )
-def test_equals_algorithm_1(names: list[str], data: st.DataObject, T_v: int) -> None:
+def test_votes_equal_algorithm_1(names: list[str], data: st.DataObject, T_v: int) -> None:
     frames: list[Objects] = []
-    seen = []
+    present_in = []
     for _ in range(2):
-        seen.append(data.draw(st.lists(st.booleans(), min_size=len(names), max_size=len(names))))
+        present_in.append(data.draw(st.lists(st.booleans(), min_size=len(names), max_size=len(names))))
         centroid = st.tuples(*[st.integers(-3, 3).map(float)] * 3)
-        frames.append({name: data.draw(centroid) for name, is_seen in zip(names, seen[-1], strict=True) if is_seen})
+        frames.append(
+            {name: data.draw(centroid) for name, is_present in zip(names, present_in[-1], strict=True) if is_present}
+        )
     nowhere = (math.nan,) * 3
     rows = [torch.tensor([f.get(name, nowhere) for name in names], dtype=torch.float64).reshape(-1, 3) for f in frames]
-    present = torch.tensor(seen[0], dtype=torch.bool) & torch.tensor(seen[1], dtype=torch.bool)
+    present = torch.tensor(present_in[0], dtype=torch.bool) & torch.tensor(present_in[1], dtype=torch.bool)
     result = hough_vote(*rows, present, distance_threshold=0.3, vote_threshold=T_v)
     accumulator, dynamic = algorithm_1(*frames, T_d=0.3, T_v=T_v)
     assert result.votes.tolist() == [accumulator[name] for name in names]
@@ -67,7 +69,7 @@ def test_equals_algorithm_1(names: list[str], data: st.DataObject, T_v: int) -> 
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_finds_the_one_that_moves_without_the_pose(dtype: torch.dtype) -> None:
+def test_moving_object_is_dynamic_without_the_pose(dtype: torch.dtype) -> None:
     previous, current = (frame.to(dtype) for frame in scene(6, [2], by=0.8))
     result = hough_vote(previous, current, torch.ones(6, dtype=torch.bool), 0.02, vote_threshold=2)
     assert result.votes.dtype == dtype
@@ -85,7 +87,7 @@ def test_convention_thresholds_are_reached_at_equality() -> None:
     assert result.change.tolist() == [[0.0, 0.5], [0.5, 0.0]]
 
 
-def test_leading_dimensions_and_absent_rows() -> None:
+def test_batch_dimensions_and_absent_rows_equal_single_votes() -> None:
     frames = [scene(5, [k], by=0.7, seed=k) for k in range(4)]
     previous = torch.stack([p for p, _ in frames]).reshape(2, 2, 5, 3)
     current = torch.stack([c for _, c in frames]).reshape(2, 2, 5, 3)
@@ -105,26 +107,26 @@ def test_leading_dimensions_and_absent_rows() -> None:
     assert not result.change.isnan().any()
 
 
-def test_permutation_of_objects_moves_the_votes_with_them() -> None:
+def test_permutation_of_objects_permutes_the_votes() -> None:
     previous, current = scene(7, [1, 4], by=0.6)
     order = torch.randperm(7, generator=torch.Generator().manual_seed(5))
-    everyone = torch.ones(7, dtype=torch.bool)
-    votes = hough_vote(previous, current, everyone, 0.05, 2).votes
-    assert torch.equal(hough_vote(previous[order], current[order], everyone, 0.05, 2).votes, votes[order])
+    all_present = torch.ones(7, dtype=torch.bool)
+    votes = hough_vote(previous, current, all_present, 0.05, 2).votes
+    assert torch.equal(hough_vote(previous[order], current[order], all_present, 0.05, 2).votes, votes[order])
 
 
-def test_soft_vote_becomes_hard_as_it_cools() -> None:
+def test_soft_vote_converges_to_hard_vote() -> None:
     previous, current = scene(6, [0, 3], by=0.9)
-    everyone = torch.ones(6, dtype=torch.bool)
-    hard = hough_vote(previous, current, everyone, 0.05, 2)
-    soft = hough_vote(previous, current, everyone, 0.05, 2, temperature=1e-5)
+    all_present = torch.ones(6, dtype=torch.bool)
+    hard = hough_vote(previous, current, all_present, 0.05, 2)
+    soft = hough_vote(previous, current, all_present, 0.05, 2, temperature=1e-5)
     torch.testing.assert_close(soft.votes, hard.votes, atol=1e-3, rtol=0.0)
-    at_threshold = hough_vote(previous, current, everyone, float(hard.change[0, 1]), 2, temperature=0.1)
+    at_threshold = hough_vote(previous, current, all_present, float(hard.change[0, 1]), 2, temperature=0.1)
     assert at_threshold.pair[0, 1] == pytest.approx(0.5)
-    assert not at_threshold.pair.diagonal().any()  # nobody votes for himself, not even softly
+    assert not at_threshold.pair.diagonal().any()  # no object votes for itself
 
 
-def test_gradcheck_and_gradients_with_absent_and_coinciding_objects() -> None:
+def test_gradients_are_correct_and_finite_with_absent_objects() -> None:
     previous, current = (frame.requires_grad_() for frame in scene(5, [1], by=0.5))
     present = torch.tensor([True, True, True, True, False])
 
@@ -132,7 +134,7 @@ def test_gradcheck_and_gradients_with_absent_and_coinciding_objects() -> None:
         result = hough_vote(p, c, present, 0.1, 2, temperature=0.05)
         return result.votes, result.pair
 
-    # Only what has changed: at a change of 0 the absolute value has a kink.
+    # Only the changed distances: at a change of 0 the absolute value has a kink.
     assert torch.autograd.gradcheck(lambda p, c: soft(p, c)[1][1, [0, 2, 3]], (previous, current))
 
     with torch.no_grad():
@@ -143,7 +145,7 @@ def test_gradcheck_and_gradients_with_absent_and_coinciding_objects() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_too_few_to_vote(count: int) -> None:
+def test_fewer_than_two_objects_have_no_votes(count: int) -> None:
     result = hough_vote(torch.rand(count, 3), torch.rand(count, 3), torch.ones(count, dtype=torch.bool), 0.1, 1)
     assert result.votes.tolist() == [0.0] * count and not result.dynamic.any()
 
@@ -152,15 +154,17 @@ def test_too_few_to_vote(count: int) -> None:
     ("previous", "current", "present"),
     [((5, 2), (5, 3), (5,)), ((5, 3), (5, 2), (5,)), ((5, 3), (4, 3), (5,)), ((5, 3), (5, 3), (4,)), ((3,), (3,), ())],
 )
-def test_refuses_other_shapes(previous: tuple[int, ...], current: tuple[int, ...], present: tuple[int, ...]) -> None:
+def test_wrong_shapes_are_rejected(
+    previous: tuple[int, ...], current: tuple[int, ...], present: tuple[int, ...]
+) -> None:
     with pytest.raises(ShapeError):
         hough_vote(torch.zeros(previous), torch.zeros(current), torch.ones(present, dtype=torch.bool), 0.1, 1)
 
 
-def test_the_module_votes_as_softly_as_it_is_told() -> None:
+def test_module_uses_the_temperature() -> None:
     previous, current = scene(5, [1], by=0.5)
-    everyone = torch.ones(5, dtype=torch.bool)
+    all_present = torch.ones(5, dtype=torch.bool)
     for temperature in (None, 0.05, 0.2):
-        module = HoughVoting(0.1, 2, temperature)(previous, current, everyone)
-        assert torch.equal(module.votes, hough_vote(previous, current, everyone, 0.1, 2, temperature).votes)
-    assert not torch.equal(module.votes, hough_vote(previous, current, everyone, 0.1, 2).votes)
+        module = HoughVoting(0.1, 2, temperature)(previous, current, all_present)
+        assert torch.equal(module.votes, hough_vote(previous, current, all_present, 0.1, 2, temperature).votes)
+    assert not torch.equal(module.votes, hough_vote(previous, current, all_present, 0.1, 2).votes)

@@ -22,7 +22,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.state_file import read_state, write_state
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, describe_change, read_checkpoint, restore, write_checkpoint
 from v3d_torch.runs.request import RunRequest

@@ -21,7 +21,7 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.io.files import atomic_write, check_writable, file_lock, write_png, write_text
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
 from v3d_torch.slam import V3DSLAM

@@ -30,7 +30,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionState
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runtime.viewer import NULL_VIEWER
 from v3d_torch.slam import V3DSLAM

@@ -1,1 +1,1 @@
-"""The object stage: clean clouds, ids, who moves (paper, Sec. III-B, C, D)."""
+"""Objects of a frame: clean clouds, ids, motion states and the static mask (paper, Sec. III-B to III-D)."""

@@ -14,10 +14,20 @@ from torch import Tensor
 from v3d_torch.errors import ConfigError, InputError
 
 _MAX_PAIRS = 2**25
-"""Most neighbour pairs, by an upper bound, that are listed at once: at the bound a surface takes about 0.2 GB."""
+"""Upper bound on the number of neighbour pairs that are listed at once. It bounds memory."""
 
 _BLOCK = 2**20
-"""Neighbours listed at a time in a cloud with more pairs than that."""
+"""Number of neighbours in a block, if a cloud has more pairs than that."""
+
+_MAX_NEIGHBOUR_CELLS = 13.5
+"""Upper bound on the pairs per squared number of points in a cell: each of the 27 cells around a point can hold its
+neighbours, and every pair counts once."""
+
+_HASH_PRIMES = (73856093, 19349663, 83492791)
+"""Spatial hash of a cell (Teschner et al., VMV 2003)."""
+
+_HASH_MASK = 0xFFFF
+"""Size of the hash table less one."""
 
 Ints = NDArray[np.signedinteger]
 Pairs = tuple[Ints, Ints]
@@ -28,22 +38,22 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
 
     A point with at least ``min_samples`` points within ``eps`` (itself and the boundary included) is a core point; core
     points within ``eps`` of each other share a cluster. Clusters are numbered by their first core point, and a border
-    point joins the lowest-numbered cluster that reaches it: the labels are those of scikit-learn, number by number.
+    point joins the lowest-numbered cluster that reaches it: the labels are exactly those of scikit-learn.
 
     Args:
-        points: metres, float32 or float64, shape :math:`(B, N, 3)`.
-        valid: which points exist, bool, shape :math:`(B, N)`; what stands in the others is not looked at.
-        eps: radius of a neighbourhood, metres.
-        min_samples: points in a neighbourhood that make its centre a core point.
+        points: Point clouds, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        valid: Points that exist, bool, shape :math:`(B, N)`; the values of all other points are ignored.
+        eps: Radius of a neighbourhood, metres.
+        min_samples: Number of points in a neighbourhood that makes its centre a core point.
 
     Returns:
         Cluster of each point, from 0 in every cloud; -1 for noise and for points that are not valid; int64, shape
         :math:`(B, N)`. Distances are compared in float64. Memory grows with the number of neighbours, not with
-        :math:`N^2`, and is bounded where they are many.
+        :math:`N^2`, and is bounded.
 
     Raises:
-        ConfigError: if ``eps`` or ``min_samples`` is not positive.
-        InputError: if a valid point is not finite.
+        ConfigError: If ``eps`` or ``min_samples`` is not positive.
+        InputError: If a valid point is not finite.
     """
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
@@ -53,7 +63,7 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     index = np.flatnonzero(mask)
     coordinates = points.detach().numpy().reshape(-1, 3).take(index, axis=0).astype(np.float64)
     if not np.isfinite(coordinates).all():
-        raise InputError("A point to be clustered is not finite; mark points without depth as not valid.")
+        raise InputError("dbscan: a valid point is not finite; mark points without depth as invalid")
     clouds = np.split(coordinates, mask.sum(axis=1).cumsum()[:-1])
     labels = np.full(mask.size, -1)
     labels[index] = np.concatenate([_cluster(cloud, eps, min_samples) for cloud in clouds])
@@ -61,83 +71,85 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
 
 
 def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
-    """Labels of one cloud, shape (N,)."""
+    """Return the labels of one cloud, shape (N,)."""
     size = len(points)
     counts, blocks = _neighbours(points, eps)
     core = counts >= min_samples
 
-    component = np.arange(size, dtype=np.int32)  # it is read for every pair: half the size, as they are
+    # Connect core points. int32 halves the memory traffic, because components are read for every pair.
+    component = np.arange(size, dtype=np.int32)
     borders: list[Pairs] = []  # (border point, core point that reaches it)
     for a, b in blocks:
         a_core, b_core = core[a], core[b]
-        inner = a_core & b_core
-        component = _join(component, component[a[inner]], component[b[inner]])
-        for outer, point, other in ((a_core > b_core, b, a), (b_core > a_core, a, b)):
-            borders.append((point[outer], other[outer]))
+        both_core = a_core & b_core
+        component = _join(component, component[a[both_core]], component[b[both_core]])
+        for one_core, border, other in ((a_core > b_core, b, a), (b_core > a_core, a, b)):
+            borders.append((border[one_core], other[one_core]))
 
+    # Number the components by their lowest core point: of repeated indices, the last assignment stays.
     cores = np.flatnonzero(core)[::-1]
     first = np.full(size, size)
-    first[component[cores]] = cores  # of repeated indices the last is kept: the lowest core point of each component
+    first[component[cores]] = cores
     rank = np.empty(size, dtype=np.int64)
     rank[np.argsort(first, kind="stable")] = np.arange(size)
 
     label = np.where(core, rank[component], size)
-    for border, reached_from in borders:
-        np.minimum.at(label, border, label[reached_from])
+    for border, core_point in borders:
+        np.minimum.at(label, border, label[core_point])
     return np.where(label < size, label, -1)
 
 
 def _neighbours(points: NDArray[np.float64], eps: float) -> tuple[Ints, Iterable[Pairs]]:
-    """Number of points within ``eps`` of each point, itself included, and every pair of neighbours once, in blocks."""
+    """Return the neighbour count of each point, itself included, and every pair of neighbours once, in blocks."""
     tree = cKDTree(points, balanced_tree=False, leafsize=32)
-    if _most_pairs(points, eps) <= _MAX_PAIRS:
+    if _max_pairs(points, eps) <= _MAX_PAIRS:
         pairs = tree.query_pairs(eps, output_type="ndarray")
-        a, b = pairs.T.astype(np.int32)  # contiguous and half the size: they are read many times from here on
+        a, b = pairs.T.astype(np.int32)  # contiguous and small, because they are read many times
         return np.bincount(pairs.ravel(), minlength=len(points)) + 1, [(a, b)]
     counts = tree.query_ball_point(points, eps, return_length=True)
     return counts, _pairs_in_blocks(tree, counts, eps)
 
 
-def _most_pairs(points: NDArray[np.float64], eps: float) -> float:
-    """Upper bound on the number of neighbour pairs.
+def _max_pairs(points: NDArray[np.float64], eps: float) -> float:
+    """Return an upper bound on the number of neighbour pairs.
 
-    Neighbours are in the same or in touching cells of side ``eps``, hence at most 27/2 times the sum of squared cell
-    counts. Cells that share a place of the hash table only raise the bound.
+    Neighbours lie in the same or in adjacent cells of side ``eps``. The bound follows from the sum of squared cell
+    counts. Hash collisions of cells only raise it.
     """
-    in_one_cell = 13.5 * len(points) ** 2
-    if in_one_cell <= _MAX_PAIRS:  # wherever so few points are
-        return in_one_cell
-    cells = np.floor(points / eps).astype(np.int64) * (73856093, 19349663, 83492791)
-    occupancy = np.bincount(np.bitwise_xor.reduce(cells, axis=1) & 0xFFFF)
-    return 13.5 * float(np.dot(occupancy, occupancy))
+    one_cell = _MAX_NEIGHBOUR_CELLS * len(points) ** 2
+    if one_cell <= _MAX_PAIRS:
+        return one_cell
+    cells = np.floor(points / eps).astype(np.int64) * _HASH_PRIMES
+    occupancy = np.bincount(np.bitwise_xor.reduce(cells, axis=1) & _HASH_MASK)
+    return _MAX_NEIGHBOUR_CELLS * float(np.dot(occupancy, occupancy))
 
 
 def _pairs_in_blocks(tree: cKDTree, counts: Ints, eps: float) -> Iterator[Pairs]:
-    """Every pair once, in blocks of bounded size: neighbours of some points that lie together in space."""
+    """Yield every pair once, in blocks of bounded size; each block holds the neighbours of some adjacent points."""
     order = tree.indices
     block = np.cumsum(counts[order]) // _BLOCK
     for points in np.split(order, np.flatnonzero(np.diff(block)) + 1):
-        found = cKDTree(tree.data[points]).sparse_distance_matrix(tree, eps, output_type="ndarray")
-        a, b = points[found["i"]], found["j"]
+        neighbours = cKDTree(tree.data[points]).sparse_distance_matrix(tree, eps, output_type="ndarray")
+        a, b = points[neighbours["i"]], neighbours["j"]
         once = a < b
         yield a[once], b[once]
 
 
 def _join(component: Ints, a: Ints, b: Ints) -> Ints:
-    """Components, numbered below N, after connecting components ``a[k]`` and ``b[k]`` for every k.
+    """Return the components, numbered below N, after connecting components ``a[k]`` and ``b[k]`` for every k.
 
-    Most pairs tell nothing new. If every component follows one partner of lower number, and that one its own to the
-    end, nearly all that belongs together has met; the pairs that still connect two components after that are few, and
-    are taken in the same way, until there are none.
+    Most pairs are redundant. Each round links every component to one partner with a lower number and follows the links
+    to their roots, which merges nearly all connected components at once. The few pairs that still connect two
+    components enter the next round.
     """
     while len(a):
-        follows = np.arange(len(component), dtype=component.dtype)
-        follows[np.maximum(a, b)] = np.minimum(a, b)
-        while not np.array_equal(follows, further := follows[follows]):
-            follows = further
-        component, a, b = follows[component], follows[a], follows[b]
-        apart = a != b
-        a, b = a[apart], b[apart]
+        parent = np.arange(len(component), dtype=component.dtype)
+        parent[np.maximum(a, b)] = np.minimum(a, b)
+        while not np.array_equal(parent, grandparent := parent[parent]):
+            parent = grandparent
+        component, a, b = parent[component], parent[a], parent[b]
+        separate = a != b
+        a, b = a[separate], b[separate]
     return component
 
 
@@ -145,8 +157,8 @@ class DBSCAN(torch.nn.Module):
     """:func:`dbscan` as a module.
 
     Args:
-        eps: radius of a neighbourhood, metres.
-        min_samples: points in a neighbourhood, its centre included, that make the centre a core point.
+        eps: Radius of a neighbourhood, metres.
+        min_samples: Number of points in a neighbourhood, its centre included, that makes the centre a core point.
     """
 
     def __init__(self, eps: float, min_samples: int) -> None:
@@ -155,5 +167,5 @@ class DBSCAN(torch.nn.Module):
         self.min_samples = min_samples
 
     def forward(self, points: Tensor, valid: Tensor) -> Tensor:
-        """Label clouds, metres, shape :math:`(B, N, 3)` with mask :math:`(B, N)`; see :func:`dbscan`."""
+        """Label clouds, metres, shape :math:`(B, N, 3)`, with mask :math:`(B, N)`; see :func:`dbscan`."""
         return dbscan(points, valid, self.eps, self.min_samples)

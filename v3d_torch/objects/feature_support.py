@@ -1,8 +1,8 @@
-"""The features' word on who stands still: those that fit the camera's motion as well as the rest of the image does.
+"""Feature support of static objects: features on the object fit the camera motion as well as those elsewhere.
 
-A person whom nobody has seen move yet is taken for moving, to be safe. But the network also takes rolled furniture for
-people, now and then for most of the image, and then nothing is left to track the camera by. The features tell: on who
-walks few fit the motion that the rest of the image agrees on.
+A person whose motion is not known yet is masked, to be safe. But a segmentation network also labels rotated furniture
+as people, sometimes over most of the image, and then too few pixels remain for tracking. Features resolve this: few
+features on a walking person fit the motion that the rest of the image agrees on.
 """
 
 from __future__ import annotations
@@ -13,35 +13,44 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+MIN_SUPPORT_RATIO = 0.5
+"""An object is supported if the inlier ratio of its features is at least this fraction of the inlier ratio outside of
+all objects: on a static object both are alike, on a walking person nearly no feature is an inlier."""
+
+MIN_SUPPORTING_FEATURES = 10
+"""Minimum number of inliers on a supported object: some inliers lie on the contour of whatever occludes it."""
+
 
 @dataclass(frozen=True)
 class FeatureSupport:
-    """Features of a frame.
+    """Features of a frame and their agreement with the camera motion.
 
     Attributes:
-        pixel: (column, row), int64, shape :math:`(N, 2)`.
-        fits: whether it was found in the frame before, and fits the camera's motion since, bool, shape :math:`(N,)`.
+        pixel: Pixel (column, row) of each feature, int64, shape :math:`(N, 2)`.
+        inlier: Features that are matched to the previous frame and fit the camera motion, bool, shape :math:`(N,)`.
     """
 
     pixel: Tensor
-    fits: Tensor
+    inlier: Tensor
 
-    def supports(self, masks: Sequence[Tensor], share: float, least: int) -> Tensor:
-        """For which objects they vouch.
+    def supports(
+        self, masks: Sequence[Tensor], min_ratio: float = MIN_SUPPORT_RATIO, min_inliers: int = MIN_SUPPORTING_FEATURES
+    ) -> Tensor:
+        """Find the objects whose features fit the camera motion.
 
         Args:
-            masks: of K objects, bool, each of shape :math:`(H, W)`.
-            share: of an object's features so many must fit, in shares of how many fit outside of all objects.
-            least: and at least so many.
+            masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
+            min_ratio: Minimum inlier ratio on the object, relative to the inlier ratio outside of all objects.
+            min_inliers: Minimum number of inliers on the object.
 
         Returns:
-            bool, shape :math:`(K,)`.
+            Objects that are supported, bool, shape :math:`(K,)`.
         """
         if len(masks) == 0:
-            return self.fits.new_zeros(0)
-        place = self.pixel[:, 1] * masks[0].shape[1] + self.pixel[:, 0]
-        inside = torch.stack([mask.flatten().index_select(0, place) for mask in masks])
+            return self.inlier.new_zeros(0)
+        index = self.pixel[:, 1] * masks[0].shape[1] + self.pixel[:, 0]
+        inside = torch.stack([mask.flatten().index_select(0, index) for mask in masks])
         outside = ~inside.any(dim=0)
-        usual = (self.fits & outside).sum() / outside.sum().clamp(min=1)
-        fitting, all_ = (inside & self.fits).sum(dim=1), inside.sum(dim=1)
-        return (fitting >= least) & (fitting >= share * usual * all_)
+        outside_ratio = (self.inlier & outside).sum() / outside.sum().clamp(min=1)
+        inliers, features = (inside & self.inlier).sum(dim=1), inside.sum(dim=1)
+        return (inliers >= min_inliers) & (inliers >= min_ratio * outside_ratio * features)

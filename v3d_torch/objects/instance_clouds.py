@@ -1,4 +1,4 @@
-"""Instances to clean clouds: back-project, voxel pool, DBSCAN, keep the largest clusters (paper, Sec. III-B.2)."""
+"""Clean point clouds of instances: back-projection, voxel pooling, DBSCAN, largest cluster (paper, Sec. III-B.2)."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from v3d_torch.types import Instances
 
 @dataclass(frozen=True)
 class InstanceClouds:
-    """A cloud per instance, padded to one length.
+    """Point clouds of N instances, padded to one length.
 
     Attributes:
-        points: voxel means in the camera frame, metres, float32, shape :math:`(N, P, 3)`.
-        valid: which are points and not padding, bool, shape :math:`(N, P)`.
-        centroid: mean of the points, float32, shape :math:`(N, 3)`; nan where a cloud has too few points.
-        own: pixels of each mask whose point is in the cloud, bool, shape :math:`(N, H, W)`.
+        points: Voxel means, camera frame, metres, float32, shape :math:`(N, P, 3)`.
+        valid: Points that exist, bool, shape :math:`(N, P)`; False for padding.
+        centroid: Mean of the points, float32, shape :math:`(N, 3)`; NaN if a cloud has too few points.
+        cloud_pixels: Pixels of each mask whose point belongs to the cloud, bool, shape :math:`(N, H, W)`.
     """
 
     points: Tensor
@@ -38,11 +38,11 @@ class InstanceClouds:
 
 
 class InstanceBackProjector:
-    """Lifts instances into 3D and rejects what does not belong to them.
+    """Back-projection of instances into 3D with outlier rejection.
 
     Args:
-        config: resolution and clustering.
-        camera: back-projects the depth.
+        config: Resolution and clustering.
+        camera: Camera of the depth images.
     """
 
     def __init__(self, config: CloudConfig, camera: PinholeCamera) -> None:
@@ -50,36 +50,39 @@ class InstanceBackProjector:
         self._rays = camera.rays[:: config.stride, :: config.stride].reshape(-1, 3).numpy()
 
     def __call__(self, depth: Tensor, instances: Instances) -> InstanceClouds:
-        """Lift all instances of a frame at once.
+        """Compute the clouds of all instances of a frame at once.
 
         Args:
-            depth: re-estimated, metres, float32, shape :math:`(1, H, W)`; 0 = none.
-            instances: of the same image.
+            depth: Smoothed depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+            instances: Instances of the same image.
+
+        Returns:
+            Clouds in the order of the instances.
         """
         config = self._config
-        points, valid, pixel = self._gather(depth, instances)
-        points, valid, _, owner = voxel_pool(points, valid, config.voxel_size)
+        points, valid, pixel = self._back_project(depth, instances)
+        points, valid, _, voxel = voxel_pool(points, valid, config.voxel_size)
         labels = dbscan(points, valid, config.eps, config.min_samples)
-        # The paper keeps as many blobs as there are instances; here each instance has its own cloud and keeps one.
+        # The paper keeps as many clusters as there are instances. Here each instance has its own cloud and keeps one.
         valid = largest_clusters(labels, valid, 1)
         count = valid.sum(dim=1)
         centroid = (points * valid[..., None]).sum(dim=1) / count.clamp(min=1)[:, None]
         centroid[count < config.min_points] = torch.nan
-        return InstanceClouds(points, valid, centroid, self._own(instances.masks, valid, owner, pixel))
+        return InstanceClouds(points, valid, centroid, self._cloud_pixels(instances.masks, valid, voxel, pixel))
 
-    def _own(self, masks: Tensor, valid: Tensor, owner: Tensor, pixel: Tensor) -> Tensor:
-        """Pixels of each mask whose point is in a voxel that stayed, bool, :math:`(N, H, W)`."""
+    def _cloud_pixels(self, masks: Tensor, valid: Tensor, voxel: Tensor, pixel: Tensor) -> Tensor:
+        """Return the pixels of each mask whose point lies in a valid voxel, bool, shape (N, H, W)."""
         step = self._config.stride
-        own = torch.zeros_like(masks[:, ::step, ::step])
-        instance, point = torch.nonzero(owner >= 0, as_tuple=True)
-        own.flatten(1)[instance, pixel[instance, point]] = valid[instance, owner[instance, point]]
-        return upsample_nearest(own.numpy(), step, masks.shape[-2:]) & masks
+        cells = torch.zeros_like(masks[:, ::step, ::step])
+        instance, point = torch.nonzero(voxel >= 0, as_tuple=True)
+        cells.flatten(1)[instance, pixel[instance, point]] = valid[instance, voxel[instance, point]]
+        return upsample_nearest(cells.numpy(), step, masks.shape[-2:]) & masks
 
-    def _gather(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor, Tensor]:
-        """Every n-th masked pixel with depth as a padded set of points.
+    def _back_project(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor, Tensor]:
+        """Back-project every n-th masked pixel with depth.
 
         Returns:
-            Points :math:`(N, P, 3)`, which exist :math:`(N, P)`, and their pixels, numbered row by row, :math:`(N, P)`.
+            Points :math:`(N, P, 3)`, their validity :math:`(N, P)`, and their row-major pixel indices :math:`(N, P)`.
         """
         step = self._config.stride
         z = depth[0, ::step, ::step].numpy()

@@ -1,6 +1,8 @@
-"""Ids of objects over frames by optimal assignment; objects that the network misses are predicted (paper, Sec. II)."""
+"""Multi-object tracking: object ids by optimal assignment, and prediction of missed objects (paper, Sec. II)."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,32 +16,53 @@ from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.types import Instances
 
+_COARSE_COLUMNS = 160
+"""Number of columns of the coarse masks that are compared: the resolution of the network's own masks."""
+
+_MIN_VISIBLE_FRACTION = 0.5
+"""An object is visible at its predicted position if the depth agrees with more than this fraction of its points."""
+
+_MAX_BESIDE_OVERLAP = 0.1
+"""An instance lies beside a predicted mask if their intersection is less than this fraction of the smaller area."""
+
+_DEPTH_TOLERANCE = 0.2
+"""Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
+
 
 class InstanceTracker(torch.nn.Module):
-    """Gives each instance the id of the object that it shows.
+    """Assignment of object ids to the instances of each frame.
 
-    An instance continues the track of its class whose predicted centroid is nearest and whose mask it overlaps, as it
-    was or where the motion has carried it, in the assignment that is best for all together; no appearance takes part.
+    An instance continues the track of its class with the nearest predicted centroid, or the track whose last or
+    predicted mask it overlaps, in the assignment with the smallest total cost. Appearance is not used. The state
+    (tracks and next id) is part of ``state_dict()``.
 
     Args:
-        config: gates and times.
-        camera: projects objects to where they should be now.
-        voxel_size: spacing of the clouds, metres.
+        config: Gates and times.
+        camera: Camera of all frames.
+        voxel_size: Spacing of the points of the clouds, metres.
     """
-
-    _COLUMNS = 160  # masks are compared on about so many columns of pixels: those of the network's own masks
-    _THERE = 0.5  # an object is where it was predicted if so many of its points are seen there
-    _BESIDE = 0.1  # and what covers less than this of it, and is covered by less, is another one
-    _DEPTH_GATE = 0.2  # metres: arms and legs swing by that; a predicted mask keeps only pixels that near
 
     def __init__(self, config: TrackerConfig, camera: PinholeCamera, voxel_size: float) -> None:
         super().__init__()
         self._config = config
         self._camera = camera
         self._voxel_size = voxel_size
-        self._stride = max(1, camera.width // self._COLUMNS)
+        self._stride = max(1, camera.width // _COARSE_COLUMNS)
         self._next_id = 1
         self.tracks: list[Track] = []
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return the tracks and the next id, for ``state_dict()``."""
+        return {"tracks": list(self.tracks), "next_id": self._next_id}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Replace the tracks and the next id, for ``load_state_dict()``.
+
+        Args:
+            state: Result of `get_extra_state`.
+        """
+        self.tracks = list(state["tracks"])
+        self._next_id = state["next_id"]
 
     def forward(
         self, stamp: float, instances: Instances, clouds: InstanceClouds, depth: Tensor, T_wc: Tensor
@@ -47,135 +70,158 @@ class InstanceTracker(torch.nn.Module):
         """Update the tracks with a frame.
 
         Args:
-            stamp: seconds.
-            instances: of the frame, best first.
-            clouds: of the instances, camera frame.
-            depth: metres, shape :math:`(1, H, W)`.
-            T_wc: camera to world, as far as it is known now.
+            stamp: Timestamp, seconds.
+            instances: Instances of the frame, by descending score.
+            clouds: Clouds of the instances, camera frame.
+            depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            T_wc: Estimated camera-to-world pose, float64, shape :math:`(4, 4)`.
 
         Returns:
-            Tracks in view or missed for less than the longest gap, by id.
+            Tracks that were detected, or missed for at most the maximum time, sorted by id.
         """
-        sightings = [self._sight(stamp, clouds, i, T_wc) for i in range(len(instances))]
-        # Where each should be by now: to be found there, and left out there if it is not found.
-        expected = self._expect(stamp, T_wc)
-        places = [self._where(silhouette, depth, self._stride) for silhouette in expected.values()]
-        now = dict(zip(expected, self._coarse(torch.stack(places)) if places else (), strict=True))
-        there = [silhouette.visible_fraction(depth, self._DEPTH_GATE) > self._THERE for silhouette in expected.values()]
-        masks = self._coarse(instances.masks[:, :: self._stride, :: self._stride])
-        owner = self._assign(stamp, instances, masks, sightings, now, torch.tensor(there))
-        continued = set()
-        for i, sighting in enumerate(sightings):
-            track = owner.get(i)
-            if track is None:
-                track = Track(self._next_id, instances.masks[i], clouds.cloud_pixels[i], masks[i], stamp, self._config)
-                self._next_id += 1
-                self.tracks.append(track)
-            track.add_detection(sighting)
-            track.mask, track.cloud_pixels, track.coarse_mask, track.missed = (
-                instances.masks[i],
-                clouds.cloud_pixels[i],
-                masks[i],
-                False,
-            )
+        step = self._stride
+        detections = [self._detection(stamp, clouds, i, T_wc) for i in range(len(instances))]
+        coarse_masks = _flatten(instances.masks[:, ::step, ::step])
+
+        # Predict each track, and check whether the object is visible there.
+        predicted = self._predict_silhouettes(stamp, T_wc)
+        predicted_masks = [self._predict_mask(silhouette, depth, step) for silhouette in predicted.values()]
+        rows = _flatten(torch.stack(predicted_masks)) if predicted_masks else ()
+        predicted_coarse = dict(zip(predicted, rows, strict=True))
+        visible = torch.tensor(
+            [s.visible_fraction(depth, _DEPTH_TOLERANCE) > _MIN_VISIBLE_FRACTION for s in predicted.values()]
+        )
+
+        # Update matched tracks, and start a track for each instance without a match.
+        matches = self._match(stamp, instances, coarse_masks, detections, predicted_coarse, visible)
+        detected = set()
+        for i, detection in enumerate(detections):
+            masks = instances.masks[i], clouds.cloud_pixels[i], coarse_masks[i]
+            track = matches.get(i) or self._start_track(stamp, masks)
+            track.add_detection(detection)
+            track.set_masks(*masks, missed=False)
             track.update_label(int(instances.labels[i]), float(instances.scores[i]))
-            continued.add(track.id)
+            detected.add(track.id)
+
+        # Predict the masks of missed tracks, and remove those that were missed for too long.
         self.tracks = [t for t in self.tracks if stamp - t.newest.stamp <= self._config.max_missed_time]
-        measured = torch.from_numpy(depth[0].numpy() > 0)  # in a sixth of torch's time
+        has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
         for track in self.tracks:
-            if track.id not in continued:
-                track.missed = True
-                track.mask, track.coarse_mask = self._where(expected[track], depth), now[track]
-                track.cloud_pixels = track.mask & measured
-        self._drop_found_again(self._coarse(measured[:: self._stride, :: self._stride]))
+            if track.id not in detected:
+                mask = self._predict_mask(predicted[track], depth)
+                track.set_masks(mask, mask & has_depth, predicted_coarse[track], missed=True)
+        self._remove_duplicates(_flatten(has_depth[::step, ::step]))
         return list(self.tracks)
 
-    def _drop_found_again(self, measured: Tensor) -> None:
-        """Drop missed objects where one of their class was found where they should be: the same, with another id.
-
-        ``measured`` tells on which of the coarse pixels there is depth.
-        """
-        missed = [track for track in self.tracks if track.missed]
-        found = [track for track in self.tracks if not track.missed and track.newest.is_located]
-        if not missed or not found:
-            return
-        own = torch.stack([track.coarse_mask for track in missed]) * measured
-        both = own @ torch.stack([track.coarse_mask for track in found]).T
-        alike = torch.tensor([[track.label == other.label for other in found] for track in missed])
-        again = (alike & (both > self._config.min_overlap * own.sum(dim=1, keepdim=True))).any(dim=1)
-        dropped = {track for track, is_again in zip(missed, again.tolist(), strict=True) if is_again}
-        self.tracks = [track for track in self.tracks if track not in dropped]
-
-    @staticmethod
-    def _coarse(mask: Tensor) -> Tensor:
-        """Every n-th pixel of masks as rows of numbers, bool :math:`(..., h, w)` to float32 :math:`(..., P)`."""
-        return mask.flatten(-2).to(torch.float32)
-
     def move_world(self, T_new_old: Tensor) -> None:
-        """Carry the tracks along when the map is corrected under them.
+        """Transform all tracks into the corrected world.
 
         Args:
-            T_new_old: corrected world from old world, float64, shape :math:`(4, 4)`.
+            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
         for track in self.tracks:
             track.move_world(T_new_old)
 
-    def _sight(self, stamp: float, clouds: InstanceClouds, i: int, T_wc: Tensor) -> Detection3D:
+    def _detection(self, stamp: float, clouds: InstanceClouds, i: int, T_wc: Tensor) -> Detection3D:
+        """Return the detection of the i-th instance in the world frame."""
         cloud = clouds.points[i, clouds.valid[i]]
         R, t = T_wc[:3, :3], T_wc[:3, 3]
         return Detection3D(stamp, R @ clouds.centroid[i].to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud))
 
-    def _assign(
+    def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor]) -> Track:
+        """Add a track with the next id and return it."""
+        track = Track(self._next_id, stamp, self._config, *masks)
+        self._next_id += 1
+        self.tracks.append(track)
+        return track
+
+    def _predict_silhouettes(self, stamp: float, T_wc: Tensor) -> dict[Track, Silhouette]:
+        """Project the predicted cloud of each track into the image."""
+        T_cw = invert(T_wc)
+        clouds = [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in self.tracks]
+        return dict(zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True))
+
+    def _predict_mask(self, silhouette: Silhouette, depth: Tensor, step: int = 1) -> Tensor:
+        """Return every n-th pixel of a silhouette whose depth agrees or is missing, bool, (h, w)."""
+        return silhouette.mask(depth[:, ::step, ::step], 0, _DEPTH_TOLERANCE, step=step, include_missing=True)
+
+    def _match(
         self,
         stamp: float,
         instances: Instances,
         masks: Tensor,
-        sightings: list[Detection3D],
-        now: dict[Track, Tensor],
-        there: Tensor,
+        detections: list[Detection3D],
+        predicted_coarse: dict[Track, Tensor],
+        visible: Tensor,
     ) -> dict[int, Track]:
-        """Track of each instance that continues one.
+        """Match instances to tracks.
 
-        ``masks`` are those of the instances, coarse, ``now`` is where each track should be by now, and ``there`` tells
-        whether it is seen to be there.
+        Args:
+            stamp: Timestamp, seconds.
+            instances: N instances of the frame.
+            masks: Coarse masks of the instances, float32, shape (N, P).
+            detections: Detections of the instances.
+            predicted_coarse: Predicted coarse mask of each of the T tracks, float32, shape (P,).
+            visible: Tracks that are visible at their predicted position, bool, shape (T,).
+
+        Returns:
+            Track of each instance that continues one, by the index of the instance.
         """
-        if not self.tracks or not sightings:
+        if not self.tracks or not detections:
             return {}
-        predicted = torch.stack([track.predict(stamp) for track in self.tracks])
-        seen = torch.stack([sighting.centroid for sighting in sightings])
-        # A mask as it was is exact where little moves; moved on, it keeps up with fast walkers and a camera that turns.
-        before, moved = torch.stack([track.coarse_mask for track in self.tracks]), torch.stack(list(now.values()))
-        both, areas, own = moved @ masks.T, moved.sum(dim=1)[:, None], masks.sum(dim=1)
-        overlap = torch.maximum(_overlap(before @ masks.T, before.sum(dim=1)[:, None], own), _overlap(both, areas, own))
-        covered = both > self._config.min_overlap * areas
-        # A detection beside somebody who is seen to be where expected is somebody else, or nobody.
-        elsewhere = there[:, None] & (both < self._BESIDE * torch.minimum(areas, own))
+        predicted = torch.stack([track.predict_centroid(stamp) for track in self.tracks])
+        observed = torch.stack([detection.centroid for detection in detections])
+        # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
+        last_masks = torch.stack([track.coarse_mask for track in self.tracks])
+        predicted_masks = torch.stack(list(predicted_coarse.values()))
+        intersection = predicted_masks @ masks.T
+        predicted_areas, areas = predicted_masks.sum(dim=1)[:, None], masks.sum(dim=1)
+        overlap = torch.maximum(
+            _intersection_over_union(last_masks @ masks.T, last_masks.sum(dim=1)[:, None], areas),
+            _intersection_over_union(intersection, predicted_areas, areas),
+        )
+        covered = intersection > self._config.min_overlap * predicted_areas
+        # A detection beside an object that is visible at its predicted position is another object.
+        beside = intersection < _MAX_BESIDE_OVERLAP * torch.minimum(predicted_areas, areas)
         elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
         gate = self._config.max_jump + self._config.max_speed * elapsed
-        alike = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
+        same_class = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
         matched = match_instances(
             predicted[None],
-            seen[None],
+            observed[None],
             overlap[None],
-            alike[None],
+            same_class[None],
             gate[None],
             self._config.min_overlap,
             covered=covered[None],
-            elsewhere=elsewhere[None],
+            excluded=(visible[:, None] & beside)[None],
         )[0]
         return {i: self.tracks[track] for i, track in enumerate(matched.tolist()) if track >= 0}
 
-    def _expect(self, stamp: float, T_wc: Tensor) -> dict[Track, Silhouette]:
-        """The last cloud of each object, moved on to where it should be in the image."""
-        T_cw = invert(T_wc)
-        clouds = [track.cloud_at(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in self.tracks]
-        return dict(zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True))
+    def _remove_duplicates(self, has_depth: Tensor) -> None:
+        """Remove missed tracks whose predicted mask a detected track of the same class covers: they are one object.
 
-    def _where(self, expected: Silhouette, depth: Tensor, step: int = 1) -> Tensor:
-        """Every n-th pixel of an object where the depth agrees or is missing, bool, :math:`(h, w)`."""
-        return expected(depth[:, ::step, ::step], 0, self._DEPTH_GATE, step=step, or_missing=True)
+        Args:
+            has_depth: Coarse pixels with depth, float32, shape (P,).
+        """
+        missed = [track for track in self.tracks if track.missed]
+        located = [track for track in self.tracks if not track.missed and track.newest.is_located]
+        if not missed or not located:
+            return
+        masks = torch.stack([track.coarse_mask for track in missed]) * has_depth
+        intersection = masks @ torch.stack([track.coarse_mask for track in located]).T
+        same_class = torch.tensor([[track.label == other.label for other in located] for track in missed])
+        covered = intersection > self._config.min_overlap * masks.sum(dim=1, keepdim=True)
+        duplicate = (same_class & covered).any(dim=1)
+        removed = {track for track, is_duplicate in zip(missed, duplicate.tolist(), strict=True) if is_duplicate}
+        self.tracks = [track for track in self.tracks if track not in removed]
 
 
-def _overlap(both: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Intersection over union by the areas of intersections (A, B) and masks (A, 1) and (B,), float64, (A, B)."""
-    return (both / (a + b - both).clamp(min=1)).to(torch.float64)
+def _flatten(masks: Tensor) -> Tensor:
+    """Return masks as rows of numbers, bool (..., h, w) to float32 (..., h w)."""
+    return masks.flatten(-2).to(torch.float32)
+
+
+def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Return the intersection over union from areas of intersections (A, B) and masks (A, 1) and (B,), float64."""
+    return (intersection / (a + b - intersection).clamp(min=1)).to(torch.float64)

@@ -1,4 +1,4 @@
-"""Where an object is and how fast, from noisy centroids: a Kalman filter with constant velocity (paper, Sec. II)."""
+"""Kalman filter with constant velocity: position and velocity of an object from noisy centroids (paper, Sec. II)."""
 
 from __future__ import annotations
 
@@ -7,65 +7,81 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 
+_INITIAL_SPEED_SIGMA = 1.0
+"""Standard deviation of the initial velocity, m/s: a new object is as likely to move at walking speed as to rest."""
+
+_MIN_SPEED = 1e-9
+"""Lower bound of a divisor, m/s."""
+
 
 class ConstantVelocityKalmanFilter:
-    """Position and velocity of one object, each axis alike and apart from the others.
+    """Position and velocity of one object. The three axes are independent and have the same covariance.
 
     Args:
-        config: noise and the greatest speed.
+        config: Noise and maximum speed.
     """
 
-    _SPEED_SIGMA = 1.0  # m/s: of what is seen for the first time, any walking speed is as likely as none
-
     def __init__(self, config: TrackerConfig) -> None:
-        self._acceleration = config.acceleration_noise
+        self._acceleration_noise = config.acceleration_noise
         self._max_speed = config.max_speed
         self._stamp = 0.0
-        self._place = torch.full((3,), torch.nan, dtype=torch.float64)
-        self._velocity = torch.zeros_like(self._place)
-        self._covariance = (1.0, 0.0, 1.0)  # of place, of both, of velocity: the same for all three axes
+        self._position = torch.full((3,), torch.nan, dtype=torch.float64)
+        self._velocity = torch.zeros_like(self._position)
+        self._covariance = (1.0, 0.0, 1.0)  # position variance, cross-covariance, velocity variance
 
     @property
     def velocity(self) -> Tensor:
-        """World frame, m/s, float64, shape :math:`(3,)`; 0 until two places are known."""
+        """Velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second measurement."""
         return self._velocity
 
     def predict(self, stamp: float) -> Tensor:
-        """Place at ``stamp``, world frame, metres, float64, shape :math:`(3,)`; nan while none was seen."""
-        return self._place + self._velocity * (stamp - self._stamp)
-
-    def update(self, stamp: float, place: Tensor, sigma: float) -> None:
-        """Take in where the object was seen.
+        """Predict the position at a timestamp.
 
         Args:
-            stamp: seconds, not before the last one.
-            place: world frame, metres, float64, shape :math:`(3,)`; nan changes nothing.
-            sigma: standard deviation of each coordinate, metres.
+            stamp: Timestamp, seconds.
+
+        Returns:
+            Position, world frame, metres, float64, shape :math:`(3,)`; NaN before the first measurement.
         """
-        if not bool(torch.isfinite(place).all()):
+        return self._position + self._velocity * (stamp - self._stamp)
+
+    def update(self, stamp: float, position: Tensor, sigma: float) -> None:
+        """Update the state with a measured position.
+
+        Args:
+            stamp: Timestamp, seconds, not before the last one.
+            position: Measured position, world frame, metres, float64, shape :math:`(3,)`. NaN is ignored.
+            sigma: Standard deviation of each coordinate, metres.
+        """
+        if not bool(torch.isfinite(position).all()):
             return
-        if bool(self._place.isnan().any()):
-            self._place, self._velocity = place, torch.zeros_like(place)
-            self._covariance = (sigma**2, 0.0, self._SPEED_SIGMA**2)
+        if bool(self._position.isnan().any()):
+            self._position, self._velocity = position, torch.zeros_like(position)
+            self._covariance = (sigma**2, 0.0, _INITIAL_SPEED_SIGMA**2)
         else:
-            self._correct(stamp, place, sigma)
+            self._correct(stamp, position, sigma)
         self._stamp = stamp
 
-    def _correct(self, stamp: float, place: Tensor, sigma: float) -> None:
-        dt, noise = stamp - self._stamp, self._acceleration**2
+    def _correct(self, stamp: float, position: Tensor, sigma: float) -> None:
+        # Predict the covariance with white acceleration noise.
+        dt, noise = stamp - self._stamp, self._acceleration_noise**2
         pp, pv, vv = self._covariance
         pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
         pv += dt * vv + noise * dt**2 / 2
         vv += noise * dt
-        of_place, of_velocity = pp / (pp + sigma**2), pv / (pp + sigma**2)  # the gains
-        self._covariance = pp - of_place * pp, pv - of_place * pv, vv - of_velocity * pv
-        expected = self.predict(stamp)
-        surprise = place - expected
-        self._place = expected + of_place * surprise
-        velocity = self._velocity + of_velocity * surprise
-        self._velocity = velocity * min(1.0, self._max_speed / max(float(velocity.norm()), 1e-9))
+        position_gain, velocity_gain = pp / (pp + sigma**2), pv / (pp + sigma**2)
+        self._covariance = pp - position_gain * pp, pv - position_gain * pv, vv - velocity_gain * pv
+        predicted = self.predict(stamp)
+        innovation = position - predicted
+        self._position = predicted + position_gain * innovation
+        velocity = self._velocity + velocity_gain * innovation
+        self._velocity = velocity * min(1.0, self._max_speed / max(float(velocity.norm()), _MIN_SPEED))
 
     def move_world(self, T_new_old: Tensor) -> None:
-        """Carry the state along when the map is corrected under it, see `InstanceTracker.move_world`."""
+        """Transform the state into the corrected world.
+
+        Args:
+            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+        """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
-        self._place, self._velocity = R @ self._place + t, R @ self._velocity
+        self._position, self._velocity = R @ self._position + t, R @ self._velocity

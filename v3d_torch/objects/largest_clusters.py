@@ -1,4 +1,4 @@
-"""Which clusters of a cloud belong to the object: the largest ones (paper, Sec. III-B.2)."""
+"""Selection of the largest clusters of a point cloud (paper, Sec. III-B.2)."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from torch import Tensor
 
 
 def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_points: int = 1) -> Tensor:
-    """Keep the points of the ``n`` largest clusters of every cloud.
+    """Select the points of the ``n`` largest clusters of every cloud.
 
-    The paper keeps as many clusters of a scene as it recognises instances; with one cloud per instance that is the
-    largest of each, ``n=1``.
+    The paper keeps as many clusters of a scene as it recognises instances. With one cloud per instance, that is the
+    largest cluster of each cloud, ``n=1``.
 
     Args:
-        labels: cluster of each point, -1 = noise, int64, shape :math:`(B, N)`.
-        valid: which points exist, bool, shape :math:`(B, N)`.
-        n: clusters to keep, one number for all clouds or int64 of shape :math:`(B,)`. Of two clusters of the same size
-            the lower label goes first.
-        min_points: a cluster with fewer points is never kept.
+        labels: Cluster of each point, -1 = noise, int64, shape :math:`(B, N)`.
+        valid: Points that exist, bool, shape :math:`(B, N)`.
+        n: Number of clusters to keep, one number for all clouds or int64 of shape :math:`(B,)`. Of two clusters of the
+            same size, the one with the lower label ranks first.
+        min_points: Minimum number of points of a cluster that is kept.
 
     Returns:
-        Points that are kept, bool, shape :math:`(B, N)`.
+        Points of the selected clusters, bool, shape :math:`(B, N)`.
     """
     KORNIA_CHECK_SHAPE(labels, ["B", "N"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in labels.shape])
@@ -32,15 +32,15 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
     size = labels.new_zeros(labels.shape[0], int(cluster.max()) + 1).scatter_add_(1, cluster, clustered.to(torch.int64))
     order = size.argsort(dim=1, descending=True, stable=True)
     rank = torch.empty_like(order).scatter_(1, order, torch.arange(order.shape[1]).expand_as(order))
-    kept = (rank < torch.as_tensor(n).reshape(-1, 1)) & (size >= min_points)
-    return clustered & kept.gather(1, cluster)
+    selected = (rank < torch.as_tensor(n).reshape(-1, 1)) & (size >= min_points)
+    return clustered & selected.gather(1, cluster)
 
 
 class LargestClusters(torch.nn.Module):
     """:func:`largest_clusters` as a module.
 
     Args:
-        min_points: a cluster with fewer points is never kept.
+        min_points: Minimum number of points of a cluster that is kept.
     """
 
     def __init__(self, min_points: int = 1) -> None:
@@ -48,5 +48,5 @@ class LargestClusters(torch.nn.Module):
         self.min_points = min_points
 
     def forward(self, labels: Tensor, valid: Tensor, n: int | Tensor = 1) -> Tensor:
-        """Keep the points of the ``n`` largest clusters of labels :math:`(B, N)`; see :func:`largest_clusters`."""
+        """Select the ``n`` largest clusters of labels :math:`(B, N)`; see :func:`largest_clusters`."""
         return largest_clusters(labels, valid, n, self.min_points)

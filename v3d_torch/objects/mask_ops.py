@@ -1,4 +1,4 @@
-"""Regions of an image: a coarse one drawn pixel by pixel, and one with all that is near it."""
+"""Operations on image masks: nearest-neighbour upsampling and dilation."""
 
 from __future__ import annotations
 
@@ -11,36 +11,39 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 
-def upsample_nearest(cells: NDArray[np.generic], side: int, size: Sequence[int]) -> Tensor:
-    """Cells as pixels.
+def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Sequence[int]) -> Tensor:
+    """Upsample a grid of square cells to pixels.
 
     Args:
-        cells: shape :math:`(..., h, w)`.
-        side: of a cell, pixels.
-        size: height and width of the image, in which the last cells may be cut off.
+        cells: Values of the cells, shape :math:`(..., h, w)`.
+        cell_size: Side of a cell, pixels.
+        image_size: Height and width of the image, pixels; the last cells can be cut off.
 
     Returns:
-        dtype of ``cells``, shape :math:`(..., H, W)`.
+        Value of the cell at each pixel, dtype of ``cells``, shape :math:`(..., H, W)`.
     """
-    height, width = size
-    # First along rows, where little is copied: numpy's repeat takes a seventh of the time of torch's.
-    pixels = cells.repeat(side, axis=-1)[..., :width].repeat(side, axis=-2)[..., :height, :]
+    height, width = image_size
+    # Along rows first, because that copies little. NumPy's repeat is faster here than torch's.
+    pixels = cells.repeat(cell_size, axis=-1)[..., :width].repeat(cell_size, axis=-2)[..., :height, :]
     return torch.from_numpy(np.ascontiguousarray(pixels))
 
 
 def dilate(mask: Tensor, pixels: int) -> Tensor:
-    """A mask with all that is no farther from it.
+    """Dilate a mask by an ellipse.
 
     Args:
-        mask: bool, shape :math:`(H, W)`.
-        pixels: greatest distance.
+        mask: Mask, bool, shape :math:`(H, W)`.
+        pixels: Radius of the dilation, pixels.
+
+    Returns:
+        Dilated mask, bool, shape :math:`(H, W)`.
     """
-    before = mask.view(torch.uint8).numpy()
-    left, top, width, height = cv2.boundingRect(before)
+    source = mask.view(torch.uint8).numpy()
+    left, top, width, height = cv2.boundingRect(source)
     rows = slice(max(top - pixels, 0), top + height + pixels)
     columns = slice(max(left - pixels, 0), left + width + pixels)
-    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
-    after = np.zeros_like(before)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    dilated = np.zeros_like(source)
     if width:
-        after[rows, columns] = cv2.dilate(before[rows, columns], around)
-    return torch.from_numpy(after).view(torch.bool)
+        dilated[rows, columns] = cv2.dilate(source[rows, columns], kernel)
+    return torch.from_numpy(dilated).view(torch.bool)

@@ -1,96 +1,49 @@
-"""Who moves: votes between objects, deformation within them, the mask of what stands still (paper, III-C, III-D)."""
+"""Motion classification of the objects of a frame (paper, Sec. III-C, III-D)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Mapping
 from math import isnan
+from typing import Any
 
 import torch
-from torch import Tensor
 
-from v3d_torch.config import ObjectsConfig, VotingConfig
+from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
-from v3d_torch.objects.deformation import intra_object_motion
 from v3d_torch.objects.feature_support import FeatureSupport
-from v3d_torch.objects.free_space_check import DepthView, NewlyOccupied, vacated_fractions
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
+from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
-from v3d_torch.objects.mask_ops import dilate
-from v3d_torch.objects.mask_refiner import MaskRefiner
-from v3d_torch.objects.track import Detection3D, Track
-from v3d_torch.objects.voting import hough_vote
-from v3d_torch.segmentation.coco import LIVING, PERSON, THINGS, class_name
+from v3d_torch.objects.motion_evidence import (
+    DetectionPairs,
+    chamfer_evidence,
+    detection_pairs,
+    free_space_evidence,
+    hough_vote_evidence,
+)
+from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.static_mask import static_masks
+from v3d_torch.objects.track import Track
+from v3d_torch.segmentation.coco import LIVING, PERSON, THINGS
 from v3d_torch.types import Instances
 
-Pairs = dict[Track, tuple[Detection3D, Detection3D]]
+_STATIC_FRACTION = 0.1
+"""An object is at rest over a baseline if less than this fraction of its pixels appeared: contours err by some
+hundredths of an object."""
 
-
-class MotionState(StrEnum):
-    """What the object stage thinks of an object."""
-
-    STATIC = "static"
-    DYNAMIC = "dynamic"
-    DEFORMING = "deforming"
-    UNKNOWN = "unknown"
-
-
-@dataclass(frozen=True)
-class TrackedObject:
-    """An object of one frame with its verdict.
-
-    Attributes:
-        id: number of the object.
-        label: COCO class; `name` has it in words.
-        mask: its pixels, bool, shape :math:`(H, W)`.
-        centroid: world frame, metres, float64, shape :math:`(3,)`; nan when unknown.
-        votes: of the newest frame, the most over the baselines.
-        chamfer: root mean nearest-neighbour distance, metres; nan when it was not measured, as of who is voted dynamic.
-        verdict: static, dynamic, deforming or unknown.
-        missed: whether the network missed it, so that all but the id is predicted.
-        cloud: as the network last saw it, world frame, metres, float32, shape :math:`(P, 3)`.
-    """
-
-    id: int
-    label: int
-    mask: Tensor
-    centroid: Tensor
-    votes: int
-    chamfer: float
-    motion_state: MotionState
-    missed: bool
-    cloud: Tensor
-
-    @property
-    def name(self) -> str:
-        """Class and number, such as ``person 3``."""
-        return f"{class_name(self.label)} {self.id}"
-
-
-@dataclass(frozen=True)
-class FrameObjects:
-    """What the object stage says of one frame.
-
-    Attributes:
-        objects: by id.
-        static: pixels that tracking may use, bool, shape :math:`(H, W)`.
-        unpeopled: pixels of ``static`` that show no person, not even one who stands still, for the coloured map.
-        ballots: votes between objects that counted, over any baseline: ids of who voted and for whom, sorted.
-    """
-
-    objects: list[TrackedObject]
-    static_mask: Tensor
-    static_without_people: Tensor
-    vote_pairs: list[tuple[int, int]]
+_MIN_MISSED_SCORE = 0.3
+"""A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones
+or one strong one: the network labels rotated furniture as people in single frames."""
 
 
 class MotionClassifier:
-    """Keeps ids, lets objects vote, measures deformation and draws the static mask.
+    """Object stage of a frame: ids, motion states and the static mask.
 
     Args:
-        config: of the object stage.
-        camera: of all frames.
+        config: Configuration of the object stage.
+        camera: Camera of all frames.
     """
 
     def __init__(self, config: ObjectsConfig, camera: PinholeCamera) -> None:
@@ -104,168 +57,124 @@ class MotionClassifier:
         instances: Instances,
         clouds: InstanceClouds,
         view: DepthView,
-        arrivals: NewlyOccupied,
-        witnesses: FeatureSupport,
+        newly_occupied: NewlyOccupied,
+        feature_support: FeatureSupport,
     ) -> FrameObjects:
-        """Judge the objects of a frame.
+        """Track and classify the objects of a frame, and update the tracks with the result.
 
         Args:
-            instances: of the frame.
-            clouds: of the instances, camera frame.
-            view: its depth, with the pose that the motion from the frame before gives it.
-            arrivals: what came since earlier frames, see `FreeSpaceCheck`.
-            witnesses: features, and which of them fit the camera's motion.
+            instances: Instances of the frame.
+            clouds: Clouds of the instances, camera frame.
+            view: Depth of the frame, with the pose from frame-to-frame motion.
+            newly_occupied: Newly occupied pixels of the frame, see `FreeSpaceCheck`.
+            feature_support: Features of the frame and their agreement with the camera motion.
+
+        Returns:
+            Objects with their motion states, and the static mask.
         """
-        stamp = view.stamp
+        config, stamp = self._config, view.stamp
+        # Ids; missed objects are predicted (Sec. II, III-C).
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
-        shares = arrivals.fractions([track.cloud_pixels for track in tracks], self._config.free_space.min_points)
-        came = dict(zip(tracks, shares.tolist(), strict=True))
-        seen = [track for track in tracks if not track.missed]
-        pairs = self._pairs(seen)
-        left = self._vacated(pairs, view)
-        votes, ballots = self._vote(seen, pairs, came, left, stamp)
-        chamfer = self._deform(pairs, came, left, stamp)
+        detected = [track for track in tracks if not track.missed]
+        pairs = detection_pairs(detected, (*config.voting.baselines, config.chamfer.baseline))
+
+        # Independent evidence, not in the paper: free space.
+        free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
+
+        # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
+        vote = hough_vote_evidence(detected, pairs, free_space, self._last_stamp, config.voting)
+        for track in vote.dynamic:
+            track.mark_dynamic(stamp)
+
+        # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
+        candidates = self._deformation_candidates(pairs[config.chamfer.baseline], stamp)
+        chamfer = chamfer_evidence(candidates, free_space, config.chamfer)
+        for track in chamfer.deforming:
+            track.mark_deforming(stamp)
         self._last_stamp = stamp
-        fits = self._fit(tracks, witnesses)
-        verdicts = {track: self._judge(track, came[track], stamp, fits[track]) for track in tracks}
+
+        # Motion states, with memory over frames.
+        supported = feature_support.supports([track.cloud_pixels for track in tracks]).tolist()
+        motion_states = {
+            track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
+            for track, is_supported in zip(tracks, supported, strict=True)
+        }
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
                 mask=track.mask,
-                centroid=track.predict(stamp),
-                votes=votes.get(track, 0),
-                chamfer=chamfer.get(track, torch.nan),
-                motion_state=verdict,
+                centroid=track.predict_centroid(stamp),
+                votes=vote.votes.get(track, 0),
+                chamfer=chamfer.distances.get(track, torch.nan),
+                motion_state=motion_state,
                 missed=track.missed,
                 cloud=track.newest.cloud,
             )
-            for track, verdict in verdicts.items()
+            for track, motion_state in motion_states.items()
         ]
-        moving = [track for track, verdict in verdicts.items() if not self._may_be_tracked(verdict)]
+
+        # Static mask.
+        excluded = [track for track, motion_state in motion_states.items() if not self._is_trackable(motion_state)]
         people = [track for track in tracks if track.label == PERSON]
-        # Who moves is mostly a person: each outline is drawn once and serves both.
-        drawn = list(dict.fromkeys([*moving, *people]))
-        draw = MaskRefiner(
-            drawn, view, arrivals, self._config.static_mask, self._camera, self._config.clouds.voxel_size
-        )
-        outlines = {track: draw(track) for track in drawn}
-        size = view.depth.shape[-2:]
-        static = self._clear_of([outlines[track] for track in moving], size)
-        unpeopled = static & self._clear_of([outlines[track] for track in people], size)
-        return FrameObjects(objects, static, unpeopled, ballots)
+        masks = static_masks(excluded, people, view, newly_occupied, config, self._camera)
+        return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
 
-    def _fit(self, tracks: list[Track], witnesses: FeatureSupport) -> dict[Track, bool]:
-        """Whether the features on each object fit the camera's motion."""
-        config = self._config.static_mask
-        vouched = witnesses.supports([track.cloud_pixels for track in tracks], config.fit_share, config.fit_least)
-        return dict(zip(tracks, vouched.tolist(), strict=True))
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state between frames: timestamp of the last frame and state of the tracker."""
+        return {"last_stamp": self._last_stamp, "tracker": self.tracker.state_dict()}
 
-    def _pairs(self, tracks: list[Track]) -> dict[float, Pairs]:
-        """For each baseline, the sightings of each object that are compared."""
-        baselines = {*self._config.voting.baselines, self._config.chamfer.baseline}
-        return {
-            baseline: {track: pair for track in tracks if (pair := track.detection_pair(baseline)) is not None}
-            for baseline in baselines
-        }
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Replace the state between frames.
 
-    def _vote(
-        self,
-        tracks: list[Track],
-        compared: dict[float, Pairs],
-        came: dict[Track, list[float]],
-        left: dict[Detection3D, float],
-        stamp: float,
-    ) -> tuple[dict[Track, int], list[tuple[int, int]]]:
-        """Votes of each object, the most over all baselines, and who cast them; marks those that are voted dynamic."""
-        config, background = self._config.voting, self._config.free_space
-        most: dict[Track, int] = {}
-        cast: set[tuple[int, int]] = set()
-        if not config.enabled:
-            return most, []
-        # What is seen for the first time has no distance that could have changed: the background alone has a vote.
-        voted = {
-            track
-            for track in tracks
-            if background.enabled and any(share >= background.moved_share for share in came[track])
-        }
-        for baseline in config.baselines:
-            pairs = compared[baseline]
-            if baseline == 0:  # the frame before: what it has not is not compared (Alg. 1)
-                pairs = {track: pair for track, pair in pairs.items() if pair[0].stamp >= self._last_stamp}
-            if not pairs:
-                continue
-            share = background.moved_share
-            moved = torch.tensor(
-                [self._has_moved(came[track], left[then], share) for track, (then, _) in pairs.items()]
-            )
-            then = torch.stack([then.centroid for then, _ in pairs.values()])
-            now = torch.stack([now.centroid for _, now in pairs.values()])
-            votes, dynamic, ballots = vote_with_free_space(then, now, moved if background.enabled else None, config)
-            ids = [track.id for track in pairs]
-            cast |= {(ids[voter], ids[elected]) for elected, voter in ballots.nonzero().tolist()}
-            for track, count, elected in zip(pairs, votes.tolist(), dynamic.tolist(), strict=True):
-                most[track] = max(most.get(track, 0), count)
-                if elected:
-                    voted.add(track)
-        for track in voted:
-            track.last_dynamic = stamp
-            track.dynamic_frames += 1
-        return most, sorted(cast)
-
-    def _deform(
-        self, compared: dict[float, Pairs], came: dict[Track, list[float]], left: dict[Detection3D, float], stamp: float
-    ) -> dict[Track, float]:
-        """Root mean Chamfer distance of each living object to its own past; marks those that deform.
-
-        Not of those that the votes say move: this refines what they leave as static (paper, Sec. I).
+        Args:
+            state: Result of `state_dict`.
         """
-        config = self._config.chamfer
-        share = self._config.free_space.deformed_share
-        measured: dict[Track, float] = {}
-        for track, (then, now) in compared[config.baseline].items() if config.enabled else ():
-            if track.label not in LIVING or self._moves(track, stamp):
-                continue
-            motion = intra_object_motion(then.cloud[None], now.cloud[None], config.distance_threshold)
-            measured[track] = float(motion.distance)
-            if motion.deforming and self._has_moved(came[track], left[then], share):
-                track.last_deforming = stamp
-        return measured
+        self._last_stamp = state["last_stamp"]
+        self.tracker.load_state_dict(state["tracker"])
 
-    def _vacated(self, compared: dict[float, Pairs], view: DepthView) -> dict[Detection3D, float]:
-        """Share of its places that each object has left since the sightings that are compared with it now."""
-        then = list(dict.fromkeys(then for pairs in compared.values() for then, _ in pairs.values()))
-        shares = vacated_fractions([sighting.cloud for sighting in then], view, self._camera, self._config.free_space)
-        return dict(zip(then, shares.tolist(), strict=True))
+    def _deformation_candidates(self, pairs: DetectionPairs, stamp: float) -> DetectionPairs:
+        """Return the pairs of living objects that are not dynamic: Chamfer distances refine the vote (Sec. I)."""
+        if not self._config.chamfer.enabled:
+            return {}
+        return {
+            track: pair
+            for track, pair in pairs.items()
+            if track.label in LIVING and not self._is_held_dynamic(track, stamp)
+        }
 
-    def _has_moved(self, came: list[float], left: float, share: float) -> bool:
-        """Whether so much of an object has come, or has left its places; always, where the background has no say."""
-        return not self._config.free_space.enabled or any(part >= share for part in (*came, left))
+    def _motion_state(self, track: Track, appeared: list[float], stamp: float, supported: bool) -> MotionState:
+        """Return the motion state of an object.
 
-    def _judge(self, track: Track, came: list[float], stamp: float, fits: bool) -> MotionState:
+        Args:
+            track: Track of the object.
+            appeared: Fraction of the object's pixels that appeared, for each baseline of the free-space check.
+            stamp: Timestamp of the frame, seconds.
+            supported: True if the features on the object fit the camera motion.
+        """
         config = self._config.static_mask
         if track.last_dynamic == stamp:
             return MotionState.DYNAMIC
-        filled = [share < self._config.free_space.still_share for share in came]
-        # Over every baseline its places were filled: it stands there since the longest of them.
-        still = len(came) > 0 and all(filled)
-        if track.missed and (still or (track.score < config.bridge_score and track.last_dynamic == -torch.inf)):
+        at_rest = [fraction < _STATIC_FRACTION for fraction in appeared]
+        at_rest_over_all = len(at_rest) > 0 and all(at_rest)
+        rarely_detected = track.total_score < _MIN_MISSED_SCORE and track.last_dynamic == -torch.inf
+        if track.missed and (at_rest_over_all or rarely_detected):
             return MotionState.STATIC
-        # Gaits pause, things do not: one whose places are filled, and are not known to have been empty, is at rest.
-        known = [was for was, share in zip(filled, came, strict=True) if not isnan(share)]
+        # Gaits pause, but a rigid thing that is at rest over all known baselines has stopped.
+        known = [rest for rest, fraction in zip(at_rest, appeared, strict=True) if not isnan(fraction)]
         if track.label in THINGS and known and all(known):
             return MotionState.STATIC
-        if self._moves(track, stamp):
+        if self._is_held_dynamic(track, stamp):
             return MotionState.DYNAMIC
         if stamp - track.last_deforming <= config.hold_dynamic_time:
             return MotionState.DEFORMING
-        doubted = track.label in LIVING and stamp - track.first_seen < config.confirm_static_time
-        if doubted and not still and not fits:
+        is_new = track.label in LIVING and stamp - track.first_stamp < config.confirm_static_time
+        if is_new and not at_rest_over_all and not supported:
             return MotionState.UNKNOWN
         return MotionState.STATIC
 
-    def _moves(self, track: Track, stamp: float) -> bool:
-        """Whether an object is voted dynamic, or was not long ago and often enough."""
+    def _is_held_dynamic(self, track: Track, stamp: float) -> bool:
+        """Check whether an object is voted dynamic now, or was recently and in enough frames."""
         config = self._config.static_mask
         held = (
             stamp - track.last_dynamic <= config.hold_dynamic_time
@@ -273,42 +182,7 @@ class MotionClassifier:
         )
         return held or track.last_dynamic == stamp
 
-    def _may_be_tracked(self, verdict: MotionState) -> bool:
-        deforming = verdict is MotionState.DEFORMING and self._config.chamfer.keep_deforming_features
-        return deforming or verdict is MotionState.STATIC
-
-    def _clear_of(self, outlines: list[Tensor], size: torch.Size) -> Tensor:
-        """Pixels outside of the given objects, bool, shape (H, W)."""
-        covered = torch.zeros(size, dtype=torch.bool)
-        for outline in outlines:
-            covered |= outline
-        return ~dilate(covered, self._config.static_mask.dilation)
-
-
-def vote_with_free_space(
-    then: Tensor, now: Tensor, moved: Tensor | None, config: VotingConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The paper's vote (Alg. 1), with the background as one more voter that has the casting vote.
-
-    Args:
-        then: centroids of K objects, world frame, metres, shape :math:`(K, 3)`.
-        now: the same objects later.
-        moved: whether the background says that each moved, bool, shape :math:`(K,)`; None for the paper's rule.
-        config: thresholds.
-
-    Returns:
-        Votes for each, int64, and which are dynamic, bool, both of shape :math:`(K,)`; and the votes of objects that
-        counted, of column j for row i, int64, shape :math:`(K, K)`.
-    """
-    present = torch.ones(then.shape[0], dtype=torch.bool)
-    ballots = hough_vote(then, now, present, config.distance_threshold, config.vote_threshold).pair.to(torch.int64)
-    if moved is None:
-        votes = ballots.sum(dim=1)
-        return votes, votes >= config.vote_threshold, ballots
-    # Who moves cannot tell who else does, nor can who stands still but whose centroid, cut off, jumps.
-    witness = ~moved & ((now - then).norm(dim=1) < 0.5 * config.distance_threshold)
-    ballots = ballots * witness
-    votes = ballots.sum(dim=1) + moved
-    # Where fewer have a vote than are needed, all who have one must agree.
-    voters = witness.sum() - witness.long() + 1
-    return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), ballots
+    def _is_trackable(self, motion_state: MotionState) -> bool:
+        """Check whether tracking can use the pixels of an object with this motion state."""
+        deforming = motion_state is MotionState.DEFORMING and self._config.chamfer.keep_deforming_features
+        return deforming or motion_state is MotionState.STATIC

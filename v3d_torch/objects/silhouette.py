@@ -1,7 +1,7 @@
-"""The pixels around an object's points in the image, and those whose depth its points explain.
+"""Silhouette of a point cloud: pixels near the projected points whose depth agrees with the points.
 
-A network draws outlines at a quarter of the image's resolution: it rounds off hands and takes slices of the wall along.
-The object's cloud, cleaned of what does not belong to it, says which depths are its own, place by place.
+A segmentation network draws masks at a quarter of the image resolution: it cuts off hands and includes parts of the
+wall. The outlier-free cloud of an object gives the range of depths that belong to the object at each pixel.
 """
 
 from __future__ import annotations
@@ -18,44 +18,47 @@ from torch import Tensor
 from v3d_torch.geometry.camera import PinholeCamera
 
 _CELL = 4
-"""Side of the cells in which the depths of a cloud are gathered, pixels: those of the network's masks."""
+"""Side of the cells that collect the depths of a cloud, pixels: the resolution of the network's masks."""
 
-_NONE = 1e6
-"""Depth of cells without points, metres: farther than anything."""
+_NO_DEPTH = 1e6
+"""Depth of cells without points, metres: farther than any measurement."""
 
-_NEAREST = 0.1
-"""Points nearer than this, or behind the camera, have no place in the image, metres."""
+_MIN_DEPTH = 0.1
+"""Points nearer than this, or behind the camera, are not projected, metres."""
 
 
 def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float) -> list[Silhouette]:
-    """Clouds as they lie in an image, all at once.
+    """Project several clouds into an image at once.
 
     Args:
-        clouds: camera frame, metres, each of shape :math:`(P, 3)`.
-        camera: that takes the image.
-        spacing: of the points, metres: gaps of this size are closed.
+        clouds: Point clouds, camera frame, metres, each of shape :math:`(P, 3)`.
+        camera: Camera of the image.
+        spacing: Spacing of the points, metres: gaps of this size are closed.
+
+    Returns:
+        Silhouette of each cloud.
     """
     if not clouds:
         return []
-    # Each coordinate in a row of its own: points are located in half the time.
+    # One contiguous row per coordinate is faster to project.
     points = torch.cat([cloud.T for cloud in clouds], dim=1).to(torch.float64).T
-    pixels, inside = camera.locate(points, _NEAREST)
-    seen = inside.numpy()
-    # Pixel centres lie at integers: a cell begins half a pixel before its first.
-    cells = np.floor((pixels.numpy()[seen] + 0.5) / _CELL).astype(np.int64)
-    z = points[:, 2].numpy()[seen].astype(np.float32)
-    ends = np.concatenate([[0], seen.cumsum()])[np.cumsum([0, *map(len, clouds)])]
+    pixels, inside = camera.locate(points, _MIN_DEPTH)
+    projected = inside.numpy()
+    # Pixel centres lie at integers, so a cell begins half a pixel before its first pixel centre.
+    cells = np.floor((pixels.numpy()[projected] + 0.5) / _CELL).astype(np.int64)
+    z = points[:, 2].numpy()[projected].astype(np.float32)
+    ends = np.concatenate([[0], projected.cumsum()])[np.cumsum([0, *map(len, clouds)])]
     return [Silhouette(cells[begin:end], z[begin:end], camera, spacing) for begin, end in pairwise(ends.tolist())]
 
 
 class Silhouette:
-    """A cloud as it lies in an image.
+    """Projection of a cloud into an image.
 
     Args:
-        cells: (column, row) of the cell of each point, int64, shape :math:`(P, 2)`.
-        z: depth of each, metres, float32, shape :math:`(P,)`.
-        camera: that takes the image.
-        spacing: of the points, metres.
+        cells: Cell (column, row) of each projected point, int64, shape :math:`(P, 2)`.
+        z: Depth of each projected point, metres, float32, shape :math:`(P,)`.
+        camera: Camera of the image.
+        spacing: Spacing of the points, metres.
     """
 
     def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
@@ -63,62 +66,66 @@ class Silhouette:
         if len(z) == 0:
             return
         middle = len(z) // 2
-        self._gap = spacing * camera.fx / float(np.partition(z, middle)[middle])
-        self._first = cells.min(axis=0)
-        columns, rows = (cells.max(axis=0) - self._first + 1).tolist()
-        # The least of the depths in each cell, and of their opposites: one look around finds nearest and farthest.
-        column, row = (cells - self._first).T
-        least = np.full(2 * rows * columns, _NONE, np.float32)
-        place = 2 * (row * columns + column)
-        np.minimum.at(least, place, z)
-        np.minimum.at(least, place + 1, -z)
-        self._least = least.reshape(rows, columns, 2)
+        median_depth = float(np.partition(z, middle)[middle])
+        self._gap = spacing * camera.fx / median_depth
+        self._first_cell = cells.min(axis=0)
+        columns, rows = (cells.max(axis=0) - self._first_cell + 1).tolist()
+        # Minimum of z and of -z in each cell: one erosion then finds the nearest and the farthest depth around a cell.
+        column, row = (cells - self._first_cell).T
+        minima = np.full(2 * rows * columns, _NO_DEPTH, np.float32)
+        index = 2 * (row * columns + column)
+        np.minimum.at(minima, index, z)
+        np.minimum.at(minima, index + 1, -z)
+        self._minima = minima.reshape(rows, columns, 2)
 
-    def __call__(
-        self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, or_missing: bool = False
+    def mask(
+        self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, include_missing: bool = False
     ) -> Tensor:
-        """Pixels near the points whose depth the points around explain.
+        """Return the pixels near the points whose depth lies within the depth range of the surrounding points.
 
         Args:
-            depth: metres, of every n-th pixel, shape :math:`(1, h, w)`; 0 = no measurement.
-            margin: pixels by which the outline is farther out than the outermost points.
-            tolerance: metres by which depth may lie before or behind the points around it.
-            step: that n.
-            or_missing: takes pixels without depth that are near as well.
+            depth: Depth of every n-th pixel, metres, shape :math:`(1, h, w)`; 0 = no measurement.
+            margin: Distance from the outermost points up to which pixels are included, pixels.
+            tolerance: Tolerance of the depth in front of and behind the surrounding points, metres.
+            step: Step n between the pixels of ``depth``.
+            include_missing: Include pixels near the points that have no depth.
 
         Returns:
-            bool, shape :math:`(h, w)`; none where no point is in the image.
+            Mask of every n-th pixel, bool, shape :math:`(h, w)`; empty if no point is in the image.
         """
-        explained = np.zeros(depth.shape[1:], np.bool_)
+        mask = np.zeros(depth.shape[1:], np.bool_)
         if len(self._z) == 0:
-            return torch.from_numpy(explained)
+            return torch.from_numpy(mask)
         radius = max(round((margin + self._gap) / _CELL), 1)
-        # Nothing is near beyond the radius: all that follows looks at this part of the image only.
+        # Only the part of the image within the radius of the points can be in the mask.
         border = (radius, radius, radius, radius)
-        wide = cv2.copyMakeBorder(self._least, *border, cv2.BORDER_CONSTANT, value=(_NONE, _NONE))
-        around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-        least = cv2.erode(wide, around)
-        left, top = (self._first - radius).tolist()
-        v, of_row = _pixels(top, len(wide), step, depth.shape[1])
-        u, of_column = _pixels(left, wide.shape[1], step, depth.shape[2])
-        # Columns first, while there are few rows.
+        padded = cv2.copyMakeBorder(self._minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        minima = cv2.erode(padded, kernel)
+        left, top = (self._first_cell - radius).tolist()
+        v, cell_rows = _pixels_of_cells(top, len(padded), step, depth.shape[1])
+        u, cell_columns = _pixels_of_cells(left, padded.shape[1], step, depth.shape[2])
+        # Expand the cells to pixels: columns first, while there are few rows.
         low, high = (
-            cells.take(of_column, axis=1).take(of_row, axis=0)
-            for cells in (least[..., 0] - tolerance, tolerance - least[..., 1])
+            bound.take(cell_columns, axis=1).take(cell_rows, axis=0)
+            for bound in (minima[..., 0] - tolerance, tolerance - minima[..., 1])
         )
-        z = depth[0].numpy()[v, u]  # NumPy compares in a third of torch's time
-        fits = (z > low) & (z < high)
-        if or_missing:
-            fits |= (z <= 0) & (low < _NONE / 2)
-        explained[v, u] = fits
-        return torch.from_numpy(explained)
+        z = depth[0].numpy()[v, u]  # NumPy compares faster here than torch
+        inside = (z > low) & (z < high)
+        if include_missing:
+            inside |= (z <= 0) & (low < _NO_DEPTH / 2)
+        mask[v, u] = inside
+        return torch.from_numpy(mask)
 
     def visible_fraction(self, depth: Tensor, tolerance: float) -> float:
-        """Share of the points where the depth is theirs; 0 where no point is in the image.
+        """Return the fraction of projected points whose depth is the measured depth.
 
         Args:
-            depth: metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            tolerance: metres by which it may lie before or behind a point.
+            depth: Measured depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            tolerance: Tolerance of the depth in front of and behind a point, metres.
+
+        Returns:
+            Fraction of the points, from 0 to 1; 0 if no point is in the image.
         """
         if len(self._z) == 0:
             return 0.0
@@ -127,7 +134,7 @@ class Silhouette:
         return float((np.abs(depth[0].numpy()[v, u] - self._z) < tolerance).mean())
 
 
-def _pixels(first: int, count: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
-    """Along one axis, which of every n-th pixel lie in so many cells from the first on, and in which of them."""
+def _pixels_of_cells(first: int, count: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
+    """Return the range of every n-th pixel within ``count`` cells from ``first`` on, and the cell of each, one axis."""
     begin, end = max(-(-first * _CELL // step), 0), min(-(-(first + count) * _CELL // step), size)
     return slice(begin, end), np.arange(begin, end) * step // _CELL - first

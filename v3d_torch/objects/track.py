@@ -1,11 +1,10 @@
-"""One object over time."""
+"""Track of one object over time: detections, predicted motion, masks and motion evidence."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from functools import cached_property
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -14,15 +13,29 @@ from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.segmentation.coco import UNLABELLED
 
+_CENTROID_SIGMA = 0.05
+"""Standard deviation of the centroid of a fully visible object, metres: arms and legs swing by more, the error of the
+mask contour is smaller."""
 
-@dataclass(frozen=True, eq=False)  # a sighting is itself, not its values
+_PARTIAL_SIGMA = 0.45
+"""Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
+the hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
+
+_HISTORY = 1.0
+"""Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""
+
+_STAMP_TOLERANCE = 1e-3
+"""Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
+
+
+@dataclass(frozen=True, eq=False)  # compared by identity
 class Detection3D:
-    """Where an object was at one time.
+    """Detection of an object at one time.
 
     Attributes:
-        stamp: seconds.
-        centroid: world frame, metres, float64, shape :math:`(3,)`; nan when its cloud was too small.
-        cloud: world frame, metres, float32, shape :math:`(P, 3)`.
+        stamp: Timestamp, seconds.
+        centroid: Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if the cloud is too small.
+        cloud: Point cloud, world frame, metres, float32, shape :math:`(P, 3)`.
     """
 
     stamp: float
@@ -31,109 +44,158 @@ class Detection3D:
 
     @cached_property
     def is_located(self) -> bool:
-        """Whether the centroid is known."""
+        """True if the centroid is known."""
         return bool(torch.isfinite(self.centroid).all())
 
 
-@dataclass(eq=False)  # a track is itself, not its values
+@dataclass(eq=False)  # compared by identity, so that a track can be a dictionary key
 class Track:
-    """An object with an id, and what was seen of it lately.
+    """One object with an id.
+
+    Measured are the detections and the class. A Kalman filter on the centroids predicts the position and the cloud. The
+    masks belong to the newest frame and are either measured or predicted, see ``missed``. The motion evidence is what
+    votes and Chamfer distances have found so far.
+
+    Args:
+        config: Noise and maximum speed of the Kalman filter.
 
     Attributes:
-        id: number of the object, from 1, never used again.
-        mask: its pixels in the newest frame, bool, shape :math:`(H, W)`; predicted where the network missed it.
-        own: those of them whose depth is its own, bool, shape :math:`(H, W)`.
-        coarse: every n-th pixel of the mask, as the tracker compares them, float32, shape :math:`(P,)`.
-        first_seen: seconds.
-        config: noise of centroids, and for how long they are remembered.
-        sightings: newest last, not older than the history of the configuration; at least one.
-        missed: whether the newest frame has it only by prediction.
-        labels: how often the network gave it which class.
-        label: the class that it gave most often: it may flicker from frame to frame. A name once given stays.
-        score: sum of the scores that the network gave it.
-        evidence: frames in which it was voted dynamic.
-        last_dynamic: stamp of the last vote that went through, seconds.
-        last_deforming: stamp of the last Chamfer distance above the threshold, seconds.
+        id: Number of the object, from 1, never reused.
+        first_stamp: Timestamp of the first detection, seconds.
+        mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
+        cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
+        coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, float32, shape :math:`(P,)`.
+        missed: True if the object was not detected in the newest frame, so that its masks are predicted.
+        detections: Detections of the last second, newest last, at least one.
+        labels: Number of detections of each class.
+        label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
+        total_score: Sum of the scores of all detections.
+        dynamic_frames: Number of frames in which the vote classified the object as dynamic.
+        last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
+        last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
     """
 
     id: int
+    first_stamp: float
+    config: InitVar[TrackerConfig]
     mask: Tensor
     cloud_pixels: Tensor
     coarse_mask: Tensor
-    first_seen: float
-    config: TrackerConfig
-    detections: list[Detection3D] = field(default_factory=list)
     missed: bool = False
+    detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
     label: int = UNLABELLED
-    score: float = 0.0
+    total_score: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
 
-    _TOLERANCE: ClassVar[float] = 1e-3  # seconds: stamps are rounded, frame times jitter
-
-    def __post_init__(self) -> None:
-        self._motion = ConstantVelocityKalmanFilter(self.config)
-        self._most_points = 1
-
-    def update_label(self, label: int, score: float) -> None:
-        """Take in the class that the network gives it in a frame, and with which score."""
-        self.labels[label] += 1
-        self.score += score
-        named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
-        self.label = (named or self.labels).most_common(1)[0][0]
+    def __post_init__(self, config: TrackerConfig) -> None:
+        self._filter = ConstantVelocityKalmanFilter(config)
+        self._max_points = 1
 
     @property
     def newest(self) -> Detection3D:
-        """The last time that the network saw the object."""
+        """Newest detection."""
         return self.detections[-1]
 
-    @property
-    def last_located(self) -> Detection3D:
-        """The last sighting with a centroid; the newest one when none has."""
-        return next((sighting for sighting in reversed(self.detections) if sighting.is_located), self.newest)
-
     def detection_pair(self, baseline: float) -> tuple[Detection3D, Detection3D] | None:
-        """The newest sighting and the newest one at least ``baseline`` seconds before it; 0 means the one before.
+        """Return the newest detection and an earlier one to compare it with.
+
+        Args:
+            baseline: Minimum time between both detections, seconds; 0 for the detection before the newest.
 
         Returns:
-            (then, now), both with a centroid; None when there is no such pair.
+            Earlier and newest detection, both with a centroid; None if there is no such pair.
         """
-        now = self.newest
-        for then in reversed(self.detections[:-1]):
-            if now.stamp - then.stamp >= baseline - self._TOLERANCE:
-                return (then, now) if then.is_located and now.is_located else None
+        current = self.newest
+        for previous in reversed(self.detections[:-1]):
+            if current.stamp - previous.stamp >= baseline - _STAMP_TOLERANCE:
+                return (previous, current) if previous.is_located and current.is_located else None
         return None
 
     @property
     def velocity(self) -> Tensor:
-        """World frame, m/s, float64, shape :math:`(3,)`; 0 while the sightings are too few to tell."""
-        return self._motion.velocity
+        """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
+        return self._filter.velocity
 
-    def predict(self, stamp: float) -> Tensor:
-        """Centroid at ``stamp`` with constant velocity (paper, Sec. II), world frame, shape :math:`(3,)`."""
-        return self._motion.predict(stamp)
+    def predict_centroid(self, stamp: float) -> Tensor:
+        """Predict the centroid with constant velocity (paper, Sec. II).
 
-    def cloud_at(self, stamp: float) -> Tensor:
-        """The newest cloud, moved on with constant velocity, world frame, float64, shape :math:`(P, 3)`."""
+        Args:
+            stamp: Timestamp, seconds.
+
+        Returns:
+            Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
+        """
+        return self._filter.predict(stamp)
+
+    def predict_cloud(self, stamp: float) -> Tensor:
+        """Predict the cloud: the newest cloud, moved with constant velocity.
+
+        Args:
+            stamp: Timestamp, seconds.
+
+        Returns:
+            Point cloud, world frame, metres, float64, shape :math:`(P, 3)`.
+        """
         return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
 
-    def add_detection(self, sighting: Detection3D) -> None:
-        """Take in a new sighting, and forget what is older than the history."""
-        self._most_points = max(self._most_points, len(sighting.cloud))
-        hidden = 1 - len(sighting.cloud) / self._most_points  # the centroid of a part is not that of the whole
-        sigma = self.config.centroid_sigma + self.config.partial_sigma * hidden
-        self._motion.update(sighting.stamp, sighting.centroid, sigma)
-        self.detections.append(sighting)
-        oldest = sighting.stamp - self.config.history - self._TOLERANCE
+    def add_detection(self, detection: Detection3D) -> None:
+        """Add a detection, update the Kalman filter, and drop detections older than the history.
+
+        Args:
+            detection: Detection, not older than the newest one.
+        """
+        self._max_points = max(self._max_points, len(detection.cloud))
+        hidden_fraction = 1 - len(detection.cloud) / self._max_points
+        sigma = _CENTROID_SIGMA + _PARTIAL_SIGMA * hidden_fraction
+        self._filter.update(detection.stamp, detection.centroid, sigma)
+        self.detections.append(detection)
+        oldest = detection.stamp - _HISTORY - _STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
 
+    def update_label(self, label: int, score: float) -> None:
+        """Update the class with the class of a detection.
+
+        Args:
+            label: Class index.
+            score: Score of the detection.
+        """
+        self.labels[label] += 1
+        self.total_score += score
+        named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
+        self.label = (named or self.labels).most_common(1)[0][0]
+
+    def set_masks(self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool) -> None:
+        """Set the masks of the newest frame.
+
+        Args:
+            mask: Pixels of the object, bool, shape :math:`(H, W)`.
+            cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
+            coarse_mask: Every n-th pixel of the mask, float32, shape :math:`(P,)`.
+            missed: True if the masks are predicted, because the object was not detected.
+        """
+        self.mask, self.cloud_pixels, self.coarse_mask, self.missed = mask, cloud_pixels, coarse_mask, missed
+
+    def mark_dynamic(self, stamp: float) -> None:
+        """Record that the vote classified the object as dynamic in the frame at ``stamp``, seconds."""
+        self.last_dynamic = stamp
+        self.dynamic_frames += 1
+
+    def mark_deforming(self, stamp: float) -> None:
+        """Record that the object deforms in the frame at ``stamp``, seconds."""
+        self.last_deforming = stamp
+
     def move_world(self, T_new_old: Tensor) -> None:
-        """Carry all of it along when the map is corrected under it, see `InstanceTracker.move_world`."""
+        """Transform the track into the corrected world.
+
+        Args:
+            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+        """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
-        self._motion.move_world(T_new_old)
+        self._filter.move_world(T_new_old)
         self.detections = [
-            Detection3D(s.stamp, R @ s.centroid + t, s.cloud @ R.T.to(s.cloud) + t.to(s.cloud)) for s in self.detections
+            Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
         ]

@@ -1,7 +1,8 @@
-"""What moves and has no name: people that the network misses, and things that it does not know.
+"""Unlabelled instances: newly occupied regions that no instance of the segmentation covers.
 
-A tilted or half-seen person, a carried box: no class, no mask. But its points do not fit the camera's motion: they lie
-where an earlier view saw nothing. Where such pixels lie together they are proposed as an instance like any other.
+The network misses tilted or partly visible people, and has no class for a carried box. But their points do not fit the
+camera motion: they lie in space that an earlier view observed as free. Connected regions of such pixels become
+instances without a class.
 """
 
 from __future__ import annotations
@@ -12,41 +13,41 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import NewlyOccupied
 from v3d_torch.objects.mask_ops import upsample_nearest
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
-_APART = np.ones((3, 3), np.uint8)
-"""Pixels that came alone are noise of the depth; opening by this removes them (pixels of the arrivals)."""
+_OPENING_KERNEL = np.ones((3, 3), np.uint8)
+"""Isolated newly occupied pixels are depth noise; opening by this kernel removes them (pixels of `NewlyOccupied`)."""
 
-_RIM = np.ones((5, 5), np.uint8)
-"""What lies this near to a named instance is its rim, cut off by a coarse mask (pixels of the arrivals)."""
+_RIM_KERNEL = np.ones((5, 5), np.uint8)
+"""Pixels this near to an instance are its rim, which a coarse mask cuts off (pixels of `NewlyOccupied`)."""
 
 
 def unlabelled_instances(
-    arrivals: NewlyOccupied, named: Instances, depth: Tensor, camera: PinholeCamera, min_area: float
+    newly_occupied: NewlyOccupied, instances: Instances, depth: Tensor, camera: PinholeCamera, min_area: float
 ) -> Instances:
-    """Regions that came and that no instance covers.
+    """Propose instances from newly occupied regions that no other instance covers.
 
     Args:
-        arrivals: of the frame.
-        named: instances of the frame.
-        depth: metres, shape :math:`(1, H, W)`.
-        camera: of the frame.
-        min_area: smaller regions are noise, square metres.
+        newly_occupied: Newly occupied pixels of the frame.
+        instances: Instances of the frame from the segmentation.
+        depth: Depth of the frame, metres, shape :math:`(1, H, W)`.
+        camera: Camera of the frame.
+        min_area: Minimum area of a region, square metres; smaller regions are noise.
 
     Returns:
-        Instances of class `UNLABELLED` with score 0 and empty boxes, none where nothing came.
+        Instances of class `UNLABELLED` with score 0 and empty boxes; none if nothing is newly occupied.
     """
-    step, (height, width) = arrivals.stride, depth.shape[-2:]
-    came = (arrivals.appeared == 1).any(dim=0).to(torch.uint8).numpy()
-    came = cv2.morphologyEx(came, cv2.MORPH_OPEN, _APART)
-    covered = np.asarray(named.masks.numpy()[:, ::step, ::step].any(axis=0), np.uint8)
-    came[cv2.dilate(covered, _RIM) > 0] = 0
-    count, region = cv2.connectedComponents(came)
-    footprint = np.square(depth[0, ::step, ::step].to(torch.float64).numpy() * step) / (camera.fx * camera.fy)
-    area = np.bincount(region.ravel(), weights=footprint.ravel(), minlength=count)
+    step, (height, width) = newly_occupied.stride, depth.shape[-2:]
+    appeared = (newly_occupied.appeared == 1).any(dim=0).to(torch.uint8).numpy()
+    appeared = cv2.morphologyEx(appeared, cv2.MORPH_OPEN, _OPENING_KERNEL)
+    covered = np.asarray(instances.masks.numpy()[:, ::step, ::step].any(axis=0), np.uint8)
+    appeared[cv2.dilate(covered, _RIM_KERNEL) > 0] = 0
+    count, region = cv2.connectedComponents(appeared)
+    pixel_area = np.square(depth[0, ::step, ::step].to(torch.float64).numpy() * step) / (camera.fx * camera.fy)
+    area = np.bincount(region.ravel(), weights=pixel_area.ravel(), minlength=count)
     large = 1 + np.flatnonzero(area[1:] >= min_area)
     if len(large) == 0:
         return Instances.empty(height, width)

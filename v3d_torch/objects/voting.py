@@ -1,4 +1,4 @@
-"""Spatial-reasoned Hough voting: which objects move, told without the camera's pose (paper, Sec. III-C, Alg. 1)."""
+"""Spatial-reasoned Hough voting: moving objects without the camera pose (paper, Sec. III-C, Alg. 1)."""
 
 from __future__ import annotations
 
@@ -8,18 +8,24 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.config import VotingConfig
+
+_STATIC_VOTER_RATIO = 0.5
+"""Beside the free-space check, an object votes only if its own centroid moved by less than this fraction of the
+distance threshold. Then at least half of every change that counts as a vote is motion of the other object."""
+
 
 class Votes(NamedTuple):
-    r"""Outcome of a vote among K objects.
+    r"""Result of a vote among K objects.
 
     Attributes:
-        votes: votes received by each object, :math:`V(O_i) = \sum_j I_{ij}`, dtype of the centroids, shape
+        votes: Number of votes for each object, :math:`V(O_i) = \sum_j I_{ij}`, dtype of the centroids, shape
             :math:`(..., K)`.
-        pair: the indicator :math:`I_{ij}`, vote of object j for object i, shape :math:`(..., K, K)`; symmetric, 0 on
+        pair: Indicator :math:`I_{ij}`, the vote of object j for object i, shape :math:`(..., K, K)`; symmetric, 0 on
             the diagonal and for objects that are not present.
-        change: by how much the distance between objects i and j has changed, metres, shape :math:`(..., K, K)`; 0 as
-            ``pair``.
-        dynamic: objects with enough votes, bool, shape :math:`(..., K)`.
+        change: Absolute change of the distance between objects i and j, metres, shape :math:`(..., K, K)`; 0 on the
+            diagonal and for objects that are not present.
+        dynamic: Objects with enough votes, bool, shape :math:`(..., K)`.
     """
 
     votes: Tensor
@@ -36,54 +42,90 @@ def hough_vote(
     vote_threshold: float | Tensor,
     temperature: float | Tensor | None = None,
 ) -> Votes:
-    r"""Let every object vote for those whose distance to it has changed.
+    r"""Let every object vote for the objects whose distance to it has changed.
 
-    The distance between two still objects is the same from wherever the camera sees them, so centroids of both times
-    stay in the camera frame of their own time and no pose is needed. Row i of both inputs is the same object.
+    The distance between two static objects does not depend on the camera position. Therefore the centroids of both
+    times can stay in the camera frames of their own times, and no pose is needed. Row i of both inputs is the same
+    object.
 
     Args:
-        previous: centroids then, metres, shape :math:`(..., K, 3)`.
-        current: centroids now, metres, shape :math:`(..., K, 3)`.
-        present: objects seen both times, bool, shape :math:`(..., K)`; what stands in other rows is not looked at.
-        distance_threshold: :math:`T_d`, metres: a change of at least this is a vote.
-        vote_threshold: :math:`T_v`: an object with at least so many votes is dynamic.
-        temperature: metres; the indicator becomes :math:`\sigma((change - T_d) / temperature)`, which can be
-            differentiated. None is the paper's step function.
+        previous: Centroids at the earlier time, metres, shape :math:`(..., K, 3)`.
+        current: Centroids at the current time, metres, shape :math:`(..., K, 3)`.
+        present: Objects that are observed at both times, bool, shape :math:`(..., K)`; the centroids of all others are
+            ignored.
+        distance_threshold: Change of a distance that counts as a vote, :math:`T_d`, metres.
+        vote_threshold: Number of votes that makes an object dynamic, :math:`T_v`.
+        temperature: Softness of the vote, metres: the indicator becomes the differentiable function
+            :math:`\sigma((change - T_d) / temperature)`. None for the step function of the paper.
 
     Returns:
-        Votes, differentiable in both centroids: ``change`` always, ``pair`` and ``votes`` with a temperature, and then
-        in threshold and temperature, too, where these are tensors.
+        Votes. ``change`` is differentiable in both centroids. With a temperature, ``pair`` and ``votes`` are
+        differentiable too, also in threshold and temperature if these are tensors.
     """
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
     KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])
-    themselves = torch.eye(present.shape[-1], dtype=torch.bool)
-    voters = present[..., :, None] & present[..., None, :] & ~themselves
+    diagonal = torch.eye(present.shape[-1], dtype=torch.bool)
+    comparable = present[..., :, None] & present[..., None, :] & ~diagonal
 
-    change = (_distances(current, present) - _distances(previous, present)).abs()
-    change = torch.where(voters, change, 0)
+    change = (_pairwise_distances(current, present) - _pairwise_distances(previous, present)).abs()
+    change = torch.where(comparable, change, 0)
     if temperature is None:
         indicator = (change >= distance_threshold).to(change.dtype)
     else:
         indicator = torch.sigmoid((change - distance_threshold) / temperature)
-    pair = torch.where(voters, indicator, 0)
+    pair = torch.where(comparable, indicator, 0)
     votes = pair.sum(dim=-1)
     return Votes(votes, pair, change, dynamic=present & (votes >= vote_threshold))
 
 
-def _distances(centroids: Tensor, present: Tensor) -> Tensor:
-    """Distance between every two centroids, (..., K, K). Absent rows become the origin: NaN there would spread."""
+def _pairwise_distances(centroids: Tensor, present: Tensor) -> Tensor:
+    """Return all pairwise distances, (..., K, K). Absent rows are set to the origin: NaN would spread to gradients."""
     centroids = torch.where(present[..., None], centroids, 0)
     return torch.linalg.vector_norm(centroids[..., :, None, :] - centroids[..., None, :, :], dim=-1)
 
 
-class HoughVoting(torch.nn.Module):
-    """:func:`hough_vote` as a module. A setting given as a `torch.nn.Parameter` is learnt.
+def vote_with_free_space(
+    previous: Tensor, current: Tensor, moved: Tensor | None, config: VotingConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Hough voting (paper, Alg. 1) with the free-space check as an additional voter and veto.
+
+    Objects that moved, or whose centroid jumped because they were cut off, do not vote. An object is dynamic only if it
+    moved according to the free-space check and has enough votes, the vote of the check included.
 
     Args:
-        distance_threshold: change of a distance that counts as a vote, metres.
-        vote_threshold: votes that make an object dynamic.
-        temperature: softness of the vote, metres; None for the paper's step function.
+        previous: Centroids of K objects at the earlier time, world frame, metres, shape :math:`(K, 3)`.
+        current: Centroids of the same objects at the current time, shape :math:`(K, 3)`.
+        moved: Objects that moved according to the free-space check, bool, shape :math:`(K,)`; None for the rule of the
+            paper.
+        config: Thresholds.
+
+    Returns:
+        Number of votes for each object, int64, shape :math:`(K,)`; objects that are dynamic, bool, shape :math:`(K,)`;
+        and the votes between objects that counted, of column j for row i, int64, shape :math:`(K, K)`.
+    """
+    present = torch.ones(previous.shape[0], dtype=torch.bool)
+    result = hough_vote(previous, current, present, config.distance_threshold, config.vote_threshold)
+    pair = result.pair.to(torch.int64)
+    if moved is None:
+        votes = pair.sum(dim=1)
+        return votes, votes >= config.vote_threshold, pair
+    may_vote = ~moved & ((current - previous).norm(dim=1) < _STATIC_VOTER_RATIO * config.distance_threshold)
+    pair = pair * may_vote
+    votes = pair.sum(dim=1) + moved
+    # The voters on an object are all other objects that may vote, and the free-space check. If they are fewer than the
+    # vote threshold, all of them must agree.
+    voters = may_vote.sum() - may_vote.long() + 1
+    return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), pair
+
+
+class HoughVoting(torch.nn.Module):
+    """:func:`hough_vote` as a module. A setting that is a `torch.nn.Parameter` can be learnt.
+
+    Args:
+        distance_threshold: Change of a distance that counts as a vote, metres.
+        vote_threshold: Number of votes that makes an object dynamic.
+        temperature: Softness of the vote, metres; None for the step function of the paper.
     """
 
     def __init__(
@@ -98,5 +140,5 @@ class HoughVoting(torch.nn.Module):
         self.temperature = temperature
 
     def forward(self, previous: Tensor, current: Tensor, present: Tensor) -> Votes:
-        """Vote on centroids, metres, shape :math:`(..., K, 3)` with mask :math:`(..., K)`; see :func:`hough_vote`."""
+        """Vote on centroids, metres, shape :math:`(..., K, 3)`, with mask :math:`(..., K)`; see :func:`hough_vote`."""
         return hough_vote(previous, current, present, self.distance_threshold, self.vote_threshold, self.temperature)

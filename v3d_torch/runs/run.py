@@ -15,7 +15,7 @@ from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_text
 from v3d_torch.mapping.map_io import StoredMap
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionState
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline import FrameCallback, Pipeline
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 from v3d_torch.types import RGBDFrame
 
 if TYPE_CHECKING:
-    from v3d_torch.objects.motion_classifier import FrameObjects
+    from v3d_torch.objects.frame_objects import FrameObjects
     from v3d_torch.slam import V3DSLAM
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import BackProjector
-from v3d_torch.objects.motion_classifier import TrackedObject
+from v3d_torch.objects.frame_objects import TrackedObject
 from v3d_torch.pipeline import Pipeline, Snapshot
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure

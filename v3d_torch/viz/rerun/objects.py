@@ -11,7 +11,7 @@ import torch
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 
-from v3d_torch.objects.motion_classifier import FrameObjects, MotionState
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 from v3d_torch.viz.voting import VOTE_COLOUR, IdPair, split_votes
 

@@ -18,7 +18,7 @@ from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
-from v3d_torch.objects.motion_classifier import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 from v3d_torch.viz.rerun.layout import layout

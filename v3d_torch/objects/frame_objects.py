@@ -1,0 +1,71 @@
+"""Objects of one frame with their motion states, and the static mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from torch import Tensor
+
+from v3d_torch.segmentation.coco import class_name
+
+
+class MotionState(StrEnum):
+    """Motion state of an object."""
+
+    STATIC = "static"
+    DYNAMIC = "dynamic"
+    DEFORMING = "deforming"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class TrackedObject:
+    """Object of one frame with its motion state.
+
+    Attributes:
+        id: Number of the object.
+        label: COCO class index; see `name` for the class name.
+        mask: Pixels of the object, bool, shape :math:`(H, W)`.
+        centroid: Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown.
+        votes: Number of votes in this frame, maximum over the baselines.
+        chamfer: Root mean nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured, for
+            example because the object is dynamic.
+        motion_state: Static, dynamic, deforming or unknown.
+        missed: True if the network did not detect the object in this frame, so that mask and centroid are predicted.
+        cloud: Point cloud of the last detection, world frame, metres, float32, shape :math:`(P, 3)`.
+    """
+
+    id: int
+    label: int
+    mask: Tensor
+    centroid: Tensor
+    votes: int
+    chamfer: float
+    motion_state: MotionState
+    missed: bool
+    cloud: Tensor
+
+    @property
+    def name(self) -> str:
+        """Class name and id, for example ``person 3``."""
+        return f"{class_name(self.label)} {self.id}"
+
+
+@dataclass(frozen=True)
+class FrameObjects:
+    """Objects of one frame and the pixels that show the static scene.
+
+    Attributes:
+        objects: Objects, sorted by id.
+        static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
+        static_without_people: Pixels of ``static_mask`` that show no person, not even a static one, for the coloured
+            map; bool, shape :math:`(H, W)`.
+        vote_pairs: Votes between objects that counted over any baseline: id of the voter and id of the object with the
+            vote, sorted.
+    """
+
+    objects: list[TrackedObject]
+    static_mask: Tensor
+    static_without_people: Tensor
+    vote_pairs: list[tuple[int, int]]

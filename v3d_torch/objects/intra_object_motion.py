@@ -1,0 +1,95 @@
+"""Intra-object motion: objects that change their shape, even if they stay in place (paper, Sec. III-D)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor
+
+from v3d_torch.objects.chamfer import chamfer_distance
+
+
+class Deformation(NamedTuple):
+    r"""Change of shape of B objects between two times.
+
+    Attributes:
+        distance: Root mean nearest-neighbour distance, :math:`\sqrt{D / 2}` with D the Chamfer distance, metres, dtype
+            of the clouds, shape :math:`(B,)`; NaN if one of the two clouds is empty.
+        deforming: Objects whose distance is at least the threshold, bool, shape :math:`(B,)`; False if the distance is
+            NaN.
+    """
+
+    distance: Tensor
+    deforming: Tensor
+
+
+def intra_object_motion(
+    then: Tensor,
+    now: Tensor,
+    distance_threshold: float,
+    then_valid: Tensor | None = None,
+    now_valid: Tensor | None = None,
+    T_now_then: Tensor | None = None,
+) -> Deformation:
+    r"""Compare the cloud of every object with its own cloud at an earlier time.
+
+    The camera moves in between, so both clouds must be expressed in one frame: pass both in the world frame, or each in
+    the frame of its own camera together with ``T_now_then``.
+
+    Args:
+        then: Clouds at the earlier time, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        now: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
+        distance_threshold: Distance from which an object is deforming, metres.
+        then_valid: Points of ``then`` that exist, bool, shape :math:`(B, N)`; all by default.
+        now_valid: Points of ``now`` that exist, bool, shape :math:`(B, M)`; all by default.
+        T_now_then: Transform from the frame of ``then`` to that of ``now``, shape :math:`(B, 4, 4)`, or
+            :math:`(4, 4)` for all objects; None if the frames are the same.
+
+    Returns:
+        Distance of each object, and the objects that are deforming. The distance is differentiable in clouds and
+        transform as `chamfer_distance` is; at a distance of 0, which is a kink, the gradient is set to 0.
+
+    Raises:
+        InputError: If a valid point is not finite.
+    """
+    if T_now_then is not None:
+        then = _transform(T_now_then, then, then_valid)
+    mean_square = chamfer_distance(then, now, then_valid, now_valid) / 2
+    # torch.where evaluates both branches: the 1 keeps the gradient of the unused branch finite.
+    is_zero = mean_square == 0
+    distance = torch.where(is_zero, 0, torch.where(is_zero, 1, mean_square).sqrt())
+    return Deformation(distance, deforming=distance >= distance_threshold)
+
+
+def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
+    """Transform the valid points by T. Set all others to the origin: NaN would spread to the gradient of T."""
+    KORNIA_CHECK_SHAPE(T, ["4", "4"] if T.ndim == 2 else [str(points.shape[0]), "4", "4"])
+    if valid is not None:
+        points = torch.where(valid[..., None], points, 0)
+    T = T.to(points)
+    return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
+
+
+class IntraObjectMotion(torch.nn.Module):
+    """:func:`intra_object_motion` as a module.
+
+    Args:
+        distance_threshold: Distance from which an object is deforming, metres.
+    """
+
+    def __init__(self, distance_threshold: float) -> None:
+        super().__init__()
+        self.distance_threshold = distance_threshold
+
+    def forward(
+        self,
+        then: Tensor,
+        now: Tensor,
+        then_valid: Tensor | None = None,
+        now_valid: Tensor | None = None,
+        T_now_then: Tensor | None = None,
+    ) -> Deformation:
+        """Compare clouds, metres, shape :math:`(B, N, 3)` and :math:`(B, M, 3)`; see :func:`intra_object_motion`."""
+        return intra_object_motion(then, now, self.distance_threshold, then_valid, now_valid, T_now_then)

@@ -1,0 +1,202 @@
+"""Evidence of object motion in one frame: free space, Hough votes and Chamfer distances (paper, Sec. III-C, III-D).
+
+All functions return their results. `MotionClassifier` updates the tracks with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+import torch
+
+from v3d_torch.config import ChamferConfig, FreeSpaceConfig, VotingConfig
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.objects.free_space_check import DepthView, vacated_fractions
+from v3d_torch.objects.intra_object_motion import intra_object_motion
+from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.objects.voting import vote_with_free_space
+
+MOVED_FRACTION = 0.5
+"""An object has moved if at least this fraction of its visible points appeared or vacated: contours and partial
+occlusion affect only a part of a static object."""
+
+DEFORMED_FRACTION = 0.1
+"""An object has deformed if at least this fraction of its visible points appeared or vacated. Silhouettes err by a
+pixel or two, which is some hundredths of a person; a torso of 0.4 m that sways by 4 cm reaches this fraction."""
+
+DetectionPairs = dict[Track, tuple[Detection3D, Detection3D]]
+"""Earlier and newest detection of each object that has both."""
+
+
+def detection_pairs(tracks: Iterable[Track], baselines: Iterable[float]) -> dict[float, DetectionPairs]:
+    """Collect the pairs of detections to compare.
+
+    Args:
+        tracks: Tracks that are detected in the frame.
+        baselines: Minimum times between the two detections of a pair, seconds.
+
+    Returns:
+        Pairs for each baseline.
+    """
+    tracks = list(tracks)
+    return {
+        baseline: {track: pair for track in tracks if (pair := track.detection_pair(baseline)) is not None}
+        for baseline in set(baselines)
+    }
+
+
+@dataclass(frozen=True)
+class FreeSpaceEvidence:
+    """Result of the free-space check for the objects of a frame.
+
+    Attributes:
+        appeared: Fraction of each object's pixels that appeared, for each baseline of the check; NaN if unknown.
+        vacated: Fraction of the points of each earlier detection whose position is free space now; NaN if unknown.
+        enabled: False if the free-space check is turned off.
+    """
+
+    appeared: dict[Track, list[float]]
+    vacated: dict[Detection3D, float]
+    enabled: bool
+
+    def has_appeared(self, track: Track) -> bool:
+        """Check whether most of an object appeared over some baseline; False if the check is turned off."""
+        return self.enabled and any(fraction >= MOVED_FRACTION for fraction in self.appeared[track])
+
+    def allows_motion(self, track: Track, previous: Detection3D, min_fraction: float) -> bool:
+        """Check whether enough of an object appeared or vacated.
+
+        Args:
+            track: Track of the object.
+            previous: Earlier detection of the object.
+            min_fraction: Minimum fraction of the object.
+
+        Returns:
+            True if the fraction is reached, or if the check is turned off.
+        """
+        fractions = (*self.appeared[track], self.vacated[previous])
+        return not self.enabled or any(fraction >= min_fraction for fraction in fractions)
+
+
+def free_space_evidence(
+    tracks: list[Track],
+    pairs: dict[float, DetectionPairs],
+    view: DepthView,
+    newly_occupied: NewlyOccupied,
+    config: FreeSpaceConfig,
+    camera: PinholeCamera,
+) -> FreeSpaceEvidence:
+    """Measure the appeared and vacated fractions of all objects.
+
+    Args:
+        tracks: Tracks of the frame.
+        pairs: Pairs of detections for each baseline.
+        view: Depth and pose of the frame.
+        newly_occupied: Newly occupied pixels of the frame.
+        config: Tolerances.
+        camera: Camera of the frame.
+    """
+    appeared = newly_occupied.fractions([track.cloud_pixels for track in tracks], config.min_points)
+    previous = list(dict.fromkeys(earlier for of_baseline in pairs.values() for earlier, _ in of_baseline.values()))
+    vacated = vacated_fractions([detection.cloud for detection in previous], view, camera, config)
+    return FreeSpaceEvidence(
+        appeared=dict(zip(tracks, appeared.tolist(), strict=True)),
+        vacated=dict(zip(previous, vacated.tolist(), strict=True)),
+        enabled=config.enabled,
+    )
+
+
+@dataclass(frozen=True)
+class VoteEvidence:
+    """Result of Hough voting over all baselines.
+
+    Attributes:
+        votes: Maximum number of votes of each compared object over the baselines.
+        dynamic: Objects that are voted dynamic over some baseline, or that appeared.
+        vote_pairs: Votes that counted over some baseline: id of the voter and id of the object with the vote, sorted.
+    """
+
+    votes: dict[Track, int]
+    dynamic: set[Track]
+    vote_pairs: list[tuple[int, int]]
+
+
+def hough_vote_evidence(
+    detected: Collection[Track],
+    pairs: dict[float, DetectionPairs],
+    free_space: FreeSpaceEvidence,
+    previous_stamp: float,
+    config: VotingConfig,
+) -> VoteEvidence:
+    """Let the objects vote over all baselines (paper, Alg. 1).
+
+    Args:
+        detected: Tracks that are detected in the frame.
+        pairs: Pairs of detections for each baseline.
+        free_space: Result of the free-space check.
+        previous_stamp: Timestamp of the previous frame, seconds.
+        config: Baselines and thresholds.
+
+    Returns:
+        Votes and dynamic objects; empty if voting is turned off.
+    """
+    if not config.enabled:
+        return VoteEvidence({}, set(), [])
+    max_votes: dict[Track, int] = {}
+    vote_pairs: set[tuple[int, int]] = set()
+    # A newly detected object has no earlier distance that could have changed: only the free-space check votes on it.
+    dynamic = {track for track in detected if free_space.has_appeared(track)}
+    for baseline in config.baselines:
+        compared = pairs[baseline]
+        if baseline == 0:  # only objects of the previous frame are compared (Alg. 1)
+            compared = {track: pair for track, pair in compared.items() if pair[0].stamp >= previous_stamp}
+        if not compared:
+            continue
+        moved = None
+        if free_space.enabled:
+            moved = torch.tensor(
+                [free_space.allows_motion(track, earlier, MOVED_FRACTION) for track, (earlier, _) in compared.items()]
+            )
+        previous = torch.stack([earlier.centroid for earlier, _ in compared.values()])
+        current = torch.stack([newest.centroid for _, newest in compared.values()])
+        votes, is_dynamic, pair_votes = vote_with_free_space(previous, current, moved, config)
+        ids = [track.id for track in compared]
+        vote_pairs |= {(ids[voter], ids[candidate]) for candidate, voter in pair_votes.nonzero().tolist()}
+        for track, count, flag in zip(compared, votes.tolist(), is_dynamic.tolist(), strict=True):
+            max_votes[track] = max(max_votes.get(track, 0), count)
+            if flag:
+                dynamic.add(track)
+    return VoteEvidence(max_votes, dynamic, sorted(vote_pairs))
+
+
+@dataclass(frozen=True)
+class ChamferEvidence:
+    """Change of shape of the compared objects.
+
+    Attributes:
+        distances: Root mean nearest-neighbour distance of each compared object, metres; NaN if a cloud is empty.
+        deforming: Objects that deform.
+    """
+
+    distances: dict[Track, float]
+    deforming: set[Track]
+
+
+def chamfer_evidence(pairs: DetectionPairs, free_space: FreeSpaceEvidence, config: ChamferConfig) -> ChamferEvidence:
+    """Compare the cloud of each object with its earlier cloud (paper, Sec. III-D).
+
+    Args:
+        pairs: Pairs of detections of the objects to compare.
+        free_space: Result of the free-space check. An object deforms only if enough of it appeared or vacated.
+        config: Threshold.
+    """
+    distances: dict[Track, float] = {}
+    deforming: set[Track] = set()
+    for track, (previous, current) in pairs.items():
+        motion = intra_object_motion(previous.cloud[None], current.cloud[None], config.distance_threshold)
+        distances[track] = float(motion.distance)
+        if motion.deforming and free_space.allows_motion(track, previous, DEFORMED_FRACTION):
+            deforming.add(track)
+    return ChamferEvidence(distances, deforming)

@@ -1,0 +1,49 @@
+"""Newly occupied pixels of a frame, from the free-space check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class NewlyOccupied:
+    """Pixels whose point lies in space that earlier views observed as free.
+
+    Attributes:
+        appeared: For each of B baselines, 1 if the space was free, 0 if it was occupied, NaN if unknown; float64, every
+            ``stride``-th pixel, shape :math:`(B, h, w)`.
+        stride: Step between the pixels, pixels.
+    """
+
+    appeared: Tensor
+    stride: int
+
+    @property
+    def previously_occupied(self) -> Tensor:
+        """Pixels whose space was occupied over at least one baseline and free over none, bool, shape :math:`(h, w)`."""
+        return (self.appeared == 0).any(dim=0) & ~(self.appeared == 1).any(dim=0)
+
+    def fractions(self, masks: Sequence[Tensor], min_pixels: int) -> Tensor:
+        """Return the fraction of each object's pixels that appeared.
+
+        Args:
+            masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
+            min_pixels: Minimum number of known pixels of an object.
+
+        Returns:
+            Fraction for each object and baseline, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
+        """
+        step, appeared = self.stride, self.appeared.flatten(1)
+        if not masks:
+            return appeared.new_zeros(0, len(appeared))
+        inside = np.stack([mask.numpy()[::step, ::step] for mask in masks]).reshape(len(masks), -1)
+        # float32 counts pixels exactly and is faster.
+        indicators = torch.cat([appeared == 1, ~appeared.isnan()]).to(torch.float32)
+        counts = torch.from_numpy(inside.astype(np.float32)) @ indicators.T
+        new, known = counts.to(appeared.dtype).chunk(2, dim=1)
+        return (new / known).masked_fill(known < min_pixels, torch.nan)
