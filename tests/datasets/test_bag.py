@@ -21,8 +21,8 @@ from v3d_torch.datasets import SourceOptions, load_sequence
 from v3d_torch.datasets.bag import BagSequence
 from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE, choose_topics
-from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.demo.sequence import write_sequence
+from v3d_torch.datasets.stored import Cursor
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import evaluate

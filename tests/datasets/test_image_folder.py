@@ -9,7 +9,7 @@ import pytest
 from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of, depth_of, save
 
 from v3d_torch.datasets import RGBDSequence, SourceOptions, load_sequence
-from v3d_torch.datasets.file_names import frame_number, images_in, stamp
+from v3d_torch.datasets.image_files import frame_number, images_in, stamp
 from v3d_torch.datasets.image_folder import ImageFolder
 from v3d_torch.errors import InputError
 

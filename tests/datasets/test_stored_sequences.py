@@ -15,7 +15,7 @@ from PIL import Image
 from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
 from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.images import read_colour, read_depth
-from v3d_torch.datasets.names import download_url
+from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 

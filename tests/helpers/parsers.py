@@ -20,7 +20,7 @@ from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.encodings import COLOURS
 from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour, read_depth
 from v3d_torch.datasets.lists import read_associations, read_image_list
-from v3d_torch.datasets.matrices import read_matrix, read_poses
+from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera

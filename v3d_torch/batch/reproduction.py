@@ -17,7 +17,7 @@ from v3d_torch.cli.console import open_sequence, result_folder, wide_console
 from v3d_torch.config.loading import FULL
 from v3d_torch.datasets import PAPER_SEQUENCES, RGBDSequence, short_name
 from v3d_torch.datasets.locate import data_folder, stored_path
-from v3d_torch.datasets.names import download_url
+from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.evaluation import ablation
 from v3d_torch.evaluation.layout import latex_table, markdown_table, screen_table

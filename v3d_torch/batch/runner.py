@@ -15,7 +15,7 @@ from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_cluster import RayCluster
 from v3d_torch.batch.records import BatchRecord
 from v3d_torch.cli.console import interrupts_between_frames, open_sequences, progress_bars, result_folder, wide_console
-from v3d_torch.datasets.patterns import matching_sequences
+from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
 
 

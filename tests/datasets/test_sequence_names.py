@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3d_torch.datasets.names import PAPER_SEQUENCES, SEQUENCES, canonical_name, download_url, short_name
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, canonical_name, download_url, short_name
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
