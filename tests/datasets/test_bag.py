@@ -389,7 +389,7 @@ def test_depth_that_is_not_registered_to_colour(tmp_path: Path) -> None:
 
 
 def test_depth_of_another_size(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"{DEPTH}: has 40x24 pixels, its colour image 32x24; name depth"):
+    with pytest.raises(InputError, match=": has 40x24 pixels, but its colour image has 32x24; name depth"):
         load_sequence(str(changed(tmp_path, size=(40, HEIGHT))))
 
 

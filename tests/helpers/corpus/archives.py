@@ -111,7 +111,7 @@ CASES = [
             "a file outside by an absolute path",
             archive(member("/outside.txt", size=3)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: holds no rgb.txt and depth.txt; get the"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
                 " archive from another source"
             ),
         ),
@@ -247,7 +247,7 @@ CASES = [
             "without a sequence",
             all_of(lambda p: shutil.rmtree(p.folder), lambda p: p.folder.mkdir(), archive()),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: holds no rgb.txt and depth.txt; get the"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
                 " archive from another source"
             ),
         ),

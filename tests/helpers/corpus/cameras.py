@@ -32,14 +32,14 @@ CASES = [
         "no camera",
         remove(YAML),
         Says(
-            "{seq}: says nothing about its camera; put a camera.yaml there (fx, fy, cx, cy, width, height,"
-            " depth_scale) or give --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
+            "{seq}: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height, depth_scale) or"
+            " pass --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
         ),
     ),
     Case(
         "empty file",
         write(YAML, ""),
-        Says("{seq}/camera.yaml: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Says("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
     ),
     Case("broken YAML", write(YAML, "fx: {525.0\n"), Says("{seq}/camera.yaml: is not valid YAML (...); repair it")),
     Case(
@@ -70,7 +70,7 @@ CASES = [
     Case(
         "a list",
         write(YAML, "- 525.0\n- 525.0\n"),
-        Says("{seq}/camera.yaml: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Says("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
     ),
     Case(
         "a field is missing",
@@ -132,8 +132,8 @@ CASES = [
         "centre far outside",
         field("cx", "1e6"),
         Says(
-            "{seq}/camera.yaml: the centre (1e+06, 29.5) lies far outside of 80x60 pixels; correct cx and"
-            " cy, or the size"
+            "{seq}/camera.yaml: the principal point (1e+06, 29.5) is far outside the 80x60 image; correct cx"
+            " and cy, or width and height"
         ),
     ),
     Case(
@@ -160,8 +160,8 @@ CASES = [
         "size of other images",
         field("width", "640"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 640x60; give the camera that"
-            " took it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x60; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
@@ -173,8 +173,8 @@ CASES = [
             )
         ),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 60x80; give the camera that took"
-            " it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 60x80; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
@@ -223,16 +223,16 @@ CASES = [
         "lens that bends rays back",
         edit(YAML, lambda content: content + b"distortion: [-50, 0, 0, 0, 0]\n"),
         Says(
-            "{seq}: no point is seen at some corner of the image with the lens (-50.0, 0.0, 0.0, 0.0, 0.0);"
-            " correct the camera's distortion (k1, k2, p1, p2, k3) or leave it out"
+            "{seq}: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
+            " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
     Case(
         "lens that bends rays anywhere",
         edit(YAML, lambda content: content + b"distortion: [1e30, 1e30, 1e30, 1e30, 1e30]\n"),
         Says(
-            "{seq}: no point is seen at some corner of the image with the lens (1e+30, 1e+30, 1e+30, 1e+30,"
-            " 1e+30); correct the camera's distortion (k1, k2, p1, p2, k3) or leave it out"
+            "{seq}: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image corners;"
+            " correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
     Case(
@@ -253,32 +253,32 @@ CASES = [
         "K.txt empty",
         numbers(""),
         Says(
-            "{seq}/K.txt: holds 0 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 0 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with three numbers",
         numbers("525 319.5 239.5\n"),
         Says(
-            "{seq}/K.txt: holds 3 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 3 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with eight numbers",
         numbers(NUMBERS + "1\n"),
         Says(
-            "{seq}/K.txt: holds 8 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 8 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with words",
         numbers("fx=525 fy=525\n"),
         Says(
-            "{seq}/K.txt: holds something that is not a number (could not convert string to float:"
-            " 'fx=525'); write fx fy cx cy depth_scale width height"
+            "{seq}/K.txt: contains a value that is not a number (could not convert string to float: 'fx=525');"
+            " write fx fy cx cy depth_scale width height"
         ),
     ),
     Case(
@@ -303,48 +303,48 @@ CASES = [
         "K.txt as a matrix, of 640x480 pixels",
         numbers("525 0 319.5\n0 525 239.5\n0 0 1\n"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 640x480; give the camera that"
-            " took it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
         "K.txt as a matrix with skew",
         numbers("525 3 319.5\n0 525 239.5\n0 0 1\n"),
         Says(
-            "{seq}/K.txt: holds 9 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 9 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with a number of 5000 digits",
         numbers(5000 * "1"),
         Says(
-            "{seq}/K.txt: holds 1 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 1 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "--camera that is nothing",
         options("--camera", "kinect"),
-        Says("kinect: is neither a camera file nor a preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
+        Says("kinect: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
     ),
     Case(
         "--camera nearly right",
         options("--camera", "tum_f3"),
-        Says("tum_f3: is neither a camera file nor a preset; did you mean tum_fr3?"),
+        Says("tum_f3: is not a camera file or preset; did you mean tum_fr3?"),
     ),
     Case(
         "--camera of other images",
         options("--camera", "tum_fr3"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 640x480; give the camera that"
-            " took it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
         "--camera is a folder",
         options("--camera", "{seq}"),
-        Says("{seq}: is neither a camera file nor a preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
+        Says("{seq}: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
     ),
     Case(
         "--camera is an image",

@@ -89,19 +89,19 @@ CASES = [
     Case(
         "the first colour image breaks off",
         edit(RGB[0], half),
-        Says("{seq}/rgb/1305031102.000000.png: is truncated or broken; copy or download it again"),
+        Says("{seq}/rgb/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "the first depth image breaks off",
         edit(DEPTH[0], half),
-        Says("{seq}/depth/1305031102.000000.png: is truncated or broken; copy or download it again"),
+        Says("{seq}/depth/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "a colour image breaks off",
         edit(RGB[5], half),
         Says(
-            "{seq}/rgb/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -109,8 +109,8 @@ CASES = [
         "a depth image breaks off",
         edit(DEPTH[5], half),
         Says(
-            "{seq}/depth/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -118,8 +118,8 @@ CASES = [
         "a bit of a colour image is wrong",
         edit(RGB[5], flipped),
         Says(
-            "{seq}/rgb/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -127,8 +127,8 @@ CASES = [
         "a bit of a depth image is wrong",
         edit(DEPTH[5], flipped),
         Says(
-            "{seq}/depth/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -136,8 +136,8 @@ CASES = [
         "an empty colour image",
         write(RGB[5], ""),
         Says(
-            "{seq}/rgb/1305031102.500000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it"
-            " again (the results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -145,8 +145,8 @@ CASES = [
         "an empty depth image",
         write(DEPTH[5], ""),
         Says(
-            "{seq}/depth/1305031102.500000.png: is no image, or none of PNG, JPEG or TIFF; copy or export"
-            " it again (the results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
@@ -154,8 +154,8 @@ CASES = [
         "a web page for an image",
         write(RGB[2], PAGE),
         Says(
-            "{seq}/rgb/1305031102.200000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it"
-            " again (the results of the 2 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results of the 2 frames before are in {out}; go on with --resume {out})",
             kept=2,
         ),
     ),
@@ -163,16 +163,17 @@ CASES = [
         "colour and depth swapped in the lists",
         swapped_lists,
         Says(
-            "{seq}/depth/1305031102.000000.png: is a 16-bit depth image where colour belongs; are colour"
-            " and depth swapped?"
+            "{seq}/depth/1305031102.000000.png: is a 16-bit depth image, expected a colour image; check that"
+            " colour and depth are not swapped"
         ),
     ),
     Case(
         "depth where one colour image belongs",
         write(RGB[4], png(depth())),
         Says(
-            "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image where colour belongs; are colour and"
-            " depth swapped? (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image, expected a colour image; check that"
+            " colour and depth are not swapped (the results of the 4 frames before are in {out}; go on with"
+            " --resume {out})",
             kept=4,
         ),
     ),
@@ -180,8 +181,9 @@ CASES = [
         "colour where one depth image belongs",
         write(DEPTH[4], png(colour(0))),
         Says(
-            "{seq}/depth/1305031102.400000.png: is a colour image where depth belongs; are colour and depth"
-            " swapped? (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped (the results of the 4 frames before are in {out}; go on with --resume"
+            " {out})",
             kept=4,
         ),
     ),
@@ -189,27 +191,34 @@ CASES = [
         "depth of 8 bits",
         every(DEPTH, lambda i: png((depth() >> 8).astype(np.uint8))),
         Says(
-            "{seq}/depth/1305031102.000000.png: is 8-bit, a depth image has 16 bits; export the depth again, unscaled"
+            "{seq}/depth/1305031102.000000.png: is an 8-bit image, depth needs 16 bits; export depth again"
+            " without rescaling"
         ),
     ),
     Case(
         "depth of 8 bits in one frame",
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
         Says(
-            "{seq}/depth/1305031102.400000.png: is 8-bit, a depth image has 16 bits; export the depth"
-            " again, unscaled (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.400000.png: is an 8-bit image, depth needs 16 bits; export depth again"
+            " without rescaling (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
     ),
     Case(
         "depth as a colour map",
         every(DEPTH, lambda i: png(cv2.applyColorMap((depth() >> 8).astype(np.uint8), 2))),
-        Says("{seq}/depth/1305031102.000000.png: is a colour image where depth belongs; are colour and depth swapped?"),
+        Says(
+            "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped"
+        ),
     ),
     Case(
         "depth of 16 bits in three channels",
         every(DEPTH, lambda i: png(np.dstack(3 * [depth()]))),
-        Says("{seq}/depth/1305031102.000000.png: is a colour image where depth belongs; are colour and depth swapped?"),
+        Says(
+            "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped"
+        ),
     ),
     Case("colour of 16 bits", every(RGB, deep_colour), Right()),
     Case("colour with an alpha channel", every(RGB, see_through), Right()),
@@ -219,24 +228,25 @@ CASES = [
     Case(
         "depth as JPEG",
         every(DEPTH, jpeg),
-        Says("{seq}/depth/1305031102.000000.png: is a colour image where depth belongs; are colour and depth swapped?"),
+        Says(
+            "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped"
+        ),
     ),
     Case(
         "depth in floating point with NaN",
         every(DEPTH, lambda i: saved(np.full((HEIGHT, WIDTH), np.nan, np.float32), "tiff")),
-        Says(
-            "{seq}/depth/1305031102.000000.png: has floating-point numbers; export the depth again, as PNG of 16 bits"
-        ),
+        Says("{seq}/depth/1305031102.000000.png: is a floating-point image; export depth as 16-bit PNG"),
     ),
     Case(
         "depth as OpenEXR",
         every(DEPTH, lambda i: b"v/1\x01\x02\0\0\0channels\0chlist\0" + bytes(300)),
-        Says("{seq}/depth/1305031102.000000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it again"),
+        Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "depth as a NumPy array",
         every(DEPTH, lambda i: b"\x93NUMPY\x01\0v\0{'descr': '<f4', 'fortran_order': False}" + bytes(300)),
-        Says("{seq}/depth/1305031102.000000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it again"),
+        Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "depth of 32 bits, negative for none",
@@ -247,33 +257,33 @@ CASES = [
         "colour smaller than depth",
         every(RGB, lambda i: png(cv2.resize(colour(*way(i)), (WIDTH // 2, HEIGHT // 2)))),
         Says(
-            "{seq}/depth/1305031102.000000.png: has 80x60 pixels, its colour image 40x30; export the depth"
-            " that is registered to colour, pixel by pixel"
+            "{seq}/depth/1305031102.000000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            " that is registered to the colour image"
         ),
     ),
     Case(
         "depth smaller than colour",
         every(DEPTH, lambda i: png(depth()[::2, ::2])),
         Says(
-            "{seq}/depth/1305031102.000000.png: has 40x30 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel"
+            "{seq}/depth/1305031102.000000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            " that is registered to the colour image"
         ),
     ),
     Case(
         "both smaller than the camera",
         all_of(every(RGB, lambda i: png(SMALL)), every(DEPTH, lambda i: png(depth()[::2, ::2]))),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, the camera 80x60; give the camera that took"
-            " it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, but the camera has 80x60; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
         "a colour image of another size",
         write(RGB[3], png(SMALL)),
         Says(
-            "{seq}/depth/1305031102.300000.png: has 80x60 pixels, its colour image 40x30; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
-            " go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " with --resume {out})",
             kept=3,
         ),
     ),
@@ -281,9 +291,9 @@ CASES = [
         "a depth image of another size",
         write(DEPTH[3], png(depth()[::2, ::2])),
         Says(
-            "{seq}/depth/1305031102.300000.png: has 40x30 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
-            " go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " with --resume {out})",
             kept=3,
         ),
     ),
@@ -291,9 +301,9 @@ CASES = [
         "a depth image on its side",
         write(DEPTH[3], png(depth().T.copy())),
         Says(
-            "{seq}/depth/1305031102.300000.png: has 60x80 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
-            " go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " with --resume {out})",
             kept=3,
         ),
     ),
@@ -301,8 +311,8 @@ CASES = [
         "a colour image that claims 40000 x 40000 pixels",
         write(RGB[3], bomb(40000, 40000, 8, 2)),
         Says(
-            "{seq}/rgb/1305031102.300000.png: claims more than 64 million pixels; copy or export it again"
-            " (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
+            " export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
@@ -310,14 +320,17 @@ CASES = [
         "a depth image that claims 40000 x 40000 pixels",
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
         Says(
-            "{seq}/depth/1305031102.300000.png: claims more than 64 million pixels; copy or export it again"
-            " (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy"
+            " or export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
     Case(
         "the first image claims 40000 x 40000 pixels",
         write(RGB[0], bomb(40000, 40000, 8, 2)),
-        Says("{seq}/rgb/1305031102.000000.png: claims more than 64 million pixels; copy or export it again"),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: has more than 64 million pixels according to its header; copy or"
+            " export it again"
+        ),
     ),
 ]

@@ -100,8 +100,7 @@ CASES = [
         "ScanNet, a pose breaks off",
         changed(scannet(), "pose/3.txt", half),
         Says(
-            "{root}/take/pose/3.txt: is no matrix of 3 or 4 lines with as many numbers each; copy it again"
-            " (the results are in {out})",
+            "{root}/take/pose/3.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
             kept=8,
         ),
     ),
@@ -109,47 +108,45 @@ CASES = [
         "ScanNet, a pose that is no motion",
         changed(scannet(), "pose/3.txt", lambda content: 4 * b"1 2 3 4\n"),
         Says(
-            "{root}/take/pose/3.txt: is not the motion of a camera, a rotation and a place; copy it again"
-            " (the results are in {out})",
+            "{root}/take/pose/3.txt: is not a valid rigid transform; copy it again (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
         "ScanNet, the camera breaks off",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", half),
-        Says(
-            "{root}/take/intrinsic/intrinsic_depth.txt: is no matrix of 3 or 4 lines with as many numbers"
-            " each; copy it again"
-        ),
+        Says("{root}/take/intrinsic/intrinsic_depth.txt: is not a 3x3 or 4x4 matrix; copy it again"),
     ),
     Case(
         "ScanNet, a camera of NaN",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", lambda content: 4 * b"nan nan nan nan\n"),
         Says(
-            "{root}/take/intrinsic/intrinsic_depth.txt: is no camera matrix, with focal lengths on its"
-            " diagonal; copy it again"
+            "{root}/take/intrinsic/intrinsic_depth.txt: is not a camera matrix with focal lengths of at least 1"
+            " pixel on its diagonal; copy it again"
         ),
     ),
     Case(
         "ScanNet, a colour camera of zeros",
         changed(larger_colour(scannet()), "intrinsic/intrinsic_color.txt", lambda content: 4 * b"0 0 0 0\n"),
         Says(
-            "{root}/take/intrinsic/intrinsic_color.txt: is no camera matrix, with focal lengths on its"
-            " diagonal; copy it again"
+            "{root}/take/intrinsic/intrinsic_color.txt: is not a camera matrix with focal lengths of at least 1"
+            " pixel on its diagonal; copy it again"
         ),
     ),
     Case(
         "ScanNet, no depth",
         take(without(scannet(), "depth") | {"depth/x.txt": b""}),
-        Says("{root}/take: no colour image has the number of a depth image; do they belong together?"),
+        Says(
+            "{root}/take: no colour image has the same frame number as a depth image; check that both belong to"
+            " the same recording"
+        ),
     ),
     Case("7-Scenes", take(seven_scenes()), Right()),
     Case(
         "7-Scenes, a pose of words",
         changed(seven_scenes(), "frame-000003.pose.txt", lambda content: b"lost\n"),
         Says(
-            "{root}/take/frame-000003.pose.txt: is no matrix of 3 or 4 lines with as many numbers each;"
-            " copy it again (the results are in {out})",
+            "{root}/take/frame-000003.pose.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
             kept=8,
         ),
     ),
@@ -157,7 +154,7 @@ CASES = [
         "7-Scenes, an image breaks off",
         changed(seven_scenes(), "frame-000003.depth.png", half),
         Says(
-            "{root}/take/frame-000003.depth.png: is truncated or broken; copy or download it again (the"
+            "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again (the"
             " results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
@@ -171,22 +168,22 @@ CASES = [
         "ICL-NUIM, the truth breaks off",
         icl_nuim("1 2 3\n"),
         Says(
-            "{seq}/traj0.gt.freiburg: line 1 is '1 2 3' where stamp tx ty tz qx qy qz qw is expected;"
-            " repair it (the results are in {out})",
+            "{seq}/traj0.gt.freiburg: line 1 is '1 2 3', expected timestamp tx ty tz qx qy qz qw; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
         "OpenLORIS, a broken camera",
         openloris("%YAML:1.0\nd400_color_optical_frame: [\n"),
-        Says("{seq}/sensors.yaml: is no YAML as OpenCV writes it (...); copy it again"),
+        Says("{seq}/sensors.yaml: is not valid OpenCV YAML (...); copy it again"),
     ),
     Case(
         "OpenLORIS, no camera",
         openloris("%YAML:1.0\nt265_fisheye1_optical_frame:\n   width: 848\n"),
         Says(
-            "{seq}/sensors.yaml: holds no d400_color_optical_frame with width, height, intrinsics; copy it"
-            " again, or give --camera"
+            "{seq}/sensors.yaml: has no d400_color_optical_frame with width, height and intrinsics; copy it"
+            " again, or pass --camera"
         ),
     ),
     Case(
@@ -196,19 +193,19 @@ CASES = [
             "      dt: d\n      data: [ 1., 2. ]\n"
         ),
         Says(
-            "{seq}/sensors.yaml: holds no d400_color_optical_frame with width, height, intrinsics; copy it"
-            " again, or give --camera"
+            "{seq}/sensors.yaml: has no d400_color_optical_frame with width, height and intrinsics; copy it"
+            " again, or pass --camera"
         ),
     ),
     Case(
         "OpenLORIS, a camera of noise",
         openloris(NOISE),
-        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it is YAML as OpenCV writes it"),
+        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it contains YAML written by OpenCV"),
     ),
     Case(
         "images without times",
         take(images()),
-        Says("{root}/take: names such as 0.png are no times; give the frames a second with --fps"),
+        Says("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
     ),
     Case("images without times, --fps", all_of(take(images()), options("--fps", "10")), Right(ate=None)),
     Case(
@@ -220,13 +217,16 @@ CASES = [
         "images whose names have nothing in common",
         all_of(take(without(images(), "depth") | {"depth/a.png": png(depth())}), options("--fps", "10")),
         Says(
-            "{root}/take: has 8 colour and 1 depth images whose names have nothing in common; name those"
-            " that belong together alike"
+            "{root}/take: has 8 colour and 1 depth images that cannot be paired by name; give the two images of"
+            " a frame the same name"
         ),
     ),
     Case(
         "images in too many folders",
         all_of(take(images() | {"rgb_right/0.png": png(colour(0))}), options("--fps", "10")),
-        Says("{root}/take: holds rgb, rgb_right, depth; leave one folder of colour and one of depth images there"),
+        Says(
+            "{root}/take: has too many image folders (rgb, rgb_right, depth); keep one folder of colour and one"
+            " of depth images"
+        ),
     ),
 ]

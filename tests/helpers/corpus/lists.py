@@ -111,135 +111,156 @@ CASES = [
         "milliseconds since the start",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e3:.0f}"),
         Says(
-            "{seq}: by their stamps its images lie 100 s apart; stamps are seconds, divide them in the"
-            " lists if they are milli- or nanoseconds"
+            "{seq}: the images are 100 s apart according to their timestamps; convert the timestamps in the"
+            " lists to seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
     Case(
         "nanoseconds since the start",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e9:.0f}"),
         Says(
-            "{seq}: by their stamps its images lie 9.99999e+07 s apart; stamps are seconds, divide them in"
-            " the lists if they are milli- or nanoseconds"
+            "{seq}: the images are 9.99999e+07 s apart according to their timestamps; convert the timestamps in"
+            " the lists to seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
     Case("negative stamps", stamps_as(lambda s: f"{s - 1305031102.35:.6f}"), Right()),
     Case(
         "stamps that are words",
         lines("rgb.txt", lambda listed: [f"frame{i} {line.split()[1]}" for i, line in enumerate(listed)]),
-        Says("{seq}/rgb.txt: line 1 has 'frame0' where a stamp in seconds is expected; repair or remove the line"),
+        Says("{seq}/rgb.txt: line 1 has 'frame0', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
         "a stamp that is not a number",
         lines("rgb.txt", lambda listed: [*listed[:3], f"nan {FIRST}", *listed[3:]]),
-        Says("{seq}/rgb.txt: line 4 has 'nan' where a stamp in seconds is expected; repair or remove the line"),
+        Says("{seq}/rgb.txt: line 4 has 'nan', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
         "an infinite stamp",
         lines("depth.txt", lambda listed: [f"inf {FIRST}", *listed]),
-        Says("{seq}/depth.txt: line 1 has 'inf' where a stamp in seconds is expected; repair or remove the line"),
+        Says("{seq}/depth.txt: line 1 has 'inf', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
         "lists of two clocks",
         stamps_as(lambda s: f"{s + 10:.6f}", ("depth.txt",)),
         Says(
-            "{seq}: no stamp in rgb.txt lies within 0.02 s of one in depth.txt; do both lists belong to this sequence?"
+            "{seq}: no timestamp in rgb.txt is within 0.02 s of one in depth.txt; check that both lists belong"
+            " to the same recording"
         ),
     ),
     Case(
         "empty list",
         write("rgb.txt", ""),
-        Says("{seq}/rgb.txt: lists no images; a list has lines of a stamp and a file, copy it again"),
+        Says("{seq}/rgb.txt: lists no images; a list has a timestamp and a file name on each line, copy it again"),
     ),
     Case(
         "list of comments only",
         write("depth.txt", "# depth maps\n"),
-        Says("{seq}/depth.txt: lists no images; a list has lines of a stamp and a file, copy it again"),
+        Says("{seq}/depth.txt: lists no images; a list has a timestamp and a file name on each line, copy it again"),
     ),
     Case(
         "no list of colour",
         remove("rgb.txt"),
-        Says("{seq}: has no rgb.txt; the sequence's images are listed in rgb.txt and depth.txt"),
+        Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
         "no list of depth",
         remove("depth.txt"),
-        Says("{seq}: has no depth.txt; the sequence's images are listed in rgb.txt and depth.txt"),
+        Says("{seq}: has no depth.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case("no lists at all", remove("rgb.txt", "depth.txt"), Right(ate=None)),
     Case(
         "a listed image is not there",
         remove(FIRST),
-        Says("{seq}/rgb/1305031102.000000.png: is listed but not there (1 such files); copy the whole sequence again"),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
     ),
     Case(
         "a line breaks off",
         edit("rgb.txt", lambda content: content[:-5]),
-        Says("{seq}/rgb/1305031102.700000: is listed but not there (1 such files); copy the whole sequence again"),
+        Says(
+            "{seq}/rgb/1305031102.700000: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
     ),
     Case(
         "a line without a name",
         lines("rgb.txt", lambda listed: [*listed[:3], STAMPS[3], *listed[4:]]),
-        Says("{seq}/rgb.txt: line 4 is '1305031102.300000' where a stamp and a file are expected; repair or remove it"),
+        Says(
+            "{seq}/rgb.txt: line 4 is '1305031102.300000', expected a timestamp and a file name; correct or remove it"
+        ),
     ),
     Case(
         "a listed image is a folder",
         folder_at(FIRST),
-        Says("{seq}/rgb/1305031102.000000.png: is listed but not there (1 such files); copy the whole sequence again"),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
     ),
     Case(
         "a listed image is a loop of links",
         loop(FIRST),
-        Says("{seq}/rgb/1305031102.000000.png: is listed but not there (1 such files); copy the whole sequence again"),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
     ),
     Case(
         "the list is a loop of links",
         loop("rgb.txt"),
-        Says("{seq}: has no rgb.txt; the sequence's images are listed in rgb.txt and depth.txt"),
+        Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
         "the list is a folder",
         folder_at("rgb.txt"),
-        Says("{seq}: has no rgb.txt; the sequence's images are listed in rgb.txt and depth.txt"),
+        Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
         "a name with a zero byte",
         edit("rgb.txt", replaced("rgb/", "rgb/\0")),
         Says(
-            "{seq}/rgb/\\x001305031102.000000.png: is listed but not there (8 such files); copy the whole"
-            " sequence again"
+            "{seq}/rgb/\\x001305031102.000000.png: is listed but does not exist (8 missing in total); copy the"
+            " whole sequence again"
         ),
     ),
     Case(
         "a name with control characters",
         edit("rgb.txt", replaced("rgb/", "rgb/\x1b[31m")),
         Says(
-            "{seq}/rgb/\\x1b[31m1305031102.000000.png: is listed but not there (8 such files); copy the"
-            " whole sequence again"
+            "{seq}/rgb/\\x1b[31m1305031102.000000.png: is listed but does not exist (8 missing in total); copy"
+            " the whole sequence again"
         ),
     ),
     Case(
         "a name of 5000 letters",
         edit("rgb.txt", replaced("rgb/", "rgb/" + 5000 * "x")),
-        Says(
-            "{seq}/rgb/...1305031102.000000.png: cannot be read (File name too long); check its name and"
-            " who may read it"
-        ),
+        Says("{seq}/rgb/...1305031102.000000.png: cannot be read (File name too long); check its name and permissions"),
     ),
     Case(
         "a list in Latin-1",
         edit("rgb.txt", lambda content: b"# Gr\xfc\xdfe\n" + content),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says(
+            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
+            " name on each line"
+        ),
     ),
     Case(
         "a list in UTF-16",
         edit("rgb.txt", lambda content: content.decode().encode("utf-16")),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says(
+            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
+            " name on each line"
+        ),
     ),
     Case(
         "an image for a list",
         lambda place: (place.folder / FIRST).rename(place.folder / "rgb.txt"),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says(
+            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
+            " name on each line"
+        ),
     ),
     Case("associations", associated("T C T D"), Right()),
     Case("associations, depth first", associated("T D T C"), Right()),
@@ -248,33 +269,33 @@ CASES = [
         associated("T C D"),
         Says(
             "{seq}/associations.txt: line 1 is '1305031102.000000 rgb/1305031102.000000.png"
-            " depth/1305031102.000000.png' where stamp, file, stamp, file are expected; write it so, or"
-            " leave only rgb.txt and depth.txt there"
+            " depth/1305031102.000000.png', expected timestamp, file, timestamp, file; correct it, or remove"
+            " this list and use rgb.txt and depth.txt"
         ),
     ),
     Case(
         "associations without names",
         associated("T T"),
         Says(
-            "{seq}/associations.txt: line 1 is '1305031102.000000 1305031102.000000' where stamp, file,"
-            " stamp, file are expected; write it so, or leave only rgb.txt and depth.txt there"
+            "{seq}/associations.txt: line 1 is '1305031102.000000 1305031102.000000', expected timestamp, file,"
+            " timestamp, file; correct it, or remove this list and use rgb.txt and depth.txt"
         ),
     ),
     Case(
         "associations with a line of a million blanks",
         write("associations.txt", "1" + 1_000_000 * " " + "x"),
         Says(
-            "{seq}/associations.txt: line 1 is '1 ...' where stamp, file, stamp, file are expected;"
-            " write it so, or leave only rgb.txt and depth.txt there"
+            "{seq}/associations.txt: line 1 is '1 ...', expected timestamp, file, timestamp, file; correct it,"
+            " or remove this list and use rgb.txt and depth.txt"
         ),
     ),
     Case(
         "associations of the names only",
         associated("C D"),
         Says(
-            "{seq}/associations.txt: line 1 is 'rgb/1305031102.000000.png depth/1305031102.000000.png'"
-            " where stamp, file, stamp, file are expected; write it so, or leave only rgb.txt and depth.txt"
-            " there"
+            "{seq}/associations.txt: line 1 is 'rgb/1305031102.000000.png depth/1305031102.000000.png',"
+            " expected timestamp, file, timestamp, file; correct it, or remove this list and use rgb.txt and"
+            " depth.txt"
         ),
     ),
     Case("one frame", frames([3]), Right(1, ate=None)),

@@ -43,8 +43,8 @@ CASES = [
         "a position that is not a number",
         number(1, "nan"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
@@ -52,8 +52,8 @@ CASES = [
         "an infinite position",
         number(2, "-inf"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
@@ -61,8 +61,8 @@ CASES = [
         "a position too large for a number",
         number(2, "1e999"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
@@ -70,7 +70,7 @@ CASES = [
         "a position beyond the solar system",
         number(1, "1e200"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a position more than 1e+07 m away; remove or repair it (the"
+            "{seq}/groundtruth.txt: line 4 has a position more than 1e+07 m away; correct or remove it (the"
             " results are in {out})",
             kept=8,
         ),
@@ -79,8 +79,8 @@ CASES = [
         "a quaternion of NaN",
         quaternions(lambda word: "nan"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
@@ -88,8 +88,8 @@ CASES = [
         "a quaternion of zeros",
         quaternions(lambda word: "0"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a quaternion of zeros, or far from a unit one;"
-            " remove or repair it (the results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
@@ -97,8 +97,8 @@ CASES = [
         "a quaternion of next to nothing",
         quaternions(lambda word: "1e-200"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a quaternion of zeros, or far from a unit one;"
-            " remove or repair it (the results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
@@ -106,8 +106,8 @@ CASES = [
         "an endless quaternion",
         quaternions(lambda word: "1e200"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a quaternion of zeros, or far from a unit one;"
-            " remove or repair it (the results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
@@ -116,7 +116,7 @@ CASES = [
         lines(TRUTH, lambda listed: [line.rsplit(maxsplit=1)[0] for line in listed]),
         Says(
             "{seq}/groundtruth.txt: line 1 is '1305031102.000000 0.000000000 0.062500000 0.000000000"
-            " 0.000000000 0.000000000 0.' where stamp tx ty tz qx qy qz qw is expected; repair it (the"
+            " 0.000000000 0.000000000 0.', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the"
             " results are in {out})",
             kept=8,
         ),
@@ -125,9 +125,9 @@ CASES = [
         "words",
         number(3, "unknown"),
         Says(
-            "{seq}/groundtruth.txt: line 4 is '1305031102.300000 0.093750000 0.156250000 unknown"
-            " 0.000001500 0.000000000 0.0000' where stamp tx ty tz qx qy qz qw is expected; repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 is '1305031102.300000 0.093750000 0.156250000 unknown 0.000001500"
+            " 0.000000000 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
@@ -135,8 +135,8 @@ CASES = [
         "empty",
         write(TRUTH, ""),
         Says(
-            "{seq}/groundtruth.txt: holds no pose; lines of stamp tx ty tz qx qy qz qw are expected, copy"
-            " it again (the results are in {out})",
+            "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
+            " qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),
@@ -144,8 +144,8 @@ CASES = [
         "comments only",
         write(TRUTH, "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"),
         Says(
-            "{seq}/groundtruth.txt: holds no pose; lines of stamp tx ty tz qx qy qz qw are expected, copy"
-            " it again (the results are in {out})",
+            "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
+            " qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),
@@ -154,8 +154,8 @@ CASES = [
         edit(TRUTH, lambda content: content[:-30]),
         Says(
             "{seq}/groundtruth.txt: line 8 is '1305031102.700000 0.218750000 0.156250000 0.000000000"
-            " 0.000003500 0.0000' where stamp tx ty tz qx qy qz qw is expected; repair it (the results are"
-            " in {out})",
+            " 0.000003500 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
@@ -163,8 +163,8 @@ CASES = [
         "binary",
         write(TRUTH, bytes(range(256))),
         Says(
-            "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines"
-            " of stamp tx ty tz qx qy qz qw (the results are in {out})",
+            "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines of"
+            " timestamp tx ty tz qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),

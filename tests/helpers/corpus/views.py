@@ -86,8 +86,8 @@ CASES = [
         "depth in metres",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1, np.uint16))),
         Says(
-            "{seq}: the depth of its first frame is 0.0002 m in the middle, at 5000 units per metre;"
-            " correct the camera's depth_scale (1000 where depth is in millimetres), or the images"
+            "{seq}: the median depth of the first frame is 0.0002 m at 5000 units per metre; correct the"
+            " camera's depth_scale (1000 if depth is in millimetres) or the depth images"
         ),
     ),
     Case(
@@ -99,8 +99,8 @@ CASES = [
         "depth of a camera that counts metres",
         edit("camera.yaml", replaced("5000", "1")),
         Says(
-            "{seq}: the depth of its first frame is 5e+03 m in the middle, at 1 units per metre; correct"
-            " the camera's depth_scale (1000 where depth is in millimetres), or the images"
+            "{seq}: the median depth of the first frame is 5e+03 m at 1 units per metre; correct the camera's"
+            " depth_scale (1000 if depth is in millimetres) or the depth images"
         ),
     ),
     Case(
