@@ -79,7 +79,7 @@ def test_a_pattern_that_matches_nothing(root: Path) -> None:
 
 @pytest.mark.parametrize("pattern", [5000 * "x" + "/*", "~nobody-of-this-name/*", "a**b/*", "[" + 3 * "*" + "]"])
 def test_a_pattern_that_can_match_nothing(pattern: str, root: Path) -> None:
-    with pytest.raises(InputError, match="match"):
+    with pytest.raises(InputError, match="matches no sequence|is not a valid pattern"):
         matching_sequences([pattern], root)
 
 

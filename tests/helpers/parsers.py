@@ -104,7 +104,7 @@ PARSERS: dict[str, Parser] = {
     "compressed colour message": lambda content, folder: colour_from(compressed(content), "topic"),
     "compressed depth message": lambda content, folder: depth_from(compressed(content), 1000.0, "topic"),
     "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
-    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
+    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_transforms),
     "ROS 1 bag": from_file("take.bag", frames_of),
     "ROS 2 bag": from_file("take.db3", frames_of),
     "mcap": from_file("take.mcap", frames_of),

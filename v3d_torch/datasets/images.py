@@ -23,7 +23,7 @@ _MAX_PIXELS = 1 << 26
 """Maximum number of pixels of an image, far more than any RGB-D camera has. The header of a small file can claim an
 image that fills the memory."""
 
-SATURATED = np.iinfo(np.uint16).max
+SATURATED_DEPTH = np.iinfo(np.uint16).max
 """Largest 16-bit depth value. No camera measures this value, and some datasets write it for missing depth."""
 
 
@@ -117,7 +117,7 @@ def metres(units: NDArray[Any], depth_scale: float) -> Tensor:
     Returns:
         Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
     """
-    invalid = torch.from_numpy((units < 0) | (units >= SATURATED))
+    invalid = torch.from_numpy((units < 0) | (units >= SATURATED_DEPTH))
     return torch.from_numpy(units.astype(np.float32)).div_(depth_scale).masked_fill_(invalid, 0.0).unsqueeze(0)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from v3d_torch.datasets.images import SATURATED
+from v3d_torch.datasets.images import SATURATED_DEPTH
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -66,7 +66,7 @@ class TUMWriter:
         """Write the images of a frame. Depth beyond the 16-bit range is written as 0, no measurement."""
         stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self.camera.depth_scale)
-        units[units >= SATURATED] = 0
+        units[units >= SATURATED_DEPTH] = 0
         colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
         _save(self.folder / "rgb" / f"{stamps[0]}.png", colour)
         _save(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))

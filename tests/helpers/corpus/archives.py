@@ -96,11 +96,11 @@ def text(content: bytes) -> Make:
 CASES = [
     Case(name, make, ends, served)
     for name, make, ends in (
-        ("whole", archive(), Right()),
+        ("gzip", archive(), Right()),
         ("bzip2", archive(kind="w:bz2"), Right()),
         ("xz", archive(kind="w:xz"), Right()),
         (
-            "a file outside by ..",
+            "file outside the folder, by ..",
             archive(member("../outside.txt")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -108,7 +108,7 @@ CASES = [
             ),
         ),
         (
-            "a file outside by an absolute path",
+            "file outside the folder, by an absolute path",
             archive(member("/outside.txt", size=3)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
@@ -116,7 +116,7 @@ CASES = [
             ),
         ),
         (
-            "a link outside",
+            "symlink to outside the folder",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "../../..")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -124,7 +124,7 @@ CASES = [
             ),
         ),
         (
-            "a link to an absolute path",
+            "symlink to an absolute path",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "/etc")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -132,7 +132,7 @@ CASES = [
             ),
         ),
         (
-            "a hard link outside",
+            "hard link to outside the folder",
             archive(member(f"{NAME}/x", tarfile.LNKTYPE, "../../etc/passwd")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -140,7 +140,7 @@ CASES = [
             ),
         ),
         (
-            "a device",
+            "device file",
             archive(member(f"{NAME}/zero", tarfile.CHRTYPE)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -148,7 +148,7 @@ CASES = [
             ),
         ),
         (
-            "a pipe",
+            "named pipe",
             archive(member(f"{NAME}/rgb.pipe", tarfile.FIFOTYPE)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -156,7 +156,7 @@ CASES = [
             ),
         ),
         (
-            "a member of a petabyte",
+            "member with a size of a petabyte",
             archive(claims(10**15)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, it unpacks to more than"
@@ -164,7 +164,7 @@ CASES = [
             ),
         ),
         (
-            "a header of 64 megabytes",
+            "header of 64 megabytes",
             archive(long_name(1 << 26)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (a header of"
@@ -172,7 +172,7 @@ CASES = [
             ),
         ),
         (
-            "breaks off",
+            "truncated gzip",
             all_of(archive(), changed(half)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -180,7 +180,7 @@ CASES = [
             ),
         ),
         (
-            "xz breaks off",
+            "truncated xz",
             all_of(archive(kind="w:xz"), changed(half)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -188,7 +188,7 @@ CASES = [
             ),
         ),
         (
-            "bzip2 breaks off",
+            "truncated bzip2",
             all_of(archive(kind="w:bz2"), changed(half)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -196,7 +196,7 @@ CASES = [
             ),
         ),
         (
-            "a wrong byte",
+            "wrong byte in gzip",
             all_of(archive(), changed(flipped)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -204,7 +204,7 @@ CASES = [
             ),
         ),
         (
-            "a wrong byte in xz",
+            "wrong byte in xz",
             all_of(archive(kind="w:xz"), changed(flipped)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -212,7 +212,7 @@ CASES = [
             ),
         ),
         (
-            "a wrong byte in bzip2",
+            "wrong byte in bzip2",
             all_of(archive(kind="w:bz2"), changed(flipped)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -220,7 +220,7 @@ CASES = [
             ),
         ),
         (
-            "empty",
+            "empty file",
             text(b""),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -228,7 +228,7 @@ CASES = [
             ),
         ),
         (
-            "a web page",
+            "web page",
             text(b"<html>404</html>" * 100),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -236,7 +236,7 @@ CASES = [
             ),
         ),
         (
-            "gzip of nothing",
+            "gzip of an empty file",
             text(gzip.compress(b"")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -244,7 +244,7 @@ CASES = [
             ),
         ),
         (
-            "without a sequence",
+            "archive without a sequence",
             all_of(lambda p: shutil.rmtree(p.folder), lambda p: p.folder.mkdir(), archive()),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"

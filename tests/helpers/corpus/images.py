@@ -87,17 +87,17 @@ PAGE = "<!DOCTYPE html>\n<html><body>404 Not Found</body></html>\n"
 
 CASES = [
     Case(
-        "the first colour image breaks off",
+        "first colour image truncated",
         edit(RGB[0], half),
         Says("{seq}/rgb/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
-        "the first depth image breaks off",
+        "first depth image truncated",
         edit(DEPTH[0], half),
         Says("{seq}/depth/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
-        "a colour image breaks off",
+        "colour image truncated",
         edit(RGB[5], half),
         Says(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
@@ -106,7 +106,7 @@ CASES = [
         ),
     ),
     Case(
-        "a depth image breaks off",
+        "depth image truncated",
         edit(DEPTH[5], half),
         Says(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
@@ -115,7 +115,7 @@ CASES = [
         ),
     ),
     Case(
-        "a bit of a colour image is wrong",
+        "colour image with a flipped bit",
         edit(RGB[5], flipped),
         Says(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
@@ -124,7 +124,7 @@ CASES = [
         ),
     ),
     Case(
-        "a bit of a depth image is wrong",
+        "depth image with a flipped bit",
         edit(DEPTH[5], flipped),
         Says(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
@@ -133,7 +133,7 @@ CASES = [
         ),
     ),
     Case(
-        "an empty colour image",
+        "empty colour image",
         write(RGB[5], ""),
         Says(
             "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
@@ -142,7 +142,7 @@ CASES = [
         ),
     ),
     Case(
-        "an empty depth image",
+        "empty depth image",
         write(DEPTH[5], ""),
         Says(
             "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
@@ -151,7 +151,7 @@ CASES = [
         ),
     ),
     Case(
-        "a web page for an image",
+        "web page instead of an image",
         write(RGB[2], PAGE),
         Says(
             "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
@@ -168,7 +168,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth where one colour image belongs",
+        "depth image instead of a colour image",
         write(RGB[4], png(depth())),
         Says(
             "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image, expected a colour image; check that"
@@ -178,7 +178,7 @@ CASES = [
         ),
     ),
     Case(
-        "colour where one depth image belongs",
+        "colour image instead of a depth image",
         write(DEPTH[4], png(colour(0))),
         Says(
             "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour"
@@ -188,7 +188,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth of 8 bits",
+        "8-bit depth",
         every(DEPTH, lambda i: png((depth() >> 8).astype(np.uint8))),
         Says(
             "{seq}/depth/1305031102.000000.png: is an 8-bit image, depth needs 16 bits; export depth again"
@@ -196,7 +196,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth of 8 bits in one frame",
+        "8-bit depth in one frame",
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
         Says(
             "{seq}/depth/1305031102.400000.png: is an 8-bit image, depth needs 16 bits; export depth again"
@@ -205,7 +205,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth as a colour map",
+        "colour-mapped depth",
         every(DEPTH, lambda i: png(cv2.applyColorMap((depth() >> 8).astype(np.uint8), 2))),
         Says(
             "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
@@ -213,18 +213,18 @@ CASES = [
         ),
     ),
     Case(
-        "depth of 16 bits in three channels",
+        "16-bit depth with three channels",
         every(DEPTH, lambda i: png(np.dstack(3 * [depth()]))),
         Says(
             "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
             " and depth are not swapped"
         ),
     ),
-    Case("colour of 16 bits", every(RGB, deep_colour), Right()),
+    Case("16-bit colour", every(RGB, deep_colour), Right()),
     Case("colour with an alpha channel", every(RGB, see_through), Right()),
-    Case("grey images", every(RGB, grey), Right()),
+    Case("greyscale images", every(RGB, grey), Right()),
     Case("images with a palette", every(RGB, palette), Right()),
-    Case("JPEG called PNG", every(RGB, jpeg), Right()),
+    Case("JPEG named PNG", every(RGB, jpeg), Right()),
     Case(
         "depth as JPEG",
         every(DEPTH, jpeg),
@@ -234,7 +234,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth in floating point with NaN",
+        "floating-point depth with NaN",
         every(DEPTH, lambda i: saved(np.full((HEIGHT, WIDTH), np.nan, np.float32), "tiff")),
         Says("{seq}/depth/1305031102.000000.png: is a floating-point image; export depth as 16-bit PNG"),
     ),
@@ -249,7 +249,7 @@ CASES = [
         Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
-        "depth of 32 bits, negative for none",
+        "32-bit depth, negative for missing depth",
         every(DEPTH, lambda i: saved(np.where(np.arange(WIDTH) % 8, depth(), -1).astype(np.int32), "tiff")),
         Right(),
     ),
@@ -270,7 +270,7 @@ CASES = [
         ),
     ),
     Case(
-        "both smaller than the camera",
+        "both images smaller than the camera",
         all_of(every(RGB, lambda i: png(SMALL)), every(DEPTH, lambda i: png(depth()[::2, ::2]))),
         Says(
             "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, but the camera has 80x60; pass the camera of"
@@ -278,7 +278,7 @@ CASES = [
         ),
     ),
     Case(
-        "a colour image of another size",
+        "one colour image of another size",
         write(RGB[3], png(SMALL)),
         Says(
             "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
@@ -288,7 +288,7 @@ CASES = [
         ),
     ),
     Case(
-        "a depth image of another size",
+        "one depth image of another size",
         write(DEPTH[3], png(depth()[::2, ::2])),
         Says(
             "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
@@ -298,7 +298,7 @@ CASES = [
         ),
     ),
     Case(
-        "a depth image on its side",
+        "one rotated depth image",
         write(DEPTH[3], png(depth().T.copy())),
         Says(
             "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
@@ -308,7 +308,7 @@ CASES = [
         ),
     ),
     Case(
-        "a colour image that claims 40000 x 40000 pixels",
+        "colour image with a header of 40000 x 40000 pixels",
         write(RGB[3], bomb(40000, 40000, 8, 2)),
         Says(
             "{seq}/rgb/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
@@ -317,7 +317,7 @@ CASES = [
         ),
     ),
     Case(
-        "a depth image that claims 40000 x 40000 pixels",
+        "depth image with a header of 40000 x 40000 pixels",
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
         Says(
             "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy"
@@ -326,7 +326,7 @@ CASES = [
         ),
     ),
     Case(
-        "the first image claims 40000 x 40000 pixels",
+        "first image with a header of 40000 x 40000 pixels",
         write(RGB[0], bomb(40000, 40000, 8, 2)),
         Says(
             "{seq}/rgb/1305031102.000000.png: has more than 64 million pixels according to its header; copy or"

@@ -94,10 +94,10 @@ def icl_nuim(truth: str) -> Make:
 
 CASES = [
     Case("ScanNet", take(scannet()), Right()),
-    Case("ScanNet, a lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Right()),
+    Case("ScanNet, lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Right()),
     Case("ScanNet, no poses", take(without(scannet(), "pose")), Right(ate=None)),
     Case(
-        "ScanNet, a pose breaks off",
+        "ScanNet, truncated pose",
         changed(scannet(), "pose/3.txt", half),
         Says(
             "{root}/take/pose/3.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
@@ -105,7 +105,7 @@ CASES = [
         ),
     ),
     Case(
-        "ScanNet, a pose that is no motion",
+        "ScanNet, pose that is not a rigid transform",
         changed(scannet(), "pose/3.txt", lambda content: 4 * b"1 2 3 4\n"),
         Says(
             "{root}/take/pose/3.txt: is not a valid rigid transform; copy it again (the results are in {out})",
@@ -113,12 +113,12 @@ CASES = [
         ),
     ),
     Case(
-        "ScanNet, the camera breaks off",
+        "ScanNet, truncated camera",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", half),
         Says("{root}/take/intrinsic/intrinsic_depth.txt: is not a 3x3 or 4x4 matrix; copy it again"),
     ),
     Case(
-        "ScanNet, a camera of NaN",
+        "ScanNet, camera of NaN",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", lambda content: 4 * b"nan nan nan nan\n"),
         Says(
             "{root}/take/intrinsic/intrinsic_depth.txt: is not a camera matrix with focal lengths of at least 1"
@@ -126,7 +126,7 @@ CASES = [
         ),
     ),
     Case(
-        "ScanNet, a colour camera of zeros",
+        "ScanNet, colour camera of zeros",
         changed(larger_colour(scannet()), "intrinsic/intrinsic_color.txt", lambda content: 4 * b"0 0 0 0\n"),
         Says(
             "{root}/take/intrinsic/intrinsic_color.txt: is not a camera matrix with focal lengths of at least 1"
@@ -143,7 +143,7 @@ CASES = [
     ),
     Case("7-Scenes", take(seven_scenes()), Right()),
     Case(
-        "7-Scenes, a pose of words",
+        "7-Scenes, pose of words",
         changed(seven_scenes(), "frame-000003.pose.txt", lambda content: b"lost\n"),
         Says(
             "{root}/take/frame-000003.pose.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
@@ -151,7 +151,7 @@ CASES = [
         ),
     ),
     Case(
-        "7-Scenes, an image breaks off",
+        "7-Scenes, truncated image",
         changed(seven_scenes(), "frame-000003.depth.png", half),
         Says(
             "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again (the"
@@ -165,7 +165,7 @@ CASES = [
         Right(1, ate=None),
     ),
     Case(
-        "ICL-NUIM, the truth breaks off",
+        "ICL-NUIM, truncated ground truth",
         icl_nuim("1 2 3\n"),
         Says(
             "{seq}/traj0.gt.freiburg: line 1 is '1 2 3', expected timestamp tx ty tz qx qy qz qw; correct or"
@@ -174,7 +174,7 @@ CASES = [
         ),
     ),
     Case(
-        "OpenLORIS, a broken camera",
+        "OpenLORIS, invalid camera file",
         openloris("%YAML:1.0\nd400_color_optical_frame: [\n"),
         Says("{seq}/sensors.yaml: is not valid OpenCV YAML (...); copy it again"),
     ),
@@ -187,7 +187,7 @@ CASES = [
         ),
     ),
     Case(
-        "OpenLORIS, a matrix that OpenCV falls over",
+        "OpenLORIS, matrix that crashes OpenCV",
         openloris(
             "%YAML:1.0\nd400_color_optical_frame:\n   intrinsics: !!opencv-matrix\n      rows: 1\n      col: 4\n"
             "      dt: d\n      data: [ 1., 2. ]\n"
@@ -198,23 +198,23 @@ CASES = [
         ),
     ),
     Case(
-        "OpenLORIS, a camera of noise",
+        "OpenLORIS, camera file of random bytes",
         openloris(NOISE),
         Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it contains YAML written by OpenCV"),
     ),
     Case(
-        "images without times",
+        "images without timestamps",
         take(images()),
         Says("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
     ),
-    Case("images without times, --fps", all_of(take(images()), options("--fps", "10")), Right(ate=None)),
+    Case("images without timestamps, with --fps", all_of(take(images()), options("--fps", "10")), Right(ate=None)),
     Case(
         "images, one without depth",
         all_of(take(without(images(), "depth/7")), options("--fps", "10")),
         Right(7, ate=None),
     ),
     Case(
-        "images whose names have nothing in common",
+        "images that cannot be paired",
         all_of(take(without(images(), "depth") | {"depth/a.png": png(depth())}), options("--fps", "10")),
         Says(
             "{root}/take: has 8 colour and 1 depth images that cannot be paired by name; give the two images of"

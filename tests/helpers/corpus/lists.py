@@ -88,8 +88,8 @@ def folder_at(file: str) -> Make:
 FIRST = f"rgb/{STAMPS[0]}.png"
 
 CASES = [
-    Case("Windows line ends", edit("rgb.txt", replaced("\n", "\r\n")), Right()),
-    Case("line ends of old Macs", edit("rgb.txt", replaced("\n", "\r")), Right()),
+    Case("Windows line endings", edit("rgb.txt", replaced("\n", "\r\n")), Right()),
+    Case("classic Mac line endings", edit("rgb.txt", replaced("\n", "\r")), Right()),
     Case("byte order mark", edit("rgb.txt", lambda content: b"\xef\xbb\xbf" + content), Right()),
     Case(
         "comments and blank lines",
@@ -98,17 +98,17 @@ CASES = [
     ),
     Case("tabs", edit("rgb.txt", replaced(" ", "\t")), Right()),
     Case("commas", edit("rgb.txt", replaced(" ", ", ")), Right()),
-    Case("spaces in names", renamed(lambda kind, stamp: f"{kind}/my take {stamp}.png"), Right()),
-    Case("names that are no ASCII", renamed(lambda kind, stamp: f"bilder für {kind}/{stamp} 深度.png"), Right()),
+    Case("spaces in file names", renamed(lambda kind, stamp: f"{kind}/my take {stamp}.png"), Right()),
+    Case("non-ASCII file names", renamed(lambda kind, stamp: f"bilder für {kind}/{stamp} 深度.png"), Right()),
     Case("absolute paths", renamed(lambda kind, stamp: f"{kind}/{stamp}.png", absolute=True), Right()),
-    Case("paths through the parent", edit("rgb.txt", replaced("rgb/", "../seq/rgb/")), Right()),
-    Case("a stamp twice", lines("rgb.txt", lambda listed: [*listed, listed[3].split()[0] + f" {FIRST}"]), Right()),
-    Case("lines in any order", lines("rgb.txt", lambda listed: [listed[i] for i in (3, 0, 7, 1, 6, 2, 5, 4)]), Right()),
-    Case("stamps in nanoseconds", stamps_as(lambda s: f"{s * 1e9:.0f}"), Right()),
-    Case("stamps in microseconds", stamps_as(lambda s: f"{s * 1e6:.0f}"), Right()),
-    Case("stamps in milliseconds", stamps_as(lambda s: f"{s * 1e3:.0f}"), Right()),
+    Case("paths through the parent folder", edit("rgb.txt", replaced("rgb/", "../seq/rgb/")), Right()),
+    Case("duplicate timestamp", lines("rgb.txt", lambda listed: [*listed, listed[3].split()[0] + f" {FIRST}"]), Right()),
+    Case("lines out of order", lines("rgb.txt", lambda listed: [listed[i] for i in (3, 0, 7, 1, 6, 2, 5, 4)]), Right()),
+    Case("timestamps in nanoseconds", stamps_as(lambda s: f"{s * 1e9:.0f}"), Right()),
+    Case("timestamps in microseconds", stamps_as(lambda s: f"{s * 1e6:.0f}"), Right()),
+    Case("timestamps in milliseconds", stamps_as(lambda s: f"{s * 1e3:.0f}"), Right()),
     Case(
-        "milliseconds since the start",
+        "milliseconds since the first frame",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e3:.0f}"),
         Says(
             "{seq}: the images are 100 s apart according to their timestamps; convert the timestamps in the"
@@ -116,31 +116,31 @@ CASES = [
         ),
     ),
     Case(
-        "nanoseconds since the start",
+        "nanoseconds since the first frame",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e9:.0f}"),
         Says(
             "{seq}: the images are 9.99999e+07 s apart according to their timestamps; convert the timestamps in"
             " the lists to seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
-    Case("negative stamps", stamps_as(lambda s: f"{s - 1305031102.35:.6f}"), Right()),
+    Case("negative timestamps", stamps_as(lambda s: f"{s - 1305031102.35:.6f}"), Right()),
     Case(
-        "stamps that are words",
+        "words instead of timestamps",
         lines("rgb.txt", lambda listed: [f"frame{i} {line.split()[1]}" for i, line in enumerate(listed)]),
         Says("{seq}/rgb.txt: line 1 has 'frame0', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
-        "a stamp that is not a number",
+        "timestamp NaN",
         lines("rgb.txt", lambda listed: [*listed[:3], f"nan {FIRST}", *listed[3:]]),
         Says("{seq}/rgb.txt: line 4 has 'nan', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
-        "an infinite stamp",
+        "infinite timestamp",
         lines("depth.txt", lambda listed: [f"inf {FIRST}", *listed]),
         Says("{seq}/depth.txt: line 1 has 'inf', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
-        "lists of two clocks",
+        "lists with different clocks",
         stamps_as(lambda s: f"{s + 10:.6f}", ("depth.txt",)),
         Says(
             "{seq}: no timestamp in rgb.txt is within 0.02 s of one in depth.txt; check that both lists belong"
@@ -153,23 +153,23 @@ CASES = [
         Says("{seq}/rgb.txt: lists no images; a list has a timestamp and a file name on each line, copy it again"),
     ),
     Case(
-        "list of comments only",
+        "list with comments only",
         write("depth.txt", "# depth maps\n"),
         Says("{seq}/depth.txt: lists no images; a list has a timestamp and a file name on each line, copy it again"),
     ),
     Case(
-        "no list of colour",
+        "missing colour list",
         remove("rgb.txt"),
         Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
-        "no list of depth",
+        "missing depth list",
         remove("depth.txt"),
         Says("{seq}: has no depth.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
-    Case("no lists at all", remove("rgb.txt", "depth.txt"), Right(ate=None)),
+    Case("missing lists", remove("rgb.txt", "depth.txt"), Right(ate=None)),
     Case(
-        "a listed image is not there",
+        "missing listed image",
         remove(FIRST),
         Says(
             "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
@@ -177,7 +177,7 @@ CASES = [
         ),
     ),
     Case(
-        "a line breaks off",
+        "truncated last line",
         edit("rgb.txt", lambda content: content[:-5]),
         Says(
             "{seq}/rgb/1305031102.700000: is listed but does not exist (1 missing in total); copy the whole"
@@ -185,14 +185,14 @@ CASES = [
         ),
     ),
     Case(
-        "a line without a name",
+        "line without a file name",
         lines("rgb.txt", lambda listed: [*listed[:3], STAMPS[3], *listed[4:]]),
         Says(
             "{seq}/rgb.txt: line 4 is '1305031102.300000', expected a timestamp and a file name; correct or remove it"
         ),
     ),
     Case(
-        "a listed image is a folder",
+        "listed image is a folder",
         folder_at(FIRST),
         Says(
             "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
@@ -200,7 +200,7 @@ CASES = [
         ),
     ),
     Case(
-        "a listed image is a loop of links",
+        "listed image is a symlink loop",
         loop(FIRST),
         Says(
             "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
@@ -208,17 +208,17 @@ CASES = [
         ),
     ),
     Case(
-        "the list is a loop of links",
+        "list is a symlink loop",
         loop("rgb.txt"),
         Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
-        "the list is a folder",
+        "list is a folder",
         folder_at("rgb.txt"),
         Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
-        "a name with a zero byte",
+        "file name with a zero byte",
         edit("rgb.txt", replaced("rgb/", "rgb/\0")),
         Says(
             "{seq}/rgb/\\x001305031102.000000.png: is listed but does not exist (8 missing in total); copy the"
@@ -226,7 +226,7 @@ CASES = [
         ),
     ),
     Case(
-        "a name with control characters",
+        "file name with control characters",
         edit("rgb.txt", replaced("rgb/", "rgb/\x1b[31m")),
         Says(
             "{seq}/rgb/\\x1b[31m1305031102.000000.png: is listed but does not exist (8 missing in total); copy"
@@ -234,12 +234,12 @@ CASES = [
         ),
     ),
     Case(
-        "a name of 5000 letters",
+        "file name with 5000 letters",
         edit("rgb.txt", replaced("rgb/", "rgb/" + 5000 * "x")),
         Says("{seq}/rgb/...1305031102.000000.png: cannot be read (File name too long); check its name and permissions"),
     ),
     Case(
-        "a list in Latin-1",
+        "list in Latin-1",
         edit("rgb.txt", lambda content: b"# Gr\xfc\xdfe\n" + content),
         Says(
             "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
@@ -247,7 +247,7 @@ CASES = [
         ),
     ),
     Case(
-        "a list in UTF-16",
+        "list in UTF-16",
         edit("rgb.txt", lambda content: content.decode().encode("utf-16")),
         Says(
             "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
@@ -255,7 +255,7 @@ CASES = [
         ),
     ),
     Case(
-        "an image for a list",
+        "image instead of a list",
         lambda place: (place.folder / FIRST).rename(place.folder / "rgb.txt"),
         Says(
             "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
@@ -265,7 +265,7 @@ CASES = [
     Case("associations", associated("T C T D"), Right()),
     Case("associations, depth first", associated("T D T C"), Right()),
     Case(
-        "associations without the second stamp",
+        "associations without the second timestamp",
         associated("T C D"),
         Says(
             "{seq}/associations.txt: line 1 is '1305031102.000000 rgb/1305031102.000000.png"
@@ -274,7 +274,7 @@ CASES = [
         ),
     ),
     Case(
-        "associations without names",
+        "associations without file names",
         associated("T T"),
         Says(
             "{seq}/associations.txt: line 1 is '1305031102.000000 1305031102.000000', expected timestamp, file,"
@@ -282,7 +282,7 @@ CASES = [
         ),
     ),
     Case(
-        "associations with a line of a million blanks",
+        "associations with a million blanks in a line",
         write("associations.txt", "1" + 1_000_000 * " " + "x"),
         Says(
             "{seq}/associations.txt: line 1 is '1 ...', expected timestamp, file, timestamp, file; correct it,"
@@ -290,7 +290,7 @@ CASES = [
         ),
     ),
     Case(
-        "associations of the names only",
+        "associations with file names only",
         associated("C D"),
         Says(
             "{seq}/associations.txt: line 1 is 'rgb/1305031102.000000.png depth/1305031102.000000.png',"
@@ -300,6 +300,6 @@ CASES = [
     ),
     Case("one frame", frames([3]), Right(1, ate=None)),
     Case("two frames", frames([3, 4]), Right(2, ate=None)),
-    Case("frames dropped at random", frames([0, 1, 3, 4, 7]), Right(5)),
+    Case("frames dropped irregularly", frames([0, 1, 3, 4, 7]), Right(5)),
     Case("depth for every other frame", lines("depth.txt", lambda listed: listed[::2]), Right(4)),
 ]

@@ -33,12 +33,12 @@ def loop(place: Place) -> None:
 
 
 CASES = [
-    Case("a folder with a line break in its name", called("two\nlines"), Right()),
-    Case("a folder with what rich and matplotlib obey in its name", called("[red] $x^{$"), Right()),
-    Case("a folder whose name is no UTF-8", called("caf\udce9"), Right()),
-    Case("nothing", seq(""), Says("the sequence name is empty; pass a name, a folder or a file")),
+    Case("folder name with a line break", called("two\nlines"), Right()),
+    Case("folder name with markup of rich and matplotlib", called("[red] $x^{$"), Right()),
+    Case("folder name that is not UTF-8", called("caf\udce9"), Right()),
+    Case("empty name", seq(""), Says("the sequence name is empty; pass a name, a folder or a file")),
     Case(
-        "an empty folder",
+        "empty folder",
         folder("none"),
         Says(
             "{root}/none: is not a sequence of a supported format; the README lists the formats, the simplest"
@@ -46,7 +46,7 @@ CASES = [
         ),
     ),
     Case(
-        "a folder of texts",
+        "folder of text files",
         folder("none", "a.txt", "b.txt"),
         Says(
             "{root}/none: is not a sequence of a supported format; the README lists the formats, the simplest"
@@ -54,7 +54,7 @@ CASES = [
         ),
     ),
     Case(
-        "a text file",
+        "text file",
         seq("{seq}/rgb.txt"),
         Says(
             "{seq}/rgb.txt: is not a sequence of a supported format; the README lists the formats, the simplest"
@@ -62,7 +62,7 @@ CASES = [
         ),
     ),
     Case(
-        "an image",
+        "image",
         seq("{seq}/rgb/1305031102.000000.png"),
         Says(
             "{seq}/rgb/1305031102.000000.png: is not a sequence of a supported format; the README lists the"
@@ -71,12 +71,12 @@ CASES = [
         ),
     ),
     Case(
-        "an archive",
+        "archive",
         noise("rgbd_dataset_freiburg3_walking_xyz.tgz"),
         Says("{root}/rgbd_dataset_freiburg3_walking_xyz.tgz: is an archive; unpack it and pass the folder"),
     ),
     Case(
-        "a recording of ScanNet's",
+        "ScanNet recording",
         noise("scene0000_00.sens"),
         Says(
             "{root}/scene0000_00.sens: is a ScanNet recording; export it with ScanNet's SensReader and pass the"
@@ -84,12 +84,12 @@ CASES = [
         ),
     ),
     Case(
-        "a loop of links",
+        "symlink loop",
         all_of(loop, seq("{root}/loop")),
         Says("{root}/loop: is not a file, a folder or the name of a sequence; did you mean demo or fr3/w/xyz?"),
     ),
     Case(
-        "a name that is nearly right",
+        "misspelled name",
         seq("fr3/w/xzy"),
         Says(
             "fr3/w/xzy: is not a file, a folder or the name of a sequence; did you mean fr3/w/xyz or fr3/w/rpy"
@@ -97,24 +97,24 @@ CASES = [
         ),
     ),
     Case(
-        "a path that is not there",
+        "missing path",
         seq("{root}/none"),
         Says("{root}/none: is not a file, a folder or the name of a sequence; did you mean demo or fr3/w/xyz?"),
     ),
     Case(
-        "a path of 5000 letters",
+        "path with 5000 letters",
         seq(5000 * "x"),
         Says("...: cannot be read (File name too long); check its name and permissions"),
     ),
     Case(
-        "the home of nobody",
+        "home folder of an unknown user",
         seq("~nobody-of-this-name/take"),
         Says(
             "~nobody-of-this-name/take: is not a file, a folder or the name of a sequence; did you mean demo or"
             " fr3/w/xyz?"
         ),
     ),
-    Case("a camera that is not plugged in", seq("realsense:"), Says("realsense: ...")),
+    Case("camera that is not connected", seq("realsense:"), Says("realsense: ...")),
     Case(
         "--rgb-topic for a folder",
         options("--rgb-topic", "/rgb"),

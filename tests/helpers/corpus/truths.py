@@ -31,16 +31,16 @@ X = Says("?", kept=8)
 
 CASES = [
     Case("no ground truth", remove(TRUTH), Right(ate=None)),
-    Case("Windows line ends", edit(TRUTH, replaced("\n", "\r\n")), Right()),
+    Case("Windows line endings", edit(TRUTH, replaced("\n", "\r\n")), Right()),
     Case("byte order mark", edit(TRUTH, lambda content: b"\xef\xbb\xbf" + content), Right()),
     Case("comments", edit(TRUTH, lambda content: b"# ground truth trajectory\n" + content), Right()),
     Case("commas", edit(TRUTH, replaced(" ", ",")), Right()),
-    Case("backwards", lines(TRUTH, lambda listed: listed[::-1]), Right()),
-    Case("a stamp twice", lines(TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()),
-    Case("quaternions twice as long", quaternions(lambda word: str(2 * float(word))), Right()),
-    Case("stamps in nanoseconds as NumPy writes them", stamps_as(lambda s: f"{s * 1e9:.18e}", (TRUTH,)), Right()),
+    Case("lines in reverse order", lines(TRUTH, lambda listed: listed[::-1]), Right()),
+    Case("duplicate timestamp", lines(TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()),
+    Case("quaternions of length two", quaternions(lambda word: str(2 * float(word))), Right()),
+    Case("timestamps in nanoseconds in NumPy's notation", stamps_as(lambda s: f"{s * 1e9:.18e}", (TRUTH,)), Right()),
     Case(
-        "a position that is not a number",
+        "position NaN",
         number(1, "nan"),
         Says(
             "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
@@ -49,7 +49,7 @@ CASES = [
         ),
     ),
     Case(
-        "an infinite position",
+        "infinite position",
         number(2, "-inf"),
         Says(
             "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
@@ -58,7 +58,7 @@ CASES = [
         ),
     ),
     Case(
-        "a position too large for a number",
+        "position beyond float64",
         number(2, "1e999"),
         Says(
             "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
@@ -67,7 +67,7 @@ CASES = [
         ),
     ),
     Case(
-        "a position beyond the solar system",
+        "position far beyond the earth's radius",
         number(1, "1e200"),
         Says(
             "{seq}/groundtruth.txt: line 4 has a position more than 1e+07 m away; correct or remove it (the"
@@ -76,7 +76,7 @@ CASES = [
         ),
     ),
     Case(
-        "a quaternion of NaN",
+        "quaternion of NaN",
         quaternions(lambda word: "nan"),
         Says(
             "{seq}/groundtruth.txt: line 1 has a number that is not finite; correct or remove it (the results"
@@ -85,7 +85,7 @@ CASES = [
         ),
     ),
     Case(
-        "a quaternion of zeros",
+        "zero quaternion",
         quaternions(lambda word: "0"),
         Says(
             "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
@@ -94,7 +94,7 @@ CASES = [
         ),
     ),
     Case(
-        "a quaternion of next to nothing",
+        "quaternion of tiny numbers",
         quaternions(lambda word: "1e-200"),
         Says(
             "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
@@ -103,7 +103,7 @@ CASES = [
         ),
     ),
     Case(
-        "an endless quaternion",
+        "quaternion of huge numbers",
         quaternions(lambda word: "1e200"),
         Says(
             "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
@@ -122,7 +122,7 @@ CASES = [
         ),
     ),
     Case(
-        "words",
+        "word instead of a number",
         number(3, "unknown"),
         Says(
             "{seq}/groundtruth.txt: line 4 is '1305031102.300000 0.093750000 0.156250000 unknown 0.000001500"
@@ -132,7 +132,7 @@ CASES = [
         ),
     ),
     Case(
-        "empty",
+        "empty file",
         write(TRUTH, ""),
         Says(
             "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
@@ -150,7 +150,7 @@ CASES = [
         ),
     ),
     Case(
-        "breaks off",
+        "truncated file",
         edit(TRUTH, lambda content: content[:-30]),
         Says(
             "{seq}/groundtruth.txt: line 8 is '1305031102.700000 0.218750000 0.156250000 0.000000000"
@@ -160,7 +160,7 @@ CASES = [
         ),
     ),
     Case(
-        "binary",
+        "binary file",
         write(TRUTH, bytes(range(256))),
         Says(
             "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines of"
@@ -168,10 +168,10 @@ CASES = [
             kept=8,
         ),
     ),
-    Case("a folder", folder_at(TRUTH), Right(ate=None)),
-    Case("a loop of links", loop(TRUTH), Right(ate=None)),
+    Case("folder instead of a file", folder_at(TRUTH), Right(ate=None)),
+    Case("symlink loop", loop(TRUTH), Right(ate=None)),
     Case(
-        "another clock",
+        "different clock",
         stamps_as(lambda s: f"{s + 3600:.6f}", (TRUTH,)),
         Says(
             "seq: has no scores, only 0 poses of the estimate (1305031102.00 to 1305031102.70 s) lie within"
@@ -190,6 +190,6 @@ CASES = [
             kept=8,
         ),
     ),
-    Case("the camera never moves", number(0, STAMPS[3]), Right()),
-    Case("every orientation the same", quaternions(lambda word: word[:3]), Right()),
+    Case("camera at rest", number(0, STAMPS[3]), Right()),
+    Case("constant orientation", quaternions(lambda word: word[:3]), Right()),
 ]

@@ -65,7 +65,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth all 65535",
+        "saturated depth",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 65535, np.uint16))),
         Says(
             "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
@@ -74,7 +74,7 @@ CASES = [
         ),
     ),
     Case(
-        "black, without depth",
+        "black without depth",
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
         Says(
             "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
@@ -96,7 +96,7 @@ CASES = [
         Right(ate=0.1, note="the ground truth is 5 times as large as the estimate: is depth_scale right?"),
     ),
     Case(
-        "depth of a camera that counts metres",
+        "depth scale of one unit per metre",
         edit("camera.yaml", replaced("5000", "1")),
         Says(
             "{seq}: the median depth of the first frame is 5e+03 m at 1 units per metre; correct the camera's"
@@ -104,12 +104,12 @@ CASES = [
         ),
     ),
     Case(
-        "the same image all the time",
+        "identical images",
         all_of(every(RGB, lambda i: png(colour(*way(0)))), lines("groundtruth.txt", still)),
         Right(),
     ),
     Case("one black frame", write(RGB[4], plain(0)), Right(lost=1, ate=0.03)),
     Case("one frame without depth", write(DEPTH[4], png(depth(0.0))), Right()),
-    Case("the first frame is black", write(RGB[0], plain(0)), Right(lost=1, ate=0.03)),
-    Case("the camera is covered for two seconds", covered, Right(30, lost=20, ate=None)),
+    Case("first frame black", write(RGB[0], plain(0)), Right(lost=1, ate=0.03)),
+    Case("camera covered for two seconds", covered, Right(30, lost=20, ate=None)),
 ]
