@@ -1,4 +1,4 @@
-"""Archives of sequences that are downloaded: they are made here, and nothing is fetched."""
+"""Damaged archives of downloaded sequences. The archives are created here, nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEQ = all_of(seq("fr3/w/xyz"), options("--data-root", "{root}/data"))
 
 @contextmanager
 def served(place: Place) -> Iterator[None]:
-    """The archive comes as if it had been downloaded."""
+    """Replace the download by a copy of the archive."""
 
     def fetch(url: str, target: Path, **_: object) -> Path:
         assert url.endswith(f"/{NAME}.tgz")
@@ -31,7 +31,7 @@ def served(place: Place) -> Iterator[None]:
 
 
 def archive(add: Callable[[tarfile.TarFile], None] | None = None, kind: str = "w:gz") -> Make:
-    """The sequence in an archive, with more in it."""
+    """Pack the sequence into an archive, with an optional extra member."""
 
     def make(place: Place) -> None:
         with tarfile.open(place.root / "archive.tgz", kind) as tar:
@@ -44,6 +44,8 @@ def archive(add: Callable[[tarfile.TarFile], None] | None = None, kind: str = "w
 
 
 def member(name: str, kind: bytes = tarfile.REGTYPE, to: str = "", size: int = 0) -> Callable[[tarfile.TarFile], None]:
+    """Add a member of any kind."""
+
     def add(tar: tarfile.TarFile) -> None:
         info = tarfile.TarInfo(name)
         info.type, info.linkname, info.size = kind, to, size
@@ -53,7 +55,7 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, to: str = "", size: int = 0
 
 
 def claims(size: int) -> Callable[[tarfile.TarFile], None]:
-    """A member that says to be so large, of which nothing is there."""
+    """Add the header of a member of this size, without its content."""
 
     def add(tar: tarfile.TarFile) -> None:
         info = tarfile.TarInfo(f"{NAME}/large.bin")
@@ -64,7 +66,7 @@ def claims(size: int) -> Callable[[tarfile.TarFile], None]:
 
 
 def long_name(size: int) -> Callable[[tarfile.TarFile], None]:
-    """A header whose name is so long, of zeros, which are small in the archive."""
+    """Add an extended header of this size; its zeros compress to almost nothing."""
 
     def add(tar: tarfile.TarFile) -> None:
         info = tarfile.TarInfo("././@PaxHeader")
@@ -77,6 +79,8 @@ def long_name(size: int) -> Callable[[tarfile.TarFile], None]:
 
 
 def changed(change: Callable[[bytes], bytes]) -> Make:
+    """Change the bytes of the archive."""
+
     def make(place: Place) -> None:
         path = place.root / "archive.tgz"
         path.write_bytes(change(path.read_bytes()))
@@ -84,12 +88,14 @@ def changed(change: Callable[[bytes], bytes]) -> Make:
     return make
 
 
-def flipped(content: bytes) -> bytes:
+def flip_byte(content: bytes) -> bytes:
+    """Invert the byte in the middle."""
     at = len(content) // 2
     return content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :]
 
 
-def text(content: bytes) -> Make:
+def content_of(content: bytes) -> Make:
+    """Write an archive with this content."""
     return all_of(lambda place: (place.root / "archive.tgz").write_bytes(content), SEQ)  # type: ignore[arg-type, return-value]
 
 
@@ -197,7 +203,7 @@ CASES = [
         ),
         (
             "wrong byte in gzip",
-            all_of(archive(), changed(flipped)),
+            all_of(archive(), changed(flip_byte)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
@@ -205,7 +211,7 @@ CASES = [
         ),
         (
             "wrong byte in xz",
-            all_of(archive(kind="w:xz"), changed(flipped)),
+            all_of(archive(kind="w:xz"), changed(flip_byte)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
@@ -213,7 +219,7 @@ CASES = [
         ),
         (
             "wrong byte in bzip2",
-            all_of(archive(kind="w:bz2"), changed(flipped)),
+            all_of(archive(kind="w:bz2"), changed(flip_byte)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
@@ -221,7 +227,7 @@ CASES = [
         ),
         (
             "empty file",
-            text(b""),
+            content_of(b""),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
@@ -229,7 +235,7 @@ CASES = [
         ),
         (
             "web page",
-            text(b"<html>404</html>" * 100),
+            content_of(b"<html>404</html>" * 100),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
@@ -237,7 +243,7 @@ CASES = [
         ),
         (
             "gzip of an empty file",
-            text(gzip.compress(b"")),
+            content_of(gzip.compress(b"")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"

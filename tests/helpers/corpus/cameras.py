@@ -1,4 +1,4 @@
-"""Cameras: ``camera.yaml``, ``K.txt``, ``--camera``."""
+"""Invalid cameras: ``camera.yaml``, ``K.txt``, ``--camera``."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ NUMBERS = f"{FOCAL} {FOCAL} {(WIDTH - 1) / 2} {(HEIGHT - 1) / 2} {SCALE} {WIDTH}
 
 
 def field(name: str, value: str) -> Make:
-    """Give a field of the camera another value."""
+    """Set a field of ``camera.yaml``."""
     lines = [f"{name}: {value}" if line.startswith(f"{name}:") else line for line in CAMERA.splitlines()]
     return write(YAML, "\n".join(lines) + "\n")
 
 
 def numbers(text: str) -> Make:
-    """A K.txt instead of the YAML file."""
+    """Replace ``camera.yaml`` by a ``K.txt``."""
     return all_of(remove(YAML), write("K.txt", text))
 
 
 def bomb() -> str:
-    """Anchors that multiply: a list of 10^9 in a few lines."""
+    """YAML with nested aliases: a few lines that expand to 10^9 elements."""
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]" for i in range(1, 9)]
     return "\n".join(lines) + "\n"
@@ -247,7 +247,9 @@ CASES = [
     ),
     Case("K.txt", numbers(NUMBERS), Right()),
     Case(
-        "K.txt with commas, comments and byte order mark", numbers("\ufeff# fx, fy ...\r\n" + NUMBERS.replace(" ", ",\r\n")), Right()
+        "K.txt with commas, comments and byte order mark",
+        numbers("\ufeff# fx, fy ...\r\n" + NUMBERS.replace(" ", ",\r\n")),
+        Right(),
     ),
     Case(
         "empty K.txt",

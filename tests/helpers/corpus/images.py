@@ -1,4 +1,4 @@
-"""Image files."""
+"""Damaged image files."""
 
 from __future__ import annotations
 
@@ -20,45 +20,48 @@ DEPTH = [f"depth/{stamp}.png" for stamp in STAMPS]
 
 
 def every(files: list[str], content: Callable[[int], bytes]) -> Make:
-    """Write each of these files anew."""
+    """Rewrite each of these files, by its index."""
     return all_of(*(write(file, content(i)) for i, file in enumerate(files)))
 
 
 def saved(image: NDArray[np.generic], form: str, **settings: object) -> bytes:
-    """As Pillow writes it."""
+    """Encode an image with Pillow."""
     file = BytesIO()
     Image.fromarray(image).save(file, form, **settings)
     return file.getvalue()
 
 
 def deep_colour(frame: int) -> bytes:
-    """16 bits a channel, whose low bytes say nothing."""
+    """Colour image with 16 bits per channel, of which the low bytes are random."""
     low = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3))
     return png((colour(*way(frame)).astype(np.uint16) << 8) + low.astype(np.uint16))
 
 
-def see_through(frame: int) -> bytes:
-    """With an alpha channel, half of it 0."""
+def with_alpha(frame: int) -> bytes:
+    """Colour image with an alpha channel that is 0 for half of the pixels."""
     alpha = np.tile(np.array([0, 255], np.uint8), (HEIGHT, WIDTH // 2))
     return png(np.dstack([colour(*way(frame)), alpha]))
 
 
 def grey(frame: int) -> bytes:
+    """Greyscale image."""
     return png(cv2.cvtColor(colour(*way(frame)), cv2.COLOR_BGR2GRAY))
 
 
 def palette(frame: int) -> bytes:
+    """Colour image with a palette."""
     file = BytesIO()
     Image.fromarray(colour(*way(frame))[..., ::-1]).quantize(256).save(file, "png")
     return file.getvalue()
 
 
 def jpeg(frame: int) -> bytes:
+    """Colour image encoded as JPEG."""
     return cv2.imencode(".jpg", colour(*way(frame)), [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
 
 
 def bomb(width: int, height: int, bits: int, kind: int) -> bytes:
-    """A PNG of zeros, small in the file and large in memory."""
+    """PNG of zeros, small on disk and large in memory (decompression bomb)."""
 
     def chunk(name: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
@@ -69,13 +72,14 @@ def bomb(width: int, height: int, bits: int, kind: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", content) + chunk(b"IEND", b"")
 
 
-def flipped(content: bytes) -> bytes:
-    """One bit of the pixels is wrong."""
+def flip_bit(content: bytes) -> bytes:
+    """Flip one bit of the pixel data."""
     at = len(content) - 30
     return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
-def swapped_lists(place: Place) -> None:
+def swap_lists(place: Place) -> None:
+    """Swap the lists of colour and depth images."""
     colours, depths = (place.folder / name for name in ("rgb.txt", "depth.txt"))
     text = colours.read_text()
     colours.write_text(depths.read_text())
@@ -116,7 +120,7 @@ CASES = [
     ),
     Case(
         "colour image with a flipped bit",
-        edit(RGB[5], flipped),
+        edit(RGB[5], flip_bit),
         Says(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
             " of the 5 frames before are in {out}; go on with --resume {out})",
@@ -125,7 +129,7 @@ CASES = [
     ),
     Case(
         "depth image with a flipped bit",
-        edit(DEPTH[5], flipped),
+        edit(DEPTH[5], flip_bit),
         Says(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
             " of the 5 frames before are in {out}; go on with --resume {out})",
@@ -161,7 +165,7 @@ CASES = [
     ),
     Case(
         "colour and depth swapped in the lists",
-        swapped_lists,
+        swap_lists,
         Says(
             "{seq}/depth/1305031102.000000.png: is a 16-bit depth image, expected a colour image; check that"
             " colour and depth are not swapped"
@@ -221,7 +225,7 @@ CASES = [
         ),
     ),
     Case("16-bit colour", every(RGB, deep_colour), Right()),
-    Case("colour with an alpha channel", every(RGB, see_through), Right()),
+    Case("colour with an alpha channel", every(RGB, with_alpha), Right()),
     Case("greyscale images", every(RGB, grey), Right()),
     Case("images with a palette", every(RGB, palette), Right()),
     Case("JPEG named PNG", every(RGB, jpeg), Right()),

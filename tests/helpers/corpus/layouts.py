@@ -1,4 +1,4 @@
-"""Folders as other datasets have them."""
+"""Folders in the layouts of other datasets."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ LOST = 4 * b"-inf -inf -inf -inf\n"
 
 
 def pose(frame: int) -> str:
-    """True pose; turned by next to nothing, as orientations that never change are taken for placeholders."""
+    """True pose, with a tiny rotation: constant orientations count as placeholders in the evaluation."""
     x, y = way(frame)
     return f"1 0 0 {x / FOCAL}\n0 1 {-1e-6 * frame} {y / FOCAL}\n0 {1e-6 * frame} 1 0\n0 0 0 1\n"
 
 
 def take(files: dict[str, bytes]) -> Make:
-    """A folder of these files, given as the sequence."""
+    """Write these files to a new folder and use it as the sequence."""
 
     def make(place: Place) -> None:
         for name, content in files.items():
@@ -34,7 +34,7 @@ def take(files: dict[str, bytes]) -> Make:
 
 
 def scannet() -> dict[str, bytes]:
-    """The sequence as ScanNet's reader exports one."""
+    """Files of the sequence as exported by ScanNet's SensReader."""
     files = {f"intrinsic/intrinsic_{kind}.txt": CAMERA_MATRIX.encode() for kind in ("color", "depth")}
     for i in range(FRAMES):
         files |= {
@@ -46,6 +46,7 @@ def scannet() -> dict[str, bytes]:
 
 
 def seven_scenes() -> dict[str, bytes]:
+    """Files of the sequence in the layout of 7-Scenes."""
     files = {"camera.yaml": CAMERA.replace("5000", "1000").encode()}
     for i in range(FRAMES):
         name = f"frame-{i:06d}"
@@ -55,7 +56,7 @@ def seven_scenes() -> dict[str, bytes]:
 
 
 def images() -> dict[str, bytes]:
-    """The images alone, with names that are no times."""
+    """Images without lists, with names that are not timestamps."""
     files = {"camera.yaml": CAMERA.encode()}
     for i in range(FRAMES):
         files |= {f"rgb/{i}.png": png(colour(*way(i))), f"depth/{i}.png": png(depth())}
@@ -63,20 +64,22 @@ def images() -> dict[str, bytes]:
 
 
 def changed(files: dict[str, bytes], name: str, change: Callable[[bytes], bytes]) -> Make:
+    """Use these files as the sequence, after a change of one of them."""
     return take(files | {name: change(files[name])})
 
 
 def larger_colour(files: dict[str, bytes]) -> dict[str, bytes]:
-    """Colour of another camera than depth."""
+    """Replace the colour images by larger ones, which need the colour camera."""
     return files | {f"color/{i}.png": png(np.zeros((97, 130, 3), np.uint8)) for i in range(FRAMES)}
 
 
 def without(files: dict[str, bytes], *prefixes: str) -> dict[str, bytes]:
+    """Remove the files whose names begin with a prefix."""
     return {name: content for name, content in files.items() if not name.startswith(prefixes)}
 
 
 def openloris(sensors: str | bytes) -> Make:
-    """The sequence as an OpenLORIS package."""
+    """Convert the sequence to an OpenLORIS package."""
 
     def rename(place: Place) -> None:
         (place.folder / "rgb.txt").rename(place.folder / "color.txt")
@@ -86,10 +89,10 @@ def openloris(sensors: str | bytes) -> Make:
     return all_of(rename, write("sensors.yaml", sensors))
 
 
-def icl_nuim(truth: str) -> Make:
-    """The sequence as one of ICL-NUIM: frames have numbers."""
+def icl_nuim(groundtruth: str) -> Make:
+    """Convert the sequence to the layout of ICL-NUIM, with frame numbers instead of timestamps."""
     listed = "".join(f"{i} depth/{stamp}.png {i} rgb/{stamp}.png\n" for i, stamp in enumerate(STAMPS))
-    return all_of(write("associations.txt", listed), write("traj0.gt.freiburg", truth))
+    return all_of(write("associations.txt", listed), write("traj0.gt.freiburg", groundtruth))
 
 
 CASES = [

@@ -1,4 +1,4 @@
-"""Lists of images."""
+"""Damaged lists of images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, edit, re
 def stamps_as(
     form: Callable[[float], str], files: tuple[str, ...] = ("rgb.txt", "depth.txt", "groundtruth.txt")
 ) -> Make:
-    """Write the stamps of these files in another way."""
+    """Write the timestamps of these files in another form."""
 
     def make(place: Place) -> None:
         for file in files:
@@ -23,7 +23,7 @@ def stamps_as(
 
 
 def renamed(change: Callable[[str, str], str], *, absolute: bool = False) -> Make:
-    """Rename the images, by kind and stamp, in the lists too."""
+    """Rename the images by kind and timestamp, also in the lists."""
 
     def make(place: Place) -> None:
         for kind in ("rgb", "depth"):
@@ -39,7 +39,7 @@ def renamed(change: Callable[[str, str], str], *, absolute: bool = False) -> Mak
 
 
 def lines(file: str, change: Callable[[list[str]], list[str]]) -> Make:
-    """Change the lines of a file."""
+    """Change the lines of a file of the sequence."""
 
     def make(place: Place) -> None:
         path = place.folder / file
@@ -49,7 +49,7 @@ def lines(file: str, change: Callable[[list[str]], list[str]]) -> Make:
 
 
 def associated(form: str) -> Make:
-    """One list instead of two, with lines of a form in which C and D are the images."""
+    """Write ``associations.txt`` by a line format in which T, C and D are timestamp, colour and depth image."""
 
     def make(place: Place) -> None:
         text = "".join(
@@ -61,6 +61,8 @@ def associated(form: str) -> Make:
 
 
 def frames(keep: list[int]) -> Make:
+    """Keep only these frames in the lists."""
+
     def pick(listed: list[str]) -> list[str]:
         return [listed[i] for i in keep]
 
@@ -68,6 +70,8 @@ def frames(keep: list[int]) -> Make:
 
 
 def loop(file: str) -> Make:
+    """Replace a file by a symlink to itself."""
+
     def make(place: Place) -> None:
         path = place.folder / file
         path.unlink()
@@ -77,6 +81,8 @@ def loop(file: str) -> Make:
 
 
 def folder_at(file: str) -> Make:
+    """Replace a file by a folder."""
+
     def make(place: Place) -> None:
         path = place.folder / file
         path.unlink()
@@ -102,7 +108,9 @@ CASES = [
     Case("non-ASCII file names", renamed(lambda kind, stamp: f"bilder für {kind}/{stamp} 深度.png"), Right()),
     Case("absolute paths", renamed(lambda kind, stamp: f"{kind}/{stamp}.png", absolute=True), Right()),
     Case("paths through the parent folder", edit("rgb.txt", replaced("rgb/", "../seq/rgb/")), Right()),
-    Case("duplicate timestamp", lines("rgb.txt", lambda listed: [*listed, listed[3].split()[0] + f" {FIRST}"]), Right()),
+    Case(
+        "duplicate timestamp", lines("rgb.txt", lambda listed: [*listed, listed[3].split()[0] + f" {FIRST}"]), Right()
+    ),
     Case("lines out of order", lines("rgb.txt", lambda listed: [listed[i] for i in (3, 0, 7, 1, 6, 2, 5, 4)]), Right()),
     Case("timestamps in nanoseconds", stamps_as(lambda s: f"{s * 1e9:.0f}"), Right()),
     Case("timestamps in microseconds", stamps_as(lambda s: f"{s * 1e6:.0f}"), Right()),

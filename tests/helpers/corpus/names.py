@@ -1,4 +1,4 @@
-"""What is given as ``--seq``."""
+"""Invalid values of ``--seq``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from helpers.corpus.recordings import noise
 
 
 def folder(name: str | bytes, *files: str) -> Make:
-    """Another folder with these files of text, given as the sequence."""
+    """Create a folder with these text files and use it as the sequence."""
 
     def make(place: Place) -> None:
         path = place.root / name
@@ -19,8 +19,8 @@ def folder(name: str | bytes, *files: str) -> Make:
     return make
 
 
-def called(name: str) -> Make:
-    """The sequence's folder under another name."""
+def rename(name: str) -> Make:
+    """Rename the sequence's folder."""
 
     def make(place: Place) -> None:
         place.seq = str(place.folder.rename(place.root / name))
@@ -29,13 +29,14 @@ def called(name: str) -> Make:
 
 
 def loop(place: Place) -> None:
+    """Create a symlink to itself."""
     (place.root / "loop").symlink_to("loop")
 
 
 CASES = [
-    Case("folder name with a line break", called("two\nlines"), Right()),
-    Case("folder name with markup of rich and matplotlib", called("[red] $x^{$"), Right()),
-    Case("folder name that is not UTF-8", called("caf\udce9"), Right()),
+    Case("folder name with a line break", rename("two\nlines"), Right()),
+    Case("folder name with markup of rich and matplotlib", rename("[red] $x^{$"), Right()),
+    Case("folder name that is not UTF-8", rename("caf\udce9"), Right()),
     Case("empty name", seq(""), Says("the sequence name is empty; pass a name, a folder or a file")),
     Case(
         "empty folder",

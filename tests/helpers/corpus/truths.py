@@ -1,4 +1,4 @@
-"""Ground truth: it does not touch the run, only the scores."""
+"""Damaged ground truth, which affects only the scores of a run."""
 
 from __future__ import annotations
 
@@ -6,39 +6,45 @@ from helpers.corpus.base import STAMPS
 from helpers.corpus.case import Case, Make, Right, Says, edit, remove, replaced, write
 from helpers.corpus.lists import folder_at, lines, loop, stamps_as
 
-TRUTH = "groundtruth.txt"
+GROUND_TRUTH = "groundtruth.txt"
 
 
 def number(column: int, value: str, row: int = 3) -> Make:
-    """Write another number into a row."""
+    """Replace a number in a row of the ground truth."""
 
     def change(listed: list[str]) -> list[str]:
         words = listed[row].split()
         words[column] = value
         return [*listed[:row], " ".join(words), *listed[row + 1 :]]
 
-    return lines(TRUTH, change)
+    return lines(GROUND_TRUTH, change)
 
 
 def quaternions(change: object) -> Make:
+    """Change all numbers of all quaternions."""
+
     def rows(listed: list[str]) -> list[str]:
         return [" ".join([*line.split()[:4], *(change(word) for word in line.split()[4:])]) for line in listed]
 
-    return lines(TRUTH, rows)
+    return lines(GROUND_TRUTH, rows)
 
-
-X = Says("?", kept=8)
 
 CASES = [
-    Case("no ground truth", remove(TRUTH), Right(ate=None)),
-    Case("Windows line endings", edit(TRUTH, replaced("\n", "\r\n")), Right()),
-    Case("byte order mark", edit(TRUTH, lambda content: b"\xef\xbb\xbf" + content), Right()),
-    Case("comments", edit(TRUTH, lambda content: b"# ground truth trajectory\n" + content), Right()),
-    Case("commas", edit(TRUTH, replaced(" ", ",")), Right()),
-    Case("lines in reverse order", lines(TRUTH, lambda listed: listed[::-1]), Right()),
-    Case("duplicate timestamp", lines(TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()),
+    Case("no ground truth", remove(GROUND_TRUTH), Right(ate=None)),
+    Case("Windows line endings", edit(GROUND_TRUTH, replaced("\n", "\r\n")), Right()),
+    Case("byte order mark", edit(GROUND_TRUTH, lambda content: b"\xef\xbb\xbf" + content), Right()),
+    Case("comments", edit(GROUND_TRUTH, lambda content: b"# ground truth trajectory\n" + content), Right()),
+    Case("commas", edit(GROUND_TRUTH, replaced(" ", ",")), Right()),
+    Case("lines in reverse order", lines(GROUND_TRUTH, lambda listed: listed[::-1]), Right()),
+    Case(
+        "duplicate timestamp", lines(GROUND_TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()
+    ),
     Case("quaternions of length two", quaternions(lambda word: str(2 * float(word))), Right()),
-    Case("timestamps in nanoseconds in NumPy's notation", stamps_as(lambda s: f"{s * 1e9:.18e}", (TRUTH,)), Right()),
+    Case(
+        "timestamps in nanoseconds in NumPy's notation",
+        stamps_as(lambda s: f"{s * 1e9:.18e}", (GROUND_TRUTH,)),
+        Right(),
+    ),
     Case(
         "position NaN",
         number(1, "nan"),
@@ -113,7 +119,7 @@ CASES = [
     ),
     Case(
         "seven columns",
-        lines(TRUTH, lambda listed: [line.rsplit(maxsplit=1)[0] for line in listed]),
+        lines(GROUND_TRUTH, lambda listed: [line.rsplit(maxsplit=1)[0] for line in listed]),
         Says(
             "{seq}/groundtruth.txt: line 1 is '1305031102.000000 0.000000000 0.062500000 0.000000000"
             " 0.000000000 0.000000000 0.', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the"
@@ -133,7 +139,7 @@ CASES = [
     ),
     Case(
         "empty file",
-        write(TRUTH, ""),
+        write(GROUND_TRUTH, ""),
         Says(
             "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
             " qx qy qz qw (the results are in {out})",
@@ -142,7 +148,7 @@ CASES = [
     ),
     Case(
         "comments only",
-        write(TRUTH, "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"),
+        write(GROUND_TRUTH, "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"),
         Says(
             "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
             " qx qy qz qw (the results are in {out})",
@@ -151,7 +157,7 @@ CASES = [
     ),
     Case(
         "truncated file",
-        edit(TRUTH, lambda content: content[:-30]),
+        edit(GROUND_TRUTH, lambda content: content[:-30]),
         Says(
             "{seq}/groundtruth.txt: line 8 is '1305031102.700000 0.218750000 0.156250000 0.000000000"
             " 0.000003500 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
@@ -161,18 +167,18 @@ CASES = [
     ),
     Case(
         "binary file",
-        write(TRUTH, bytes(range(256))),
+        write(GROUND_TRUTH, bytes(range(256))),
         Says(
             "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines of"
             " timestamp tx ty tz qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),
-    Case("folder instead of a file", folder_at(TRUTH), Right(ate=None)),
-    Case("symlink loop", loop(TRUTH), Right(ate=None)),
+    Case("folder instead of a file", folder_at(GROUND_TRUTH), Right(ate=None)),
+    Case("symlink loop", loop(GROUND_TRUTH), Right(ate=None)),
     Case(
         "different clock",
-        stamps_as(lambda s: f"{s + 3600:.6f}", (TRUTH,)),
+        stamps_as(lambda s: f"{s + 3600:.6f}", (GROUND_TRUTH,)),
         Says(
             "seq: has no scores, only 0 poses of the estimate (1305031102.00 to 1305031102.70 s) lie within"
             " 0.02 s of the ground truth (1305034702.00 to 1305034702.70 s), at least 3 are needed; are they"
@@ -182,7 +188,7 @@ CASES = [
     ),
     Case(
         "two poses",
-        lines(TRUTH, lambda listed: listed[:2]),
+        lines(GROUND_TRUTH, lambda listed: listed[:2]),
         Says(
             "seq: has no scores, only 2 poses of the estimate (1305031102.00 to 1305031102.70 s) lie within"
             " 0.02 s of the ground truth (1305031102.00 to 1305031102.10 s), at least 3 are needed; are they"

@@ -1,4 +1,4 @@
-"""Images that are whole and show nothing to go by."""
+"""Intact image files with content that cannot be tracked."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from helpers.corpus.lists import lines
 
 
 def plain(value: int) -> bytes:
+    """Colour image with a single grey value."""
     return png(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
 
 
 def still(listed: list[str]) -> list[str]:
-    """Every pose that of the first line."""
+    """Give every line the pose of the first one."""
     return [f"{line.split()[0]} {listed[0].split(maxsplit=1)[1]}" for line in listed]
 
 
 def covered(place: Place) -> None:
-    """30 frames, of which the middle 20 show a hand before the lens."""
+    """Write 30 frames, of which the middle 20 are black and without depth: the camera is covered."""
     for kind in ("rgb", "depth"):
         lines = []
         for i in range(30):
             stamp = f"{1305031102 + i / 10:.6f}"
             x, y = way(min(i, 4)) if i < 25 else way(min(i - 20, 7))
-            seen = {
+            images = {
                 "rgb": plain(0) if 5 <= i < 25 else png(colour(x, y)),
                 "depth": png(depth(0.0 if 5 <= i < 25 else 1.0)),
             }
-            (place.folder / kind / f"{stamp}.png").write_bytes(seen[kind])
+            (place.folder / kind / f"{stamp}.png").write_bytes(images[kind])
             lines.append(f"{stamp} {kind}/{stamp}.png\n")
         (place.folder / f"{kind}.txt").write_text("".join(lines))
     (place.folder / "groundtruth.txt").unlink()
