@@ -216,7 +216,11 @@ def test_compressed_depth() -> None:
         ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "is not a PNG"),
         ("depth", ROS2.compressed(1, "mono8; png compressed", png(colour_of(0)[..., 0])), "8-bit"),
         ("colour", ROS2.compressed(1, "bgr8; jpeg compressed bgr8", png(colour_of(0))[:-40]), "truncated"),
-        ("colour", ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))), "16-bit depth image, expected a colour image"),
+        (
+            "colour",
+            ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))),
+            "16-bit depth image, expected a colour image",
+        ),
     ],
 )
 def test_images_that_are_wrong(read: str, message: Any, what: str) -> None:
