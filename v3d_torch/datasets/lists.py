@@ -115,7 +115,7 @@ def read_associations(path: Path) -> list[ImagePair]:
 
 
 def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
-    """Associate the images of two lists one to one by nearest timestamps, at most `MAX_DIFFERENCE` apart.
+    """Associate the images of two lists one to one by nearest timestamps, at most 20 ms apart.
 
     Args:
         colour: Path of the list of colour images, in the sequence's folder.

@@ -46,33 +46,26 @@ Make = Callable[[Place], None]
 
 @dataclass(frozen=True)
 class Right:
-    """Expected end of a run: exit code 0 and a correct result.
-
-    Attributes:
-        frames: Number of poses in the trajectory.
-        lost: Number of frames with lost tracking.
-        ate: Upper limit of the absolute trajectory error (rmse), metres; None if the run has no scores.
-        note: Text in the output of the command.
-    """
+    """Expected end of a run: exit code 0 and a correct result."""
 
     frames: int = FRAMES
+    """Number of poses in the trajectory."""
     lost: int = 0
+    """Number of frames with lost tracking."""
     ate: float | None = 0.005
+    """Upper limit of the absolute trajectory error (rmse), metres; None if the run has no scores."""
     note: str = ""
+    """Text in the output of the command."""
 
 
 @dataclass(frozen=True)
 class Says:
-    """Expected end of a run: exit code 2 and a single error message on stderr.
-
-    Attributes:
-        sentence: Whole message after ``error: ``. ``{seq}``, ``{out}`` and ``{root}`` stand for paths, ``...`` for any
-            text.
-        kept: Number of poses in the results; None if the run ends before any results are written.
-    """
+    """Expected end of a run: exit code 2 and a single error message on stderr."""
 
     sentence: str
+    """Whole text after ``error: ``. ``{seq}``, ``{out}`` and ``{root}`` stand for paths, ``...`` for any text."""
     kept: int | None = None
+    """Number of poses in the results; None if the run ends before any results are written."""
 
     def fits(self, text: str, place: Place) -> bool:
         """Check whether a message is the expected one."""
@@ -82,19 +75,16 @@ class Says:
 
 @dataclass(frozen=True)
 class Case:
-    """A damaged sequence and the expected end of its run.
-
-    Attributes:
-        name: Short description.
-        make: Function that damages the sequence or changes the command line.
-        ends: Expected end of the run.
-        during: Function that returns a context manager around the run.
-    """
+    """A damaged sequence and the expected end of its run."""
 
     name: str
+    """Short description."""
     make: Make
+    """Function that damages the sequence or changes the command line."""
     ends: Right | Says
+    """Expected end of the run."""
     during: Callable[[Place], AbstractContextManager[object]] = lambda place: nullcontext()
+    """Function that returns a context manager around the run."""
 
 
 # ---------------------------------------------------------------- ways to damage a sequence
