@@ -1,4 +1,4 @@
-"""Every broken sequence of the corpus through the command: a right result, or one sentence and what was computed."""
+"""Runs of all damaged inputs of the corpus: a correct result, or one error message and the partial results."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ CASES = [
     for category, cases in CATEGORIES.items()
     for case in cases
 ]
-DRAWN = {"what the images show", "what --seq names", "results and rights"}
-"""Categories whose figures are drawn, which takes most of the time of a run so short."""
+WITH_FIGURES = {"image content", "sequence names", "results and permissions"}
+"""Categories whose runs draw figures. Drawing takes most of the time of such short runs."""
 
 SHELL = {
-    "ground truth": "words",
-    "what --seq names": "a folder with a line break in its name",
+    "ground truth": "word instead of a number",
+    "sequence names": "folder name with a line break",
 }
-"""Cases that also run as a user starts them."""
+"""Cases that are also run in a subprocess, as a user starts them."""
 
 _MEMORY = 2 << 30
-"""Bytes that a case may take on top: a bomb takes more."""
+"""Memory limit of a case on top of the current use, bytes. A decompression bomb exceeds this limit."""
 
 
 @pytest.fixture(scope="session")
@@ -47,7 +47,7 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
-    """The whole sequence, to be broken, in an empty folder that is the working directory."""
+    """Create a working directory with a copy of the intact sequence."""
     shutil.copytree(base, tmp_path / "seq")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
@@ -55,21 +55,21 @@ def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
     place = Place(tmp_path)
     place.seq = str(place.folder)
     yield place
-    for path in tmp_path.rglob("*"):  # so that pytest can remove what a case has closed
+    for path in tmp_path.rglob("*"):  # so that pytest can remove folders without permissions
         if path.is_dir() and not path.is_symlink():
             path.chmod(0o700)
 
 
 @contextmanager
-def little_memory() -> Iterator[None]:
-    """Let no more than `_MEMORY` be taken, where the system tells how much there is already."""
+def memory_limit() -> Iterator[None]:
+    """Limit the additional memory to `_MEMORY`, if the system reports the current use."""
     status = Path("/proc/self/statm")
     if not status.is_file():
         yield
         return
-    taken = int(status.read_text().split()[0]) * resource.getpagesize()
+    used = int(status.read_text().split()[0]) * resource.getpagesize()
     before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (taken + _MEMORY, before[1]))
+    resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, before[1]))
     try:
         yield
     finally:
@@ -80,12 +80,12 @@ def arguments(place: Place) -> list[str]:
     return ["--seq", place.seq, "--out", str(place.out), *place.options]
 
 
-def assert_ends(place: Place, ends: Right | Says, code: int, stdout: str, stderr: str) -> None:
+def assert_expected_end(place: Place, ends: Right | Says, code: int, stdout: str, stderr: str) -> None:
     if isinstance(ends, Right):
         assert (code, stderr) == (0, "")
         metrics = json.loads((place.out / "metrics.json").read_text())
         assert (metrics["processed"], metrics["lost"], metrics["failure"]) == (ends.frames, ends.lost, None)
-        assert kept(place) == ends.frames
+        assert saved_poses(place) == ends.frames
         assert (metrics["ate"] is None) == (ends.ate is None)
         assert ends.ate is None or metrics["ate"]["rmse"] < ends.ate
         assert ends.note in stdout
@@ -93,11 +93,11 @@ def assert_ends(place: Place, ends: Right | Says, code: int, stdout: str, stderr
         assert code == 2, stderr
         assert stderr.startswith("error: ") and stderr.endswith("\n") and stderr.count("\n") == 1, stderr
         assert ends.fits(stderr.removeprefix("error: ").removesuffix("\n"), place), stderr
-        assert kept(place) == ends.kept
+        assert saved_poses(place) == ends.kept
 
 
-def kept(place: Place) -> int | None:
-    """Poses in the results; None where there are no results."""
+def saved_poses(place: Place) -> int | None:
+    """Number of poses in the results; None if there are no results."""
     trajectory = place.out / "trajectory.txt"
     return len(trajectory.read_text().splitlines()) if trajectory.is_file() else None
 
@@ -105,38 +105,38 @@ def kept(place: Place) -> int | None:
 @pytest.mark.timeout(60)
 @pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 @pytest.mark.parametrize(("category", "case"), CASES)
-def test_a_broken_sequence(
+def test_damaged_input_ends_as_expected(
     category: str, case: Case, place: Place, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if category not in DRAWN:
+    if category not in WITH_FIGURES:
         monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
     case.make(place)
-    with case.during(place), little_memory():
+    with case.during(place), memory_limit():
         done = CliRunner().invoke(run.app, arguments(place))
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exc_info
-    assert_ends(place, case.ends, done.exit_code, done.stdout, done.stderr)
-    assert capfd.readouterr().err == ""  # nor does a library write there by itself
+    assert_expected_end(place, case.ends, done.exit_code, done.stdout, done.stderr)
+    assert capfd.readouterr().err == ""  # libraries must not write to stderr either
     assert not list(place.root.glob("**/*.part*"))
 
 
 @pytest.mark.parametrize(("category", "name"), SHELL.items(), ids=SHELL)
-def test_a_broken_sequence_from_a_shell(category: str, name: str, place: Place) -> None:
+def test_damaged_input_ends_as_expected_in_a_subprocess(category: str, name: str, place: Place) -> None:
     case = next(case for case in CATEGORIES[category] if case.name == name)
     case.make(place)
     command = [sys.executable, "-m", "v3d_torch.run", *arguments(place)]
     environment = os.environ | {"PYTHONPATH": str(Path(run.__file__).parents[1]), "COLUMNS": "200", "NO_COLOR": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)  # noqa: S603
-    assert_ends(place, case.ends, done.returncode, done.stdout, done.stderr)
+    assert_expected_end(place, case.ends, done.returncode, done.stdout, done.stderr)
 
 
-def test_every_case_has_a_name_of_its_own() -> None:
+def test_case_names_are_unique() -> None:
     for cases in CATEGORIES.values():
         assert len({case.name for case in cases}) == len(cases)
     assert sum(len(cases) for cases in CATEGORIES.values()) >= 60
 
 
-def test_results_of_an_earlier_run_are_replaced_and_other_files_stay(place: Place) -> None:
-    (case,) = (case for case in CATEGORIES["results and rights"] if case.name == "results of an earlier run")
+def test_earlier_results_are_replaced_and_other_files_are_kept(place: Place) -> None:
+    (case,) = (case for case in CATEGORIES["results and permissions"] if case.name == "results of an earlier run")
     case.make(place)
     assert CliRunner().invoke(run.app, arguments(place)).exit_code == 0
     assert (place.out / "notes.txt").read_text() == "of an earlier run"
@@ -144,8 +144,8 @@ def test_results_of_an_earlier_run_are_replaced_and_other_files_stay(place: Plac
     assert sorted(path.name for path in (place.out / "masks").iterdir()) == stamps
 
 
-def test_nothing_that_a_run_writes_is_left_for_the_next(place: Place) -> None:
-    """Whoever adds a file to the results adds it to what `clear_earlier_results` removes."""
+def test_clear_earlier_results_removes_all_files_of_a_run(place: Place) -> None:
+    """A new result file must also be added to the files that `clear_earlier_results` removes."""
     from v3d_torch.runs.result_folder import clear_earlier_results
 
     assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks", "--mesh"]).exit_code == 0

@@ -8,8 +8,8 @@ import pytest
 from helpers.corpus.base import write_base
 from rich.console import Console
 
-from v3d_torch.datasets.names import PAPER_SEQUENCES, SEQUENCES, short_name
-from v3d_torch.datasets.patterns import matching_sequences
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, short_name
+from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError
 from v3d_torch.runs.console import open_sequences
 

@@ -127,7 +127,7 @@ def test_what_users_get_wrong(tmp_path: Path) -> None:
     save(tmp_path / "depth" / "1.png", depth_of(0))
     (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
     done = call_here("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
-    assert_one_sentence(done, str(tmp_path / "full"), "holds something already; choose another")
+    assert_one_sentence(done, str(tmp_path / "full"), "already exists and is not an empty folder; choose another")
     assert_one_sentence(call_here("--out", tmp_path / "new"), "realsense: ")
     assert not (tmp_path / "new").exists()
 

@@ -21,8 +21,8 @@ from v3d_torch.datasets import SourceOptions, load_sequence
 from v3d_torch.datasets.bag import BagSequence
 from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.bag_topics import CAMERA_INFO, COMPRESSED, IMAGE, choose_topics
-from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.demo.sequence import write_sequence
+from v3d_torch.datasets.stored import Cursor
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import evaluate
@@ -213,10 +213,14 @@ def test_compressed_depth() -> None:
         ("colour", ROS2.image(1, "16UC1", depth_of(0)), "holds 16UC1 images, not colour; .*--rgb-topic"),
         ("depth", ROS2.image(1, "rgb8", colour_of(0)), "holds rgb8 images, not depth; .*--depth-topic"),
         ("depth", ROS2.compressed(1, "16UC1; compressedDepth rvl", b"1" * 40), "RVL cannot be read"),
-        ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "is no image"),
+        ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "is not a PNG"),
         ("depth", ROS2.compressed(1, "mono8; png compressed", png(colour_of(0)[..., 0])), "8-bit"),
         ("colour", ROS2.compressed(1, "bgr8; jpeg compressed bgr8", png(colour_of(0))[:-40]), "truncated"),
-        ("colour", ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))), "16-bit depth image where colour"),
+        (
+            "colour",
+            ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))),
+            "16-bit depth image, expected a colour image",
+        ),
     ],
 )
 def test_images_that_are_wrong(read: str, message: Any, what: str) -> None:
@@ -352,7 +356,7 @@ def test_a_depth_topic_under_any_name() -> None:
         ([RGB, DEPTH, INFO], {"info_topic": "/x"}, f"has no camera on /x; give --info-topic one of {INFO}$"),
         ([RGB, DEPTH], {}, f"has no camera beside {RGB}; name it with --info-topic, or give --camera$"),
         ([RGB, DEPTH, INFO], {"rgb_topic": DEPTH, "depth_topic": RGB, "info_topic": INFO}, "16UC1 images, not colour"),
-        ([RGB, DEPTH, INFO], {"fps": 30.0}, "is a bag, --fps means nothing to it"),
+        ([RGB, DEPTH, INFO], {"fps": 30.0}, "is a bag, which does not support --fps"),
     ],
 )
 def test_topics_that_are_wrong(topics: list[str], options: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -389,7 +393,7 @@ def test_depth_that_is_not_registered_to_colour(tmp_path: Path) -> None:
 
 
 def test_depth_of_another_size(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"{DEPTH}: has 40x24 pixels, its colour image 32x24; name depth"):
+    with pytest.raises(InputError, match=": has 40x24 pixels, but its colour image has 32x24; name depth"):
         load_sequence(str(changed(tmp_path, size=(40, HEIGHT))))
 
 

@@ -1,4 +1,4 @@
-"""Bonn RGB-D Dynamic: its camera, and ground truth taken from the markers to the camera."""
+"""Bonn RGB-D Dynamic: published camera, and conversion of the marker poses to camera poses."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_frames_and_camera(folder: Path) -> None:
+def test_bonn_frames_and_camera_match_files(folder: Path) -> None:
     sequence = load_sequence(str(folder))
     assert isinstance(sequence, BonnSequence)
     assert (sequence.name, len(sequence)) == ("rgbd_bonn_tiny", 2)
@@ -43,16 +43,16 @@ def test_frames_and_camera(folder: Path) -> None:
 
 
 def test_convention_ground_truth_is_of_the_camera(folder: Path) -> None:
-    """T_ROS^-1 T T_ROS T_m as published, with the rotation that is in T_m."""
+    """Published formula T_ROS^-1 T T_ROS T_m, with only the rotation and translation of T_m."""
     T_ros = np.array([[-1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
     scaled = np.array([[1.0157, 0.1828, -0.2389], [0.0009, -0.8431, -0.6413], [-0.3009, 0.6147, -0.8085]])
     T_m = np.eye(4)
     T_m[:3, :3] = Rotation.from_matrix(scaled / np.cbrt(np.linalg.det(scaled))).as_matrix()
     T_m[:3, 3] = [0.0113, -0.0098, 0.0111]
-    truth = load_sequence(str(folder)).groundtruth
-    assert truth is not None and truth.stamps.tolist() == [10.0, 11.0]
+    groundtruth = load_sequence(str(folder)).groundtruth
+    assert groundtruth is not None and groundtruth.stamps.tolist() == [10.0, 11.0]
     for T_wc, position, angle in zip(
-        truth.T_wc.numpy(), ([1, 2, 3], [1.5, 2, 3]), (0, 2 * np.arcsin(0.6)), strict=True
+        groundtruth.T_wc.numpy(), ([1, 2, 3], [1.5, 2, 3]), (0, 2 * np.arcsin(0.6)), strict=True
     ):
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = Rotation.from_euler("z", angle).as_matrix(), position
@@ -62,7 +62,7 @@ def test_convention_ground_truth_is_of_the_camera(folder: Path) -> None:
         assert np.linalg.norm(T_wc[:3, 3] - (np.linalg.inv(T_ros) @ T)[:3, 3]) == pytest.approx(0.0186, abs=2e-4)
 
 
-def test_a_folder_with_a_camera_is_no_original(folder: Path) -> None:
+def test_bonn_folder_with_camera_file_keeps_camera_poses(folder: Path) -> None:
     (folder / "camera.yaml").write_text("fx: 1\nfy: 2\ncx: 3\ncy: 4\nwidth: 640\nheight: 480\ndepth_scale: 1000\n")
     sequence = load_sequence(str(folder))
     assert sequence.camera == PinholeCamera(1, 2, 3, 4, depth_scale=1000)
@@ -70,7 +70,7 @@ def test_a_folder_with_a_camera_is_no_original(folder: Path) -> None:
     assert sequence.groundtruth.T_wc[:, :3, 3].tolist() == [[1, 2, 3], [1.5, 2, 3]]
 
 
-def test_without_ground_truth(folder: Path) -> None:
+def test_bonn_sequence_without_ground_truth_is_opened(folder: Path) -> None:
     (folder / "groundtruth.txt").unlink()
     sequence = load_sequence(str(folder))
     assert sequence.groundtruth is None and sequence.camera is CAMERA

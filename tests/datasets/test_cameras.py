@@ -13,7 +13,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 CAMERA_YAML = "fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
 
 
-def test_presets() -> None:
+def test_presets_have_published_parameters() -> None:
     assert PRESETS == ("d435i", "tum_fr1", "tum_fr2", "tum_fr3")
     assert load_camera("tum_fr1") == PinholeCamera(
         517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
@@ -37,7 +37,7 @@ def test_presets() -> None:
         ("K.txt", "1 0 3\n0 2 4\n0 0 1\n"),
     ],
 )
-def test_camera_files(tmp_path: Path, name: str, text: str) -> None:
+def test_camera_file_is_read(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     camera = load_camera(tmp_path / name)
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1, 2, 3, 4)
@@ -58,15 +58,15 @@ def test_camera_files(tmp_path: Path, name: str, text: str) -> None:
         ("c.yaml", CAMERA_YAML + "1: 3\n", "c.yaml: "),
         ("c.yaml", "{fx", "not valid YAML"),
         ("c.yaml", "!!python/object/apply:os.getcwd []", "not valid YAML"),
-        ("c.yaml", "30", "holds no camera"),
-        ("K.txt", "1 2 3", "holds 3 numbers"),
+        ("c.yaml", "30", "does not contain a camera"),
+        ("K.txt", "1 2 3", "contains 3 numbers"),
         ("K.txt", "1 9 3 0 2 4 0 0 1", "3x3 camera matrix without skew"),
         ("K.txt", "1 2 3 4 5000 640.5 480", "width: .*got 640.5"),
         ("K.txt", "one two", "not a number"),
         ("K.txt", "\udcff", "not a text file"),
     ],
 )
-def test_camera_files_that_are_wrong(tmp_path: Path, name: str, text: str, message: str) -> None:
+def test_invalid_camera_file_is_rejected(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).write_bytes(text.encode("utf-8", errors="surrogateescape"))
     with pytest.raises(InputError, match=message) as caught:
         load_camera(tmp_path / name)
@@ -74,6 +74,6 @@ def test_camera_files_that_are_wrong(tmp_path: Path, name: str, text: str, messa
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_preset_offers_the_nearest() -> None:
+def test_unknown_preset_suggests_the_most_similar() -> None:
     with pytest.raises(InputError, match="did you mean tum_fr3"):
         load_camera("tum-fr3")

@@ -1,4 +1,4 @@
-"""ICL-NUIM: stamps from frame numbers, and a camera and poses whose y axis points down."""
+"""ICL-NUIM: timestamps from frame numbers, and conversion of camera and poses to a y axis that points down."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_frames(folder: Path) -> None:
+def test_icl_nuim_frames_match_files(folder: Path) -> None:
     sequence = load_sequence(str(folder))
     assert isinstance(sequence, ICLNUIMSequence)
     assert sequence.name == folder.name
@@ -41,7 +41,7 @@ def test_frames(folder: Path) -> None:
 
 
 def test_convention_y_points_down(folder: Path) -> None:
-    """A point is seen at the same pixel as through the published camera, fy = -480, with the published pose."""
+    """A point has the same pixel as with the published camera (fy = -480) and the published pose."""
     sequence = load_sequence(str(folder))
     assert sequence.groundtruth is not None
     camera = sequence.camera
@@ -50,23 +50,23 @@ def test_convention_y_points_down(folder: Path) -> None:
     in_front = torch.tensor([[0.3, -0.2, 2.0, 1.0], [-0.5, 0.4, 3.0, 1.0]], dtype=torch.float64)
     for T_wc, T_wc_published in zip(sequence.groundtruth.T_wc, published, strict=True):
         world = in_front @ T_wc_published.T
-        seen = in_front[:, :3] @ K.T
+        expected = in_front[:, :3] @ K.T
         flipped = world * torch.tensor([1, -1, 1, 1])
         pixels = camera.project((flipped @ invert(T_wc).T)[:, :3])
-        torch.testing.assert_close(pixels, seen[:, :2] / seen[:, 2:])
+        torch.testing.assert_close(pixels, expected[:, :2] / expected[:, 2:])
         assert torch.det(T_wc[:3, :3]) == pytest.approx(1.0)
 
 
-def test_moving_up_is_minus_y(folder: Path) -> None:
+def test_upward_motion_of_icl_nuim_is_negative_y(folder: Path) -> None:
     up = se3_exp(torch.tensor([0.0, 0.5, 0, 0, 0, 0], dtype=torch.float64))
     (folder / "livingRoom0.gt.freiburg").write_text(f"1 0 {up[1, 3].item()} 0 0 0 0 1\n")
-    truth = load_sequence(str(folder)).groundtruth
-    assert truth is not None and truth.T_wc[0, 1, 3] == -0.5
+    groundtruth = load_sequence(str(folder)).groundtruth
+    assert groundtruth is not None and groundtruth.T_wc[0, 1, 3] == -0.5
 
 
-def test_two_ground_truths_are_one_too_many(folder: Path) -> None:
+def test_two_ground_truth_files_are_rejected(folder: Path) -> None:
     (folder / "livingRoom0n.gt.freiburg").write_text(POSES)
     with pytest.raises(
-        InputError, match=r"several ground truths \(livingRoom0.gt.freiburg, livingRoom0n.gt.freiburg\)"
+        InputError, match=r"several ground-truth files \(livingRoom0.gt.freiburg, livingRoom0n.gt.freiburg\)"
     ):
         load_sequence(str(folder))

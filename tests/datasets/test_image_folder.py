@@ -1,4 +1,4 @@
-"""Folders without lists: which images belong together, and when they were taken."""
+"""Folders of images without lists: pairs and timestamps from file names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of, depth_of, save
 
 from v3d_torch.datasets import RGBDSequence, SourceOptions, load_sequence
-from v3d_torch.datasets.file_names import frame_number, images_in, stamp
+from v3d_torch.datasets.image_files import frame_number, list_images, stamp_in_name
 from v3d_torch.datasets.image_folder import ImageFolder
 from v3d_torch.errors import InputError
 
@@ -25,7 +25,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def fill(root: Path, colour: list[str], depth: list[str]) -> Path:
-    """Images with seeds 0, 1, 2 ... in the order of the names given."""
+    """Save images with seeds 0, 1, 2 ... in the order of the given names."""
     for seed, name in enumerate(colour):
         save(root / name, colour_of(seed))
     for seed, name in enumerate(depth):
@@ -41,37 +41,37 @@ def assert_frames(sequence: RGBDSequence, stamps: list[float], seeds: list[tuple
         np.testing.assert_allclose(frame.depth[0], depth_of(depth) / 1000, rtol=1e-6)
 
 
-def test_two_folders_in_the_order_of_their_numbers(root: Path) -> None:
+def test_images_of_two_folders_are_paired_in_order_of_their_numbers(root: Path) -> None:
     fill(root, [f"rgb/img{i}.png" for i in (9, 10, 100)], [f"depth/d_{i:03d}.png" for i in (1, 2, 3)])
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1, 0.2], [(0, 0), (1, 1), (2, 2)])
 
 
-def test_two_folders_with_equal_names_and_one_missing(root: Path) -> None:
+def test_images_with_equal_names_are_paired_if_one_is_missing(root: Path) -> None:
     fill(root, [f"color/{i}.png" for i in (7, 8, 9)], [f"depth_png/{i}.png" for i in (9, 7)])
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 1), (2, 0)])
 
 
-def test_names_that_are_times(root: Path) -> None:
+def test_images_with_timestamps_as_names_are_paired_by_time(root: Path) -> None:
     colour = [f"rgb/{t}.png" for t in ("1305031102.5", "1305031102.12", "1305031103.0")]
     fill(root, colour, [f"depth/{t}.png" for t in ("1305031102.51", "1305031102.11", "1305031109.0")])
     assert_frames(load_sequence(str(root)), [1305031102.12, 1305031102.5], [(1, 1), (0, 0)])
 
 
-def test_times_with_few_decimals_are_no_version_numbers(root: Path) -> None:
-    """Pairing needs them in order, and 0.9 comes after 0.12."""
+def test_timestamps_with_few_decimals_are_sorted_by_value(root: Path) -> None:
+    """Association needs sorted timestamps, and 0.9 comes after 0.12."""
     times = [1.9, 1.12, 1.5, 1.125, 1.7, 1.65, 1.155]
     fill(root, [f"rgb/{t}.png" for t in times], [f"depth/{t + 0.001:.3f}.png" for t in times])
     order = sorted(range(len(times)), key=lambda i: times[i])
     assert_frames(load_sequence(str(root)), sorted(times), [(i, i) for i in order])
 
 
-def test_side_by_side(root: Path) -> None:
+def test_colour_and_depth_in_one_folder_are_paired_by_name(root: Path) -> None:
     fill(root, ["0_rgb.png", "1_rgb.png"], ["0_depth.png", "1_depth.png"])
     save(root / "0_mask.png", colour_of(7))
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 0), (1, 1)])
 
 
-def test_kind_in_front(root: Path) -> None:
+def test_kind_at_the_start_of_names_is_ignored_in_pairing(root: Path) -> None:
     fill(root, ["color_000001.png", "color_000002.png"], ["depth_000002.png", "depth_000001.png"])
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 1), (1, 0)])
 
@@ -89,34 +89,44 @@ def test_kind_in_front(root: Path) -> None:
         ("rgb.png", None, None),
     ],
 )
-def test_what_names_say(name: str, seconds: float | None, number: int | None) -> None:
-    assert stamp(Path(name)) == (None if seconds is None else pytest.approx(seconds, abs=1e-6))
+def test_file_name_gives_timestamp_and_frame_number(name: str, seconds: float | None, number: int | None) -> None:
+    assert stamp_in_name(Path(name)) == (None if seconds is None else pytest.approx(seconds, abs=1e-6))
     assert frame_number(Path(name)) == number
 
 
-def test_order_of_names(tmp_path: Path) -> None:
+def test_images_are_listed_in_numerical_order(tmp_path: Path) -> None:
     for name in ("b2.png", "b10.png", "a3.png", "b2.txt", ".b0.png"):
         (tmp_path / name).touch()
-    assert [path.name for path in images_in(tmp_path)] == ["a3.png", "b2.png", "b10.png"]
+    assert [path.name for path in list_images(tmp_path)] == ["a3.png", "b2.png", "b10.png"]
 
 
 @pytest.mark.parametrize(
     ("colour", "depth", "options", "message"),
     [
-        (["rgb/1.png"], ["depth/1.png"], SourceOptions(), "names such as 1.png are no times; .*--fps"),
-        (["rgb/a.png", "rgb/b.png"], ["depth/x.png"], FPS, "has 2 colour and 1 depth images whose names"),
+        (["rgb/1.png"], ["depth/1.png"], SourceOptions(), "file names such as 1.png are not timestamps; .*--fps"),
+        (
+            ["rgb/a.png", "rgb/b.png"],
+            ["depth/x.png"],
+            FPS,
+            "has 2 colour and 1 depth images that cannot be paired by name",
+        ),
         (["rgb/10.5.png"], ["depth/11.5.png"], FPS, "no colour image is within 0.02 s"),
-        (["rgb/1.png", "color/1.png"], ["depth/1.png"], FPS, "holds color, rgb, depth; leave one folder"),
-        (["rgb/1.png"], [], FPS, "is no sequence of a known kind"),
+        (
+            ["rgb/1.png", "color/1.png"],
+            ["depth/1.png"],
+            FPS,
+            "has too many image folders .color, rgb, depth.; keep one folder",
+        ),
+        (["rgb/1.png"], [], FPS, "is not a sequence of a supported format"),
         (
             ["rgb/1.png"],
             ["depth/1.png"],
             SourceOptions(fps=10, rgb_topic="/a"),
-            "a folder of images, --rgb-topic means",
+            "a folder of images, which does not support --rgb-topic",
         ),
     ],
 )
-def test_what_can_be_wrong(
+def test_invalid_image_folder_is_rejected(
     root: Path, colour: list[str], depth: list[str], options: SourceOptions, message: str
 ) -> None:
     fill(root, colour, depth)
@@ -125,10 +135,10 @@ def test_what_can_be_wrong(
     assert str(root) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_camera_is_needed_and_a_file_is_no_folder(root: Path) -> None:
+def test_image_folder_without_camera_and_file_instead_of_folder_are_rejected(root: Path) -> None:
     fill(root, ["rgb/1.png"], ["depth/1.png"])
-    with pytest.raises(InputError, match="is no sequence of a known kind"):
+    with pytest.raises(InputError, match="is not a sequence of a supported format"):
         load_sequence(str(root / "camera.yaml"))
     (root / "camera.yaml").unlink()
-    with pytest.raises(InputError, match="says nothing about its camera"):
+    with pytest.raises(InputError, match="has no camera parameters"):
         load_sequence(str(root), options=FPS)

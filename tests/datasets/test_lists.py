@@ -1,4 +1,4 @@
-"""Text files of the TUM layout, and the pairs made of them."""
+"""Image lists of the TUM layout and association of colour and depth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from v3d_torch.io.timestamps import associate
 
 STAMPS = st.floats(min_value=-1e10, max_value=1e10, allow_nan=False)
 NAMES = st.from_regex(r"rgb/[a-z0-9_\-]+( [a-z0-9#,]+)*\.png", fullmatch=True)
-IN_A_FILE = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FILE_SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @given(
@@ -23,8 +23,8 @@ IN_A_FILE = settings(max_examples=60, deadline=None, suppress_health_check=[Heal
     mark=st.booleans(),
     gap=st.sampled_from([" ", "\t", "   ", ", "]),
 )
-@IN_A_FILE
-def test_lists_in_any_dress(
+@FILE_SETTINGS
+def test_image_list_is_read_with_any_whitespace_comments_and_line_ends(
     tmp_path: Path, entries: list[tuple[float, str]], noise: list[str], ending: str, mark: bool, gap: str
 ) -> None:
     lines = [*noise, *(f" {stamp!r}{gap}{name} " for stamp, name in entries), *noise]
@@ -34,8 +34,10 @@ def test_lists_in_any_dress(
 
 
 @given(entries=st.lists(st.tuples(STAMPS, NAMES, STAMPS, NAMES), min_size=1, max_size=20))
-@IN_A_FILE
-def test_associations_with_spaces_in_names(tmp_path: Path, entries: list[tuple[float, str, float, str]]) -> None:
+@FILE_SETTINGS
+def test_associations_with_spaces_in_file_names_are_read(
+    tmp_path: Path, entries: list[tuple[float, str, float, str]]
+) -> None:
     path = tmp_path / "associations.txt"
     path.write_text("".join(f"{a!r} {colour} {b!r} {depth}\n" for a, colour, b, depth in entries))
     first = {entry[0]: (entry[0], entry[1], entry[3]) for entry in reversed(entries)}
@@ -43,7 +45,7 @@ def test_associations_with_spaces_in_names(tmp_path: Path, entries: list[tuple[f
     assert found == [first[stamp] for stamp in sorted(first)]
 
 
-def test_depth_has_its_own_time(tmp_path: Path) -> None:
+def test_depth_delay_is_depth_stamp_minus_colour_stamp(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("10.0 rgb/a.png\n10.5 rgb/b.png\n")
     (tmp_path / "depth.txt").write_text("9.984375 depth/a.png\n10.515625 depth/b.png\n")
     path = tmp_path / "associations.txt"
@@ -51,13 +53,13 @@ def test_depth_has_its_own_time(tmp_path: Path) -> None:
     path.write_text("\n".join(lines))
     listed, paired = read_associations(path), pair_lists(tmp_path / "rgb.txt", tmp_path / "depth.txt")
     assert listed == paired and [pair.depth_delay for pair in listed] == [-1 / 64, 1 / 64]
-    path.write_text("10.0 rgb/a.png 5009.99 depth/a.png")  # two clocks tell no delay
+    path.write_text("10.0 rgb/a.png 5009.99 depth/a.png")  # stamps of two clocks give no delay
     assert [pair.depth_delay for pair in read_associations(path)] == [0.0]
 
 
 @given(content=st.binary(max_size=200))
-@IN_A_FILE
-def test_any_bytes_are_a_list_or_an_input_error(tmp_path: Path, content: bytes) -> None:
+@FILE_SETTINGS
+def test_any_bytes_are_a_valid_list_or_raise_input_error(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "rgb.txt").write_bytes(content)
     for read in (read_image_list, read_associations):
         try:
@@ -66,15 +68,15 @@ def test_any_bytes_are_a_list_or_an_input_error(tmp_path: Path, content: bytes) 
             assert "\n" not in str(error)
 
 
-# Binary fractions: differences are exact, so that ties are ties.
+# Binary fractions have exact differences, so that equal differences compare equal.
 TICKS = st.lists(st.integers(0, 2000), unique=True, max_size=60).map(
     lambda ticks: [tick / 1024 for tick in sorted(ticks)]
 )
 
 
 @given(first=TICKS, second=TICKS)
-def test_association_takes_the_nearest_first(first: list[float], second: list[float]) -> None:
-    """Against the plain reading of the benchmark's tool: all differences, sorted, each stamp used once."""
+def test_association_pairs_nearest_stamps_first(first: list[float], second: list[float]) -> None:
+    """Reference: the benchmark's tool, which sorts all differences and uses each stamp once."""
     limit = 20 / 1024
     near = sorted((abs(a - b), i, j) for i, a in enumerate(first) for j, b in enumerate(second) if abs(a - b) <= limit)
     expected: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""OpenLORIS-Scene: OpenCV's YAML, intrinsics in their own order, ground truth of the robot taken to its camera."""
+"""OpenLORIS-Scene: OpenCV's YAML, order of the intrinsics, conversion of base poses to camera poses."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ d400_color_optical_frame:
       dt: d
       data: [ 0.1, -0.2, 0.003, 0.004 ]
 """
-LINKS = """%YAML:1.0
+TRANSFORMS = """%YAML:1.0
 trans_matrix:
    -
       parent_frame: laser
@@ -71,11 +71,11 @@ def folder(tmp_path: Path) -> Path:
     (root / "aligned_depth.txt").write_text("".join(f"15600000{i:02d}.501 aligned_depth/{i}.png\n" for i in range(2)))
     (root / "groundtruth.txt").write_text("1560000000.4 1 2 0 0 0 0.6 0.8\n")
     (root / "sensors.yaml").write_text(SENSORS)
-    (root / "trans_matrix.yaml").write_text(LINKS)
+    (root / "trans_matrix.yaml").write_text(TRANSFORMS)
     return root
 
 
-def test_frames_and_camera(folder: Path) -> None:
+def test_openloris_frames_and_camera_match_files(folder: Path) -> None:
     sequence = load_sequence(str(folder))
     assert isinstance(sequence, OpenLORISSequence)
     assert sequence.stamps.tolist() == [1560000000.5, 1560000001.5]
@@ -91,12 +91,12 @@ def test_convention_ground_truth_is_of_the_camera(folder: Path) -> None:
     T_laser_camera = np.array([[0, 0, 1, 0.3], [-1, 0, 0, 0.05], [0, -1, 0, 0.4], [0, 0, 0, 1]])
     T_wb = np.eye(4)
     T_wb[:3, :3], T_wb[:3, 3] = Rotation.from_quat([0, 0, 0.6, 0.8]).as_matrix(), [1, 2, 0]
-    truth = load_sequence(str(folder)).groundtruth
-    assert truth is not None and truth.stamps.tolist() == [1560000000.4]
-    np.testing.assert_allclose(truth.T_wc[0], T_wb @ np.linalg.inv(T_laser_base) @ T_laser_camera, atol=1e-12)
+    groundtruth = load_sequence(str(folder)).groundtruth
+    assert groundtruth is not None and groundtruth.stamps.tolist() == [1560000000.4]
+    np.testing.assert_allclose(groundtruth.T_wc[0], T_wb @ np.linalg.inv(T_laser_base) @ T_laser_camera, atol=1e-12)
 
 
-def test_a_camera_of_the_user_needs_no_sensors(folder: Path) -> None:
+def test_camera_chosen_by_user_replaces_sensors_file(folder: Path) -> None:
     (folder / "sensors.yaml").write_text("%YAML:1.0\nnothing: 1\n")
     own = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=2000)
     assert load_sequence(str(folder), camera=own).camera is own
@@ -106,12 +106,12 @@ def test_a_camera_of_the_user_needs_no_sensors(folder: Path) -> None:
     ("damage", "message"),
     [
         (lambda f: (f / "aligned_depth.txt").unlink(), "has no aligned_depth.txt"),
-        (lambda f: (f / "sensors.yaml").write_text("%YAML:1.0\nx: 1\n"), "sensors.yaml: holds no d400_color"),
+        (lambda f: (f / "sensors.yaml").write_text("%YAML:1.0\nx: 1\n"), "sensors.yaml: has no d400_color"),
         (lambda f: (f / "sensors.yaml").write_text(SENSORS.replace("30.5", "-30.5")), "sensors.yaml: fx: .*-30.5"),
-        (lambda f: (f / "aligned_depth" / "1.png").unlink(), "1.png: is listed but not there"),
+        (lambda f: (f / "aligned_depth" / "1.png").unlink(), "1.png: is listed but does not exist"),
     ],
 )
-def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path], object], message: str) -> None:
+def test_damaged_openloris_folder_is_rejected(folder: Path, damage: Callable[[Path], object], message: str) -> None:
     damage(folder)
     with pytest.raises(InputError, match=message) as caught:
         load_sequence(str(folder))
@@ -119,17 +119,17 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
 
 
 @pytest.mark.parametrize(
-    ("links", "message"),
+    ("transforms", "message"),
     [
         (None, "cannot be read"),
-        ("{", "is no YAML as OpenCV writes"),
-        ("%YAML:1.0\nx: 1\n", "does not say where d400_color_opt"),
-        ("%YAML:1.0\ntrans_matrix:\n   - { parent_frame: a }\n", "a link has no"),
+        ("{", "is not valid OpenCV YAML"),
+        ("%YAML:1.0\nx: 1\n", "has no transform from d400_color_optical_frame to base_link"),
+        ("%YAML:1.0\ntrans_matrix:\n   - { parent_frame: a }\n", "a transform has no"),
     ],
 )
-def test_without_the_place_of_the_camera_there_is_no_truth(folder: Path, links: str | None, message: str) -> None:
+def test_invalid_calibration_gives_no_ground_truth(folder: Path, transforms: str | None, message: str) -> None:
     file = folder / "trans_matrix.yaml"
-    file.unlink() if links is None else file.write_text(links)
+    file.unlink() if transforms is None else file.write_text(transforms)
     with pytest.warns(GroundTruthWarning):
         sequence = load_sequence(str(folder))
     assert isinstance(sequence, StoredSequence) and sequence.groundtruth is None

@@ -229,7 +229,7 @@ def test_no_camera_is_connected(name: str, called: str) -> None:
     with pytest.raises(InputError, match=f"^{called}: no such camera is connected, there is none; plug it"):
         open_source(name)
     assert time.monotonic() - start < 5
-    with pytest.raises(InputError, match="is a live camera, --depth-topic means nothing to it"):
+    with pytest.raises(InputError, match="is a live camera, which does not support --depth-topic"):
         open_source(name, options=SourceOptions(depth_topic="/a"))
 
 

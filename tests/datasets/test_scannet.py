@@ -1,4 +1,4 @@
-"""ScanNet's folders: colour brought to the depth camera's pixels, lost poses left out, numbers as times."""
+"""ScanNet exports: colour warped to the depth camera, lost poses skipped, timestamps from frame numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from v3d_torch.errors import GroundTruthWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 FULL, SIZE = (260, 193), (128, 96)
-"""Colour and depth images, in the proportions of ScanNet's, whose colour is cut at top and bottom."""
+"""Sizes of colour and depth images with the aspect ratios of ScanNet: colour is cropped at top and bottom."""
 K_COLOUR = np.array([[234.0, 0, 131.0], [0, 234.5, 97.0], [0, 0, 1]])
 K_DEPTH = np.array([[115.5, 0, 63.0], [0, 115.6, 48.5], [0, 0, 1]])
 LOST = "-inf -inf -inf -inf\n" * 4
@@ -25,13 +25,13 @@ IDENTITY = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 
 
 def rays(K: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """x and y of the ray of every pixel at unit depth, shape (H, W, 2)."""
+    """Normalised coordinates (x, y) of every pixel, shape (H, W, 2)."""
     u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
 
 
-def seen(K: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
-    """What a camera sees of a wall whose colour is a steep ramp to the right, one downwards, and waves."""
+def render(K: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
+    """Render a wall whose channels are a ramp to the right, a ramp downwards, and waves."""
     x, y = np.moveaxis(rays(K, size), -1, 0)
     return np.stack([128 + 215 * x, 128 + 280 * y, 128 + 100 * np.sin(20 * x) * np.cos(20 * y)], axis=-1)
 
@@ -40,7 +40,7 @@ def seen(K: NDArray[np.float64], size: tuple[int, int]) -> NDArray[np.float64]:
 def folder(tmp_path: Path) -> Path:
     root = tmp_path / "scene0000_00"
     for number in (0, 20, 100):
-        save(root / "color" / f"{number}.png", seen(K_COLOUR, FULL).round().clip(0, 255).astype(np.uint8))
+        save(root / "color" / f"{number}.png", render(K_COLOUR, FULL).round().clip(0, 255).astype(np.uint8))
         save(root / "depth" / f"{number}.png", depth_of(number, *SIZE))
         (root / "pose").mkdir(exist_ok=True)
         (root / "pose" / f"{number}.txt").write_text(LOST if number == 20 else IDENTITY.replace("0\n", "2\n", 1))
@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("nested", [False, True])
-def test_frames(folder: Path, nested: bool) -> None:
+def test_scannet_frames_match_files(folder: Path, nested: bool) -> None:
     if nested:
         folder = folder.rename(folder.with_name("frames")).parent
     sequence = load_sequence(str(folder))
@@ -65,17 +65,17 @@ def test_frames(folder: Path, nested: bool) -> None:
     assert sequence.groundtruth.T_wc[1, :3, 3].tolist() == [2, 0, 0]
 
 
-def test_colour_lies_on_the_rays_of_depth(folder: Path) -> None:
-    """To a fraction of a grey level, where a tenth of a pixel is a fifth of a level on the ramps."""
+def test_warped_colour_has_the_rays_of_the_depth_camera(folder: Path) -> None:
+    """The tolerance is a fraction of a grey level; on the ramps, 0.1 pixels are 0.2 grey levels."""
     image = load_sequence(str(folder))[0].image
-    error = image.permute(1, 2, 0).numpy() - seen(K_DEPTH, SIZE)
+    error = image.permute(1, 2, 0).numpy() - render(K_DEPTH, SIZE)
     inside = error[2:-2, 2:-2]
     assert np.abs(inside[..., :2]).max() < 1.5  # three roundings
     assert np.abs(inside[..., :2].mean(axis=(0, 1))).max() < 0.1
     assert np.abs(inside[..., 2]).max() < 4
 
 
-def test_fine_texture_is_averaged_not_sampled(folder: Path) -> None:
+def test_fine_texture_is_averaged_in_smaller_images(folder: Path) -> None:
     u, v = np.meshgrid(np.arange(FULL[0]), np.arange(FULL[1]))
     board = np.repeat(((u + v) % 2 * 255).astype(np.uint8)[..., None], 3, axis=-1)
     save(folder / "color" / "0.png", board)
@@ -83,24 +83,24 @@ def test_fine_texture_is_averaged_not_sampled(folder: Path) -> None:
     assert np.abs(image.astype(float) - 127.5).max() < 40
 
 
-def test_images_of_one_size_are_registered(folder: Path) -> None:
+def test_colour_of_the_depth_size_is_unchanged(folder: Path) -> None:
     save(folder / "color" / "0.png", colour_of(0, *SIZE))
     assert np.array_equal(load_sequence(str(folder))[0].image.permute(1, 2, 0).numpy(), colour_of(0, *SIZE))
 
 
-def test_one_camera_file_is_enough(folder: Path) -> None:
+def test_missing_depth_camera_is_derived_from_colour_camera(folder: Path) -> None:
     (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
     camera = load_sequence(str(folder)).camera
     ratio = SIZE[0] / FULL[0]
     assert (camera.fx, camera.cx) == pytest.approx((234 * ratio, 131.5 * ratio - 0.5))
     image = load_sequence(str(folder))[0].image.permute(1, 2, 0).numpy()
-    assert np.abs(image - seen(camera.K.numpy(), SIZE))[2:-2, 2:-2, :2].max() < 1.5
+    assert np.abs(image - render(camera.K.numpy(), SIZE))[2:-2, 2:-2, :2].max() < 1.5
     (folder / "intrinsic" / "intrinsic_color.txt").unlink()
     own = load_sequence(str(folder), camera=PinholeCamera(100, 100, 64, 48, *SIZE, depth_scale=1000))
     assert own[0].image.shape == (3, 96, 128)
 
 
-def test_no_pose_at_all_is_no_ground_truth(folder: Path) -> None:
+def test_sequence_without_finite_poses_has_no_ground_truth(folder: Path) -> None:
     for path in (folder / "pose").iterdir():
         path.write_text(LOST)
     assert load_sequence(str(folder)).groundtruth is None
@@ -111,18 +111,21 @@ def test_no_pose_at_all_is_no_ground_truth(folder: Path) -> None:
     [
         (
             lambda f: (f / "intrinsic" / "intrinsic_depth.txt").write_text("a b c\n"),
-            "intrinsic_depth.txt: is no matrix",
+            "intrinsic_depth.txt: is not a 3x3 or 4x4 matrix",
         ),
         (
             lambda f: (f / "intrinsic" / "intrinsic_depth.txt").write_text("0 0 0\n" * 3),
-            "_depth.txt: is no camera",
+            "_depth.txt: is not a camera matrix",
         ),
-        (lambda f: [p.unlink() for p in (f / "intrinsic").iterdir()], "says nothing about its camera"),
-        (lambda f: [p.rename(p.with_stem(f"1{p.stem}")) for p in (f / "depth").glob("*")], "has the number of a depth"),
-        (lambda f: (f / "depth" / "0.png").write_bytes(b"\x89PNG"), "0.png: is no image"),
+        (lambda f: [p.unlink() for p in (f / "intrinsic").iterdir()], "has no camera parameters"),
+        (
+            lambda f: [p.rename(p.with_stem(f"1{p.stem}")) for p in (f / "depth").glob("*")],
+            "has the same frame number as a depth",
+        ),
+        (lambda f: (f / "depth" / "0.png").write_bytes(b"\x89PNG"), "0.png: is not a PNG"),
     ],
 )
-def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path], object], message: str) -> None:
+def test_damaged_scannet_folder_is_rejected(folder: Path, damage: Callable[[Path], object], message: str) -> None:
     damage(folder)
     with pytest.raises(InputError, match=message) as caught:
         load_sequence(str(folder))
@@ -130,9 +133,10 @@ def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path]
 
 
 @pytest.mark.parametrize(
-    ("pose", "message"), [("1 2 3\n", "is no matrix"), ("1 0 0\n0 1 0\n0 0 1\n", "is no 4x4 matrix")]
+    ("pose", "message"),
+    [("1 2 3\n", "is not a 3x3 or 4x4 matrix"), ("1 0 0\n0 1 0\n0 0 1\n", "is not a 4x4 pose matrix")],
 )
-def test_a_broken_pose_costs_no_frame(folder: Path, pose: str, message: str) -> None:
+def test_damaged_pose_gives_no_ground_truth(folder: Path, pose: str, message: str) -> None:
     file = next(folder.rglob("pose/0.txt"))
     file.write_text(pose)
     with pytest.warns(GroundTruthWarning):

@@ -1,4 +1,4 @@
-"""7-Scenes: a file of each kind per frame, 65535 for no depth."""
+"""7-Scenes: one colour, depth and pose file per frame, 65535 for missing depth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_frames(folder: Path) -> None:
+def test_seven_scenes_frames_match_files(folder: Path) -> None:
     sequence = load_sequence(str(folder))
     assert isinstance(sequence, SevenScenesSequence)
     assert (sequence.name, sequence.camera) == ("chess/seq-01", CAMERA)
@@ -38,12 +38,12 @@ def test_frames(folder: Path) -> None:
     assert sequence.groundtruth.T_wc[:, :3, 3].tolist() == [[0, 2, 3], [1, 2, 3]]
 
 
-def test_without_poses_and_with_a_broken_one(folder: Path) -> None:
+def test_missing_and_damaged_poses_give_no_ground_truth(folder: Path) -> None:
     (folder / "frame-000000.pose.txt").write_text("no pose")
     with pytest.warns(GroundTruthWarning):
         sequence = load_sequence(str(folder))
     assert isinstance(sequence, StoredSequence) and sequence.groundtruth is None
-    assert str(sequence.groundtruth_error).startswith(f"{folder / 'frame-000000.pose.txt'}: is no matrix")
+    assert str(sequence.groundtruth_error).startswith(f"{folder / 'frame-000000.pose.txt'}: is not a 3x3 or 4x4 matrix")
     for path in folder.glob("*.pose.txt"):
         path.unlink()
     assert load_sequence(str(folder)).groundtruth is None

@@ -1,4 +1,4 @@
-"""Folders in TUM layout, everything that can be wrong with them, and where sequences are looked for."""
+"""Folders in TUM layout, errors in them, and the search for sequences."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from PIL import Image
 from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
 from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.images import read_colour, read_depth
-from v3d_torch.datasets.names import download_url
+from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -25,8 +25,8 @@ CAMERA_YAML = f"fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: {WIDTH}\nheight: {H
 
 
 @pytest.fixture(autouse=True)
-def own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No test looks into, or writes to, the user's own data and cache."""
+def isolated_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep all tests away from the user's own data and cache."""
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("V3D_DATA", raising=False)
 
@@ -41,7 +41,7 @@ def depth_of(seed: int) -> np.ndarray:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three pairs of small images; the depth stamps are 5 ms later, and there is one more depth image."""
+    """Three pairs of small images with depth 5 ms later, and a fourth depth image."""
     root = tmp_path / "sequence"
     for name in ("rgb", "depth"):
         (root / name).mkdir(parents=True)
@@ -55,7 +55,7 @@ def folder(tmp_path: Path) -> Path:
     return root
 
 
-def test_frames(folder: Path) -> None:
+def test_tum_frames_match_files(folder: Path) -> None:
     sequence = load_sequence(str(folder))
     assert isinstance(sequence, RGBDSequence)
     assert (sequence.name, len(sequence), sequence.groundtruth) == ("sequence", 3, None)
@@ -71,7 +71,7 @@ def test_frames(folder: Path) -> None:
         np.testing.assert_allclose(frame.depth[0].numpy(), depth_of(i) / 1000.0, rtol=1e-6)
 
 
-def test_convention_depth_is_metres_and_zero_and_the_most_are_none(folder: Path) -> None:
+def test_convention_depth_is_in_metres_and_zero_or_saturated_is_missing(folder: Path) -> None:
     units = np.array([[0, 1, 5000, 65535]], dtype=np.uint16)
     Image.fromarray(units).save(folder / "depth.png")
     assert read_depth(folder / "depth.png", 5000).tolist() == [[pytest.approx([0.0, 0.0002, 1.0, 0.0])]]
@@ -85,7 +85,7 @@ def test_convention_images_are_rgb(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "P", "RGBA", "LA", "1", "CMYK", "L jpeg"])
-def test_colour_of_every_kind_equals_pillow(tmp_path: Path, mode: str) -> None:
+def test_decoded_colour_of_every_mode_equals_pillow(tmp_path: Path, mode: str) -> None:
     path = tmp_path / ("a.jpg" if mode in ("CMYK", "L jpeg") else "a.png")
     Image.fromarray(colour_of(0)).convert(mode.split()[0]).save(path)
     assert np.array_equal(read_colour(path).permute(1, 2, 0).numpy(), np.asarray(Image.open(path).convert("RGB")))
@@ -101,7 +101,7 @@ def test_images_of_a_real_sequence_equal_opencv(v3d_data: Path) -> None:
 
 
 @pytest.mark.parametrize("swapped", [False, True], ids=["colour first", "depth first"])
-def test_associations_in_either_order(folder: Path, swapped: bool) -> None:
+def test_associations_are_read_in_either_order(folder: Path, swapped: bool) -> None:
     sides = [[f"{10 + i}.0 rgb/{i}.png", f"{10 + i}.5 depth/{i}.png"] for i in (2, 0)]
     lines = [" ".join(reversed(pair) if swapped else pair) for pair in sides]
     (folder / "associations.txt").write_text("\n".join(lines))
@@ -110,46 +110,50 @@ def test_associations_in_either_order(folder: Path, swapped: bool) -> None:
     assert np.array_equal(sequence[1].image.permute(1, 2, 0).numpy(), colour_of(2))
 
 
-def test_duplicate_and_backward_stamps(folder: Path) -> None:
+def test_duplicate_and_unsorted_stamps_are_sorted_once(folder: Path) -> None:
     (folder / "rgb.txt").write_text("12 rgb/2.png\n10 rgb/0.png\n10 rgb/1.png\n")
     sequence = load_sequence(str(folder))
     assert sequence.stamps.tolist() == [10.0, 12.0]
     assert np.array_equal(sequence[0].image.permute(1, 2, 0).numpy(), colour_of(0))
 
 
-def test_groundtruth_is_read(folder: Path) -> None:
+def test_ground_truth_file_is_read(folder: Path) -> None:
     (folder / "groundtruth.txt").write_text("# truth\n10 1 2 3 0 0 0 1\n11 4 5 6 0 0 1 0\n")
     groundtruth = load_sequence(str(folder)).groundtruth
     assert groundtruth is not None
     assert groundtruth.T_wc[:, :3, 3].tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_index_behind_the_end(folder: Path) -> None:
+def test_index_out_of_range_raises_index_error(folder: Path) -> None:
     with pytest.raises(IndexError, match="has 3 frames"):
         load_sequence(str(folder))[3]
 
 
-def test_frames_have_numbers(folder: Path) -> None:
+def test_frame_index_must_be_an_integer(folder: Path) -> None:
     sequence = load_sequence(str(folder))
     frame = sequence[np.int64(1)]
     assert (frame.index, type(frame.index)) == (1, int)
     for wrong in (slice(0, 2), "1", 1.0, None):
-        with pytest.raises(InputError, match=r"by their numbers, and not by .*; take several with itertools\.islice"):
+        with pytest.raises(
+            InputError, match=r"a frame index must be an integer, got .*; read several frames with itertools\.islice"
+        ):
             sequence[wrong]
 
 
-def test_a_camera_of_another_kind(folder: Path) -> None:
+def test_camera_of_unsupported_type_is_rejected(folder: Path) -> None:
     for wrong, kind in ((np.eye(3), "ndarray"), ({"fx": 500}, "dict")):
-        with pytest.raises(InputError, match=f"^the camera is a {kind}; give a PinholeCamera, a preset's name or a"):
+        with pytest.raises(
+            InputError, match=f"^camera is a {kind}; pass a PinholeCamera, the name of a preset or a file"
+        ):
             load_sequence(str(folder), camera=wrong)
 
 
 def camera_after(change: Callable[[Path], object], folder: Path, **arguments: str) -> PinholeCamera:
     change(folder)
-    return tum.TUMSequence(folder, **arguments).camera  # whatever the size of its images
+    return tum.TUMSequence(folder, **arguments).camera  # opened directly: load_sequence also checks the image size
 
 
-def test_camera_comes_from_the_best_source(folder: Path) -> None:
+def test_camera_is_chosen_by_priority(folder: Path) -> None:
     own = load_camera(folder / "camera.yaml")
     assert camera_after(lambda f: (f / "K.txt").write_text("1 2 3 4 5000 640 480"), folder) == own
     assert camera_after(lambda f: None, folder, camera="tum_fr2") == load_camera("tum_fr2")
@@ -159,7 +163,7 @@ def test_camera_comes_from_the_best_source(folder: Path) -> None:
     for name, preset in [("rgbd_dataset_freiburg2_desk", "tum_fr2"), ("my_fr1_copy", "tum_fr1")]:
         folder = folder.rename(folder.with_name(name))
         assert tum.TUMSequence(folder).camera == load_camera(preset)
-    with pytest.raises(InputError, match=r"says nothing about its camera.*--camera"):
+    with pytest.raises(InputError, match=r"has no camera parameters.*--camera"):
         load_sequence(str(folder.rename(folder.with_name("unknown"))))
 
 
@@ -186,70 +190,70 @@ def swap_lists(folder: Path) -> None:
         (lambda f: (f / "depth.txt").unlink(), "has no depth.txt"),
         (lambda f: (f / "rgb.txt").write_text("# nothing\n"), "rgb.txt: lists no images"),
         (lambda f: (f / "associations.txt").write_text(""), "associations.txt: lists no images"),
-        (lambda f: (f / "rgb.txt").write_text("10 rgb/0.png\nnow rgb/1.png"), "line 2 has 'now' where a stamp"),
-        (lambda f: (f / "rgb.txt").write_text("nan rgb/1.png"), "line 1 has 'nan' where a stamp"),
-        (lambda f: (f / "rgb.txt").write_text("rgb/1.png"), "line 1 is 'rgb/1.png' where a stamp and a file"),
+        (lambda f: (f / "rgb.txt").write_text("10 rgb/0.png\nnow rgb/1.png"), "line 2 has 'now', expected a timestamp"),
+        (lambda f: (f / "rgb.txt").write_text("nan rgb/1.png"), "line 1 has 'nan', expected a timestamp"),
+        (lambda f: (f / "rgb.txt").write_text("rgb/1.png"), "line 1 is 'rgb/1.png', expected a timestamp and a file"),
         (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe1\x000"), "not a text file"),
-        (lambda f: (f / "associations.txt").write_text("10 rgb/0.png depth/0.png"), "stamp, file, stamp, file"),
-        (lambda f: (f / "depth.txt").write_text("10.5 depth/0.png"), "no stamp in rgb.txt lies within 0.02 s"),
-        (lambda f: (f / "rgb" / "0.png").unlink(), "rgb/0.png: is listed but not there .1 such"),
+        (lambda f: (f / "associations.txt").write_text("10 rgb/0.png depth/0.png"), "timestamp, file, timestamp, file"),
+        (lambda f: (f / "depth.txt").write_text("10.5 depth/0.png"), "no timestamp in rgb.txt is within 0.02 s"),
+        (lambda f: (f / "rgb" / "0.png").unlink(), "rgb/0.png: is listed but does not exist .1 missing"),
         (lambda f: truncate(f / "rgb" / "0.png"), "rgb/0.png: is truncated"),
         (lambda f: truncate(f / "depth" / "0.png"), "depth/0.png: is truncated"),
-        (lambda f: (f / "depth" / "0.png").write_bytes(b""), "depth/0.png: is (no image|truncated)"),
+        (lambda f: (f / "depth" / "0.png").write_bytes(b""), "depth/0.png: is (not a PNG|truncated)"),
         (as_jpeg, "rgb/0.jpg: is truncated"),
         (
             lambda f: Image.fromarray(depth_of(0).astype(np.uint8)).save(f / "depth" / "0.png"),
-            "depth/0.png: is 8-bit, a depth image has 16 bits",
+            "depth/0.png: is an 8-bit image, depth needs 16 bits",
         ),
-        (swap_lists, "depth image where colour belongs; are colour and depth swapped"),
-        (lambda f: Image.fromarray(colour_of(0)).save(f / "depth" / "0.png"), "colour image where depth belongs"),
+        (swap_lists, "depth image, expected a colour image; check that colour and depth are not swapped"),
+        (lambda f: Image.fromarray(colour_of(0)).save(f / "depth" / "0.png"), "colour image, expected a depth image"),
         (
             lambda f: Image.new("RGB", (8, 8)).save(f / "rgb" / "0.png"),
-            "depth/0.png: has 32x24 pixels, its colour image 8x8",
+            "depth/0.png: has 32x24 pixels, but its colour image has 8x8",
         ),
         (lambda f: Image.new("I;16", (9, 8)).save(f / "depth" / "0.png"), "depth/0.png: has 9x8 pixels"),
     ],
 )
-def test_what_can_be_wrong_is_one_sentence(folder: Path, damage: Callable[[Path], object], message: str) -> None:
+def test_damaged_tum_folder_is_rejected(folder: Path, damage: Callable[[Path], object], message: str) -> None:
     damage(folder)
     with pytest.raises(InputError, match=message) as caught:
         load_sequence(str(folder))[0]
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_broken_ground_truth_costs_no_frame(folder: Path) -> None:
+def test_damaged_ground_truth_gives_a_warning_and_all_frames(folder: Path) -> None:
     (folder / "groundtruth.txt").write_text("a b c")
-    with pytest.warns(GroundTruthWarning, match="line 1 is 'a b c'.*no true poses") as told:
+    with pytest.warns(GroundTruthWarning, match="line 1 is 'a b c'.*continuing without ground truth") as caught:
         sequence = load_sequence(str(folder))
-    assert [Path(warning.filename) for warning in told] == [Path(__file__)]  # at the line that asked for it
+    assert [Path(warning.filename) for warning in caught] == [Path(__file__)]  # the caller's line
     assert len(list(sequence)) == len(sequence) and sequence.groundtruth is None
     assert isinstance(sequence, tum.TUMSequence)
     assert str(sequence.groundtruth_error).startswith(f"{folder / 'groundtruth.txt'}: line 1 is 'a b c'")
 
 
-def test_the_folder_around_sequences_is_answered_with_one_of_them(folder: Path) -> None:
-    message = rf"^{folder.parent}: is no sequence itself but holds 1, such as {folder.name}; give {folder}$"
+def test_error_for_folder_of_sequences_suggests_one_of_them(folder: Path) -> None:
+    message = rf"^{folder.parent}: is not a sequence but contains 1, such as {folder.name}; pass {folder}$"
     with pytest.raises(InputError, match=message):
         load_sequence(str(folder.parent))
 
 
-def test_a_file_is_no_sequence(folder: Path) -> None:
-    with pytest.raises(InputError, match="is a file"):
+def test_file_or_missing_folder_is_not_a_tum_sequence(folder: Path) -> None:
+    with pytest.raises(InputError, match="is not a folder"):
         tum.TUMSequence(folder / "rgb.txt")
-    with pytest.raises(InputError, match="is not there"):
+    with pytest.raises(InputError, match="does not exist"):
         tum.TUMSequence(folder / "nowhere")
 
 
-# Where sequences are
+# Search for sequences
 
 
-@pytest.mark.parametrize("called", [WALKING_XYZ, "fr3_walking_xyz", "freiburg3_walking_xyz", "fr3_w_xyz"])
-def test_found_by_name_in_root_environment_and_cache(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, called: str
+@pytest.mark.parametrize("folder_name", [WALKING_XYZ, "fr3_walking_xyz", "freiburg3_walking_xyz", "fr3_w_xyz"])
+def test_sequence_is_found_by_name_in_root_environment_and_cache(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder_name: str
 ) -> None:
     root = tmp_path / "cache"
     root.mkdir()
-    folder.rename(root / called)
+    folder.rename(root / folder_name)
     assert load_sequence("fr3/w/xyz").name == "fr3/w/xyz"
     data = root.rename(tmp_path / "data")
     assert len(load_sequence("fr3/w/xyz", data_root=data, download=False)) == 3
@@ -257,28 +261,28 @@ def test_found_by_name_in_root_environment_and_cache(
     assert len(load_sequence("fr3/walking_xyz", download=False)) == 3
 
 
-def test_any_folder_in_the_root_by_its_name(folder: Path) -> None:
+def test_any_folder_in_data_root_is_found_by_its_name(folder: Path) -> None:
     assert load_sequence("sequence", data_root=folder.parent).name == "sequence"
 
 
-def test_the_demo_is_made_in_the_cache(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[Path] = []
+def test_demo_is_rendered_to_the_cache(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    caches: list[Path] = []
 
     def ensure(cache: Path, progress: object) -> Path:
-        asked.append(cache)
+        caches.append(cache)
         return folder
 
     monkeypatch.setattr("v3d_torch.datasets.demo.ensure_demo", ensure)
     assert load_sequence("demo").name == "demo"
-    assert asked == [tmp_path / "cache"]
+    assert caches == [tmp_path / "cache"]
 
 
-def test_unknown_name_offers_the_nearest() -> None:
-    with pytest.raises(InputError, match=r"fr3/w/xzy: is neither .* did you mean fr3/w/xyz or"):
+def test_unknown_name_suggests_similar_ones() -> None:
+    with pytest.raises(InputError, match=r"fr3/w/xzy: is not a file, .* did you mean fr3/w/xyz or"):
         load_sequence("fr3/w/xzy")
 
 
-def test_without_network_the_error_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_download_explains_manual_download(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(url: str, *_: object, **__: object) -> None:
         raise DownloadError(f"{url}: cannot be reached")
 
@@ -286,17 +290,19 @@ def test_without_network_the_error_says_what_to_do(tmp_path: Path, monkeypatch: 
     with pytest.raises(DownloadError) as caught:
         load_sequence("fr3/w/xyz", data_root=tmp_path / "data")
     for part in (
-        "fr3/w/xyz is not in",
+        "fr3/w/xyz: is not in",
         download_url(WALKING_XYZ),
-        f"the folder {WALKING_XYZ} into {tmp_path / 'data'}",
+        f"the folder {WALKING_XYZ} to {tmp_path / 'data'}",
     ):
         assert part in str(caught.value)
-    with pytest.raises(InputError, match=f"get {download_url(WALKING_XYZ)} by hand"):
+    with pytest.raises(InputError, match=f"download {download_url(WALKING_XYZ)}, unpack it"):
         load_sequence("fr3/w/xyz", download=False)
 
 
 @pytest.mark.parametrize("given_root", [True, False], ids=["into data_root", "into the cache"])
-def test_downloads_once(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given_root: bool) -> None:
+def test_sequence_is_downloaded_once(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given_root: bool
+) -> None:
     shared = tmp_path / "shared"
     shared.mkdir()
     monkeypatch.setenv("V3D_DATA", str(shared))
@@ -319,7 +325,7 @@ def test_downloads_once(folder: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(shared.iterdir()) == []
 
 
-def test_a_broken_archive_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_archive_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def serve(url: str, target: Path, **_: object) -> Path:
         target.write_bytes(b"no archive")
         return target
@@ -334,7 +340,7 @@ def test_a_broken_archive_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     ("name", "frames", "poses"),
     [("fr1_rpy", 694, 2742), ("walkers_desk", 200, 200), ("crowd_rpy", 180, 180), ("walkers_room", 160, 160)],
 )
-def test_real_sequences(v3d_data: Path, name: str, frames: int, poses: int) -> None:
+def test_real_sequence_has_all_frames_and_poses(v3d_data: Path, name: str, frames: int, poses: int) -> None:
     sequence = load_sequence(name, data_root=v3d_data)
     assert len(sequence) == frames
     assert sequence.groundtruth is not None
@@ -345,7 +351,7 @@ def test_real_sequences(v3d_data: Path, name: str, frames: int, poses: int) -> N
     assert 0.3 < float(frame.depth[frame.depth > 0].median()) < 6
 
 
-def test_the_lists_of_fr1_rpy_pair_as_its_associations(v3d_data: Path, tmp_path: Path) -> None:
+def test_lists_of_fr1_rpy_give_the_pairs_of_its_associations(v3d_data: Path, tmp_path: Path) -> None:
     source, copy = v3d_data / "fr1_rpy", tmp_path / "fr1_rpy"
     copy.mkdir()
     for name in ("rgb", "depth", "rgb.txt", "depth.txt"):

@@ -1,4 +1,4 @@
-"""Trajectory files against evo's reader and writer."""
+"""Trajectory files in TUM format, compared with evo's reader and writer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write(folder: Path, text: str) -> Path:
 
 
 def test_convention_camera_to_world_scalar_last(tmp_path: Path) -> None:
-    """A camera at (1, 2, 3), turned by a quarter about world z, sees along its x axis what lies along world y."""
+    """The x axis of a camera at (1, 2, 3), rotated by 90 degrees about world z, is the world y axis."""
     trajectory = read_trajectory(write(tmp_path, f"7.5 1 2 3 0 0 {0.5**0.5} {0.5**0.5}\n"))
     assert trajectory.stamps.tolist() == [7.5]
     p_w = trajectory.T_wc[0] @ torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
@@ -42,7 +42,7 @@ def test_convention_camera_to_world_scalar_last(tmp_path: Path) -> None:
 
 
 @given(seed=st.integers(0, 10_000), poses=st.integers(1, 20))
-def test_round_trip(seed: int, poses: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_written_trajectory_is_read_back(seed: int, poses: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("round") / "trajectory.txt"
     trajectory = random_trajectory(poses, seed)
     write_trajectory(path, trajectory)
@@ -51,7 +51,7 @@ def test_round_trip(seed: int, poses: int, tmp_path_factory: pytest.TempPathFact
     assert torch.allclose(back.T_wc, trajectory.T_wc, rtol=0, atol=5e-9)
 
 
-def test_evo_reads_what_is_written(tmp_path: Path) -> None:
+def test_evo_reads_written_trajectory(tmp_path: Path) -> None:
     trajectory = random_trajectory(50, seed=1)
     write_trajectory(tmp_path / "trajectory.txt", trajectory)
     theirs = file_interface.read_tum_trajectory_file(tmp_path / "trajectory.txt")
@@ -59,7 +59,7 @@ def test_evo_reads_what_is_written(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.stack(theirs.poses_se3), trajectory.T_wc.numpy(), rtol=0, atol=5e-9)
 
 
-def test_what_evo_writes_is_read(tmp_path: Path) -> None:
+def test_trajectory_written_by_evo_is_read(tmp_path: Path) -> None:
     trajectory = random_trajectory(50, seed=2)
     theirs = PoseTrajectory3D(poses_se3=list(trajectory.T_wc.numpy()), timestamps=trajectory.stamps.numpy())
     file_interface.write_tum_trajectory_file(tmp_path / "evo.txt", theirs)
@@ -67,8 +67,8 @@ def test_what_evo_writes_is_read(tmp_path: Path) -> None:
     assert torch.allclose(back.T_wc, trajectory.T_wc, rtol=0, atol=1e-12)
 
 
-def test_layout_of_a_line(tmp_path: Path) -> None:
-    """Six decimals, then nine; no negative zeros."""
+def test_line_has_fixed_decimals_without_negative_zeros(tmp_path: Path) -> None:
+    """Six decimals for the timestamp, nine for the other columns."""
     T_wc = torch.eye(4, dtype=torch.float64).repeat(1, 1, 1)
     T_wc[0, 0, 3] = -1e-12
     write_trajectory(
@@ -79,12 +79,12 @@ def test_layout_of_a_line(tmp_path: Path) -> None:
 
 
 def test_convention_quaternions_are_written_with_qw_positive(tmp_path: Path) -> None:
-    """q and -q are one rotation: of the two always the same is written."""
+    """q and -q are the same rotation; the written one is unique."""
     write_trajectory(tmp_path / "trajectory.txt", random_trajectory(200, seed=3))
     assert np.loadtxt(tmp_path / "trajectory.txt")[:, 7].min() >= 0
 
 
-def test_comments_blank_lines_and_line_endings(tmp_path: Path) -> None:
+def test_comments_blank_lines_commas_and_line_ends_are_accepted(tmp_path: Path) -> None:
     text = "\ufeff# stamp tx ty tz\r\n\r\n  # more\r\n1.0 1 0 0 0 0 0 2\r\n2.0\t2,0,0,0,0,0,1 \r\n"
     trajectory = read_trajectory(write(tmp_path, text))
     assert trajectory.stamps.tolist() == [1.0, 2.0]
@@ -92,7 +92,7 @@ def test_comments_blank_lines_and_line_endings(tmp_path: Path) -> None:
     assert torch.equal(trajectory.T_wc[0, :3, :3], torch.eye(3, dtype=torch.float64))  # the quaternion had length 2
 
 
-def test_stamps_come_out_increasing_and_the_first_of_equal_ones_counts(tmp_path: Path) -> None:
+def test_poses_are_sorted_and_first_of_equal_stamps_is_kept(tmp_path: Path) -> None:
     lines = [f"{stamp} {x} 0 0 0 0 0 1" for stamp, x in ((3, 30), (1, 10), (2, 20), (1, 11), (3, 31))]
     trajectory = read_trajectory(write(tmp_path, "\n".join(lines)))
     assert trajectory.stamps.tolist() == [1, 2, 3]
@@ -103,46 +103,46 @@ GOOD = "# header\n1 0 0 0 0 0 0 1\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
-        ("", "no pose"),
-        ("# only a comment\n\n", "no pose"),
+        ("", "contains no poses"),
+        ("# only a comment\n\n", "contains no poses"),
         (GOOD + "2 0 0 0 0 0 0\n", "line 3"),
         (GOOD + "2 0 0 0 0 0 0 1 9\n", "line 3"),
         (GOOD + "2 0 0 zero 0 0 0 1\n", "line 3"),
         (GOOD + "\n2 0 0 nan 0 0 0 1\n", "line 4 has a number that is not finite"),
         (GOOD + "inf 0 0 0 0 0 0 1\n", "line 3 has a number that is not finite"),
-        (GOOD + "2 0 0 0 0 0 0 0\n3 0 0 0 0 0 0 0\n", "line 3 has a quaternion of zeros"),
+        (GOOD + "2 0 0 0 0 0 0 0\n3 0 0 0 0 0 0 0\n", "line 3 has a quaternion that is zero"),
         ("timestamp,tx,ty,tz,qx,qy,qz,qw\n" + GOOD, "line 1"),
     ],
 )
-def test_wrong_files_are_refused_by_name_and_line(tmp_path: Path, text: str, said: str) -> None:
+def test_invalid_trajectory_file_is_rejected_with_path_and_line(tmp_path: Path, text: str, message: str) -> None:
     path = write(tmp_path, text)
     with pytest.raises(InputError) as error:
         read_trajectory(path)
-    assert str(path) in str(error.value) and said in str(error.value)
+    assert str(path) in str(error.value) and message in str(error.value)
 
 
-def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+def test_missing_file_folder_and_binary_file_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "picture.png").write_bytes(b"\x89PNG\xff\xfe\x00")
     for path in (tmp_path / "none.txt", tmp_path, tmp_path / "picture.png"):
         with pytest.raises(InputError, match=path.name):
             read_trajectory(path)
 
 
-def test_no_poses_make_an_empty_file(tmp_path: Path) -> None:
+def test_empty_trajectory_is_written_as_empty_file(tmp_path: Path) -> None:
     nothing = Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
     write_trajectory(tmp_path / "trajectory.txt", nothing)
     assert (tmp_path / "trajectory.txt").read_bytes() == b""
 
 
-def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+def test_unwritable_file_raises_output_error(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").mkdir()
     with pytest.raises(OutputError, match=r"trajectory\.txt"):
         write_trajectory(tmp_path / "trajectory.txt", random_trajectory(2, seed=0))
 
 
-def test_arrays_and_lists_make_a_trajectory(tmp_path: Path) -> None:
+def test_trajectory_is_created_from_arrays_and_lists(tmp_path: Path) -> None:
     expected = random_trajectory(3, 0)
     stamps, T_wc = expected.stamps.numpy(), expected.T_wc.numpy()
     write_trajectory(tmp_path / "expected.txt", expected)
@@ -168,18 +168,18 @@ def test_arrays_and_lists_make_a_trajectory(tmp_path: Path) -> None:
         (None, None, "stamps of a trajectory"),
     ],
 )
-def test_what_is_no_trajectory_is_said(stamps: object, T_wc: object, message: str) -> None:
+def test_invalid_trajectory_arguments_are_rejected(stamps: object, T_wc: object, message: str) -> None:
     with pytest.raises(InputError, match=f"^{message}"):
         Trajectory(stamps, T_wc)
 
 
-def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
+def test_invalid_trajectory_is_not_written(tmp_path: Path) -> None:
     path, good = tmp_path / "out.txt", random_trajectory(2, 0)
-    with pytest.raises(InputError, match=r"takes a path and a Trajectory, this is a .*Path"):
+    with pytest.raises(InputError, match=r"^write_trajectory: expected a Trajectory, got .*Path"):
         write_trajectory(good, path)
     for wrong in (torch.nan, torch.inf, 0.0):
         T_wc = good.T_wc.clone()
         T_wc[1] *= wrong
-        with pytest.raises(InputError, match=r"out\.txt: pose 1 has no rotation or no finite position"):
+        with pytest.raises(InputError, match=r"out\.txt: pose 1 is not a valid rigid transform"):
             write_trajectory(path, Trajectory(good.stamps, T_wc))
     assert not path.exists()

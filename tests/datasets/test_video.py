@@ -110,5 +110,5 @@ def test_depth_is_missing(folder: Path) -> None:
 
 def test_other_size_than_the_cameras(folder: Path) -> None:
     (folder / "camera.yaml").write_text(CAMERA_YAML.replace("width: 32", "width: 64"))
-    with pytest.raises(InputError, match=r"rgb\.avi: has 32x24 pixels, the camera 64x24"):
+    with pytest.raises(InputError, match=r"rgb\.avi: has 32x24 pixels, but the camera has 64x24"):
         load_sequence(str(folder))[0]

@@ -20,7 +20,7 @@ from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.encodings import COLOURS
 from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour, read_depth
 from v3d_torch.datasets.lists import read_associations, read_image_list
-from v3d_torch.datasets.matrices import read_matrix, read_poses
+from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -104,7 +104,7 @@ PARSERS: dict[str, Parser] = {
     "compressed colour message": lambda content, folder: colour_from(compressed(content), "topic"),
     "compressed depth message": lambda content, folder: depth_from(compressed(content), 1000.0, "topic"),
     "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
-    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
+    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_transforms),
     "ROS 1 bag": from_file("take.bag", frames_of),
     "ROS 2 bag": from_file("take.db3", frames_of),
     "mcap": from_file("take.mcap", frames_of),

@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import v3d_torch
-from v3d_torch.datasets.names import SEQUENCES, canonical_name, download_url
+from v3d_torch.datasets.sequence_names import SEQUENCES, canonical_name, download_url
 from v3d_torch.io import safe_yaml as plain_yaml
 from v3d_torch.segmentation.weights import REGISTRY
 

@@ -16,7 +16,7 @@ from v3d_torch.batch.runner import complete, refuse_resume_of_nothing
 from v3d_torch.config.loading import FULL
 from v3d_torch.datasets import PAPER_SEQUENCES, RGBDSequence, short_name
 from v3d_torch.datasets.locate import data_folder, stored_path
-from v3d_torch.datasets.names import download_url
+from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.evaluation import ablation
 from v3d_torch.evaluation.outcome import Outcome

@@ -14,7 +14,7 @@ from v3d_torch.batch.processes import Processes
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_cluster import RayCluster
 from v3d_torch.batch.records import BatchRecord
-from v3d_torch.datasets.patterns import matching_sequences
+from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.runs.console import interrupts_between_frames, open_sequences, progress_bars, wide_console
 from v3d_torch.runs.result_folder import make_result_folder

@@ -1,4 +1,4 @@
-"""Sources of RGB-D frames; `open_source` opens any of them by name, `load_sequence` those that have an end."""
+"""Sources of RGB-D frames. `open_source` opens any source by name, `load_sequence` opens stored sequences only."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
 from v3d_torch.datasets.cameras import CameraChoice, load_camera
-from v3d_torch.datasets.locate import sequence_path
-from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
+from v3d_torch.datasets.locate import find_or_download
 from v3d_torch.datasets.realsense import open_camera
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, canonical_name, short_name
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
@@ -32,8 +32,8 @@ __all__ = [
     "short_name",
 ]
 
-_RATES = (0.01, 1e4)
-"""Between which frames a second lie."""
+_MIN_FPS, _MAX_FPS = 0.01, 1e4
+"""Accepted range of frame rates, Hz: far wider than that of any camera, it excludes 0, negative values and NaN."""
 
 
 def open_source(
@@ -45,79 +45,34 @@ def open_source(
     download: bool = True,
     progress: Progress | None = None,
 ) -> RGBDStream:
-    """Open whatever gives RGB-D frames.
+    """Open a source of RGB-D frames: a stored sequence, a recording or a live camera.
 
     Args:
-        name: ``demo``; ``realsense:`` for a camera that is plugged in, ``realsense:SERIAL`` for one of several; a
-            folder or file of any kind in `v3d_torch.datasets.sources.SOURCES`; a name such as ``fr3/w/xyz``
-            (`canonical_name` lists the ways to write it); or the name of something in ``data_root``.
-        data_root: where sequences are kept; None takes ``$V3D_DATA``, then the cache (``$V3D_CACHE``).
-        camera: a camera, a preset's name or a camera file; None takes the source's own.
-        options: what the source does not say itself.
-        download: whether a TUM sequence that is not here is downloaded.
-        progress: told of the bytes of a download, or of the frames of the demo as they are made.
+        name: One of
+
+            - ``demo``: the rendered demo sequence;
+            - ``realsense:`` or ``realsense:SERIAL``: a connected camera;
+            - the path of a folder or file of any kind in `v3d_torch.datasets.sources.SOURCES`;
+            - the name of a sequence in ``data_root``;
+            - the name of a TUM sequence, such as ``fr3/w/xyz`` (see `canonical_name` for other spellings).
+        data_root: Folder with the user's sequences; None for ``$V3D_DATA``, or else the cache (``$V3D_CACHE``).
+        camera: A camera, the name of a preset or a camera file; None for the camera of the source.
+        options: Options for sources that do not describe themselves completely; None for the defaults.
+        download: True if a TUM sequence that is not on disk is downloaded.
+        progress: Callback for the number of downloaded bytes, or of rendered frames of the demo; None for no reports.
 
     Returns:
-        An `RGBDSequence` where the frames are stored, else a stream.
+        An `RGBDSequence` if the frames are stored, or else a stream.
 
     Raises:
-        InputError: there is no such source, or something in it is wrong.
-        DownloadError: it is not here and cannot be downloaded.
+        InputError: If there is no such source or its content is invalid.
+        DownloadError: If the sequence is not on disk and cannot be downloaded.
 
     Warns:
-        GroundTruthWarning: its ground truth cannot be read; ``groundtruth`` is None then.
+        GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
     """
-    source = _checked(name, data_root, camera, options or SourceOptions(), download, progress)
-    _warn_of_truth(source)
-    return source
-
-
-def _checked(
-    name: StrPath,
-    data_root: StrPath | None,
-    camera: CameraChoice,
-    options: SourceOptions,
-    download: bool,
-    progress: Progress | None,
-) -> RGBDStream:
-    if options.fps is not None and not _RATES[0] <= options.fps <= _RATES[1]:
-        raise InputError(f"--fps {options.fps:g}: give frames a second, between {_RATES[0]:g} and {_RATES[1]:g}")
-    try:
-        root = None if data_root is None else expand_user(data_root)
-        return _open(os.fspath(name), root, camera, options, download, progress)
-    except OSError as error:  # a folder that may not be looked into, a name that is too long
-        raise InputError(
-            f"{error.filename or name}: cannot be read ({error.strerror}); check its name and who may read it"
-        ) from error
-
-
-def _warn_of_truth(source: RGBDStream) -> None:
-    """Say where the caller of this module stands that a source came without its ground truth."""
-    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
-        warnings.warn(f"{source.groundtruth_error}; there are no true poses", GroundTruthWarning, stacklevel=3)
-
-
-def _open(
-    name: str,
-    data_root: Path | None,
-    camera: CameraChoice,
-    options: SourceOptions,
-    download: bool,
-    progress: Progress | None,
-) -> RGBDStream:
-    if name == "demo":
-        # The demo is rendered on first use, with libraries that nothing else here needs.
-        from v3d_torch.datasets.demo import ensure_demo
-
-        reject_options(name, "the demo", options, frozenset())
-        return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
-    if name.partition(":")[0] == "realsense":
-        reject_options(name, "a live camera", options, frozenset({"fps"}))
-        return open_camera(name, camera, fps=options.fps)
-    path = sequence_path(name, data_root=data_root, download=download, progress=progress)
-    source = open_path(path, camera, options, progress)
-    if isinstance(source, StoredSequence):
-        source.check_first_frame(path)
+    source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
+    _warn_about_groundtruth(source)
     return source
 
 
@@ -130,20 +85,81 @@ def load_sequence(
     download: bool = True,
     progress: Progress | None = None,
 ) -> RGBDSequence:
-    """Open a sequence, whose frames have a number and may be read in any order; see `open_source`.
+    """Open a sequence with a fixed number of frames that can be indexed.
+
+    Args:
+        name: Name or path of the sequence, see `open_source`.
+        data_root: Folder with the user's sequences; None for ``$V3D_DATA``, or else the cache (``$V3D_CACHE``).
+        camera: A camera, the name of a preset or a camera file; None for the camera of the sequence.
+        options: Options for sequences that do not describe themselves completely; None for the defaults.
+        download: True if a TUM sequence that is not on disk is downloaded.
+        progress: Callback for the number of downloaded bytes, or of rendered frames of the demo; None for no reports.
+
+    Returns:
+        The sequence; ``sequence[i]`` is an `RGBDFrame`.
 
     Raises:
-        InputError: as `open_source`, or the source is a stream.
-        DownloadError: as `open_source`.
+        InputError: If there is no such sequence, its content is invalid, or the source is a stream.
+        DownloadError: If the sequence is not on disk and cannot be downloaded.
 
     Warns:
-        GroundTruthWarning: as `open_source`.
+        GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
     """
-    source = _checked(name, data_root, camera, options or SourceOptions(), download, progress)
+    source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
     if not isinstance(source, RGBDSequence):
         raise InputError(
-            f"{name}: is a stream, whose frames come only once and in order; save it first with"
+            f"{name}: is a stream, whose frames cannot be indexed; record it first with"
             f" python -m v3d_torch record --seq {name} --out FOLDER"
         )
-    _warn_of_truth(source)
+    _warn_about_groundtruth(source)
     return source
+
+
+def _open(
+    name: StrPath,
+    data_root: StrPath | None,
+    camera: CameraChoice,
+    options: SourceOptions,
+    download: bool,
+    progress: Progress | None,
+) -> RGBDStream:
+    """Check the arguments and open a source; file system errors become `InputError`."""
+    if options.fps is not None and not _MIN_FPS <= options.fps <= _MAX_FPS:
+        raise InputError(f"--fps {options.fps:g}: is out of range; pass between {_MIN_FPS:g} and {_MAX_FPS:g} Hz")
+    try:
+        root = None if data_root is None else expand_user(data_root)
+        return _open_by_name(os.fspath(name), root, camera, options, download, progress)
+    except OSError as error:  # such as a folder without permission or a name that is too long
+        raise InputError(
+            f"{error.filename or name}: cannot be read ({error.strerror}); check its name and permissions"
+        ) from error
+
+
+def _open_by_name(
+    name: str,
+    data_root: Path | None,
+    camera: CameraChoice,
+    options: SourceOptions,
+    download: bool,
+    progress: Progress | None,
+) -> RGBDStream:
+    if name == "demo":
+        # Imported here because rendering the demo needs libraries that other sources do not need.
+        from v3d_torch.datasets.demo import ensure_demo
+
+        reject_options(name, "the demo", options, frozenset())
+        return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
+    if name.partition(":")[0] == "realsense":
+        reject_options(name, "a live camera", options, frozenset({"fps"}))
+        return open_camera(name, camera, fps=options.fps)
+    path = find_or_download(name, data_root=data_root, download=download, progress=progress)
+    source = open_path(path, camera, options, progress)
+    if isinstance(source, StoredSequence):
+        source.check_first_frame(path)
+    return source
+
+
+def _warn_about_groundtruth(source: RGBDStream) -> None:
+    """Warn, at the line that called this module, if the ground truth of a source could not be read."""
+    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
+        warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)

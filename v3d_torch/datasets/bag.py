@@ -14,9 +14,8 @@ from torch import Tensor
 from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.bag_topics import Topics, choose_topics
 from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
-from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.lists import MAX_DIFFERENCE
-from v3d_torch.datasets.stored import StoredSequence
+from v3d_torch.datasets.stored import Cursor, StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.download import Progress

@@ -1,4 +1,4 @@
-"""What every source of frames offers."""
+"""Interfaces of the sources of RGB-D frames."""
 
 from __future__ import annotations
 
@@ -13,47 +13,51 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 @runtime_checkable
 class RGBDStream(Protocol):
-    """RGB-D frames in order of time, taken one after the other. It may have no end, as a live camera."""
+    """Any source of RGB-D frames in temporal order. A live camera is a stream without an end."""
 
     @property
     def name(self) -> str:
-        """Short name, as it stands in tables."""
+        """Short name, used in tables and messages."""
 
     @property
     def camera(self) -> PinholeCamera:
-        """The camera that took all frames."""
+        """Camera of all frames."""
 
     @property
     def groundtruth(self) -> Trajectory | None:
-        """Measured camera poses, at their own stamps; None where there are none."""
+        """Measured camera poses at their own timestamps; None if unavailable."""
 
     def __iter__(self) -> Iterator[RGBDFrame]:
-        """All frames; stamps are strictly increasing, indices count from 0."""
+        """Iterate over the frames. Timestamps are strictly increasing, indices count from 0."""
 
 
 @runtime_checkable
 class RGBDSequence(RGBDStream, Protocol):
-    """RGB-D frames of a known number, in any order."""
+    """A source with a fixed number of RGB-D frames that can be indexed."""
 
     @property
     def stamps(self) -> Tensor:
-        """Time of each colour image, seconds, float64, shape :math:`(N,)`, strictly increasing."""
+        """Timestamps of the colour images, seconds, float64, shape :math:`(N,)`, strictly increasing."""
 
     def __len__(self) -> int:
         """Number of frames."""
 
     def __getitem__(self, index: int) -> RGBDFrame:
-        """Frame ``index``, from 0; raises IndexError behind the last."""
+        """Return frame ``index``, counted from 0.
+
+        Raises:
+            IndexError: If the sequence has no such frame.
+        """
 
 
 @runtime_checkable
 class HasMotionMasks(Protocol):
-    """A sequence that has true masks besides its frames. They are for evaluation: the system must not see them."""
+    """A sequence with ground-truth motion masks. They are for evaluation only, the system never reads them."""
 
     def motion_mask(self, index: int) -> Tensor | None:
-        """What moves in frame ``index``; None where it is not known.
+        """Return the ground-truth motion mask of frame ``index``; None if unknown.
 
         Returns:
-            0 for what is static, 1-254 for a person who moves, the same in all frames, 255 for what belongs to
-            neither (a person who is only about there), uint8, shape :math:`(H, W)`.
+            Mask, uint8, shape :math:`(H, W)`. 0 is static, 1-254 is the id of a moving person (the same in all
+            frames), 255 is excluded from evaluation (a person whose outline is only approximate).
         """

@@ -1,4 +1,4 @@
-"""Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): TUM layout, its own camera, ground truth of the markers."""
+"""Bonn RGB-D Dynamic (Palazzolo et al., IROS 2019): TUM layout with its own camera and marker-based ground truth."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from v3d_torch.types import Trajectory
 CAMERA = PinholeCamera(
     542.822841, 542.576870, 315.593520, 237.756098, distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0)
 )
-"""As published with the dataset; depth in 5000 units per metre."""
+"""Published camera of the dataset, with 5000 depth units per metre."""
 
 _T_ROS = torch.tensor(
     [[-1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]],
     dtype=torch.float64,
 )
-"""The motion capture's axes to those of the markers' frame, as published."""
+"""Published change of axes between the motion capture frame and the marker frame."""
 
 _T_MARKERS_CAMERA = torch.tensor(
     [
@@ -32,22 +32,23 @@ _T_MARKERS_CAMERA = torch.tensor(
     ],
     dtype=torch.float64,
 )
-"""Camera to the markers that motion capture follows, as published: a rotation times 1.0593, which is meant for models
-built from the depth images; a pose takes the rotation and the offset."""
+"""Published transform from the camera to the tracked markers. It is a rotation times 1.0593, and the scale is meant for
+models built from the depth images. Poses use only the rotation and the translation."""
 
 
 class BonnSequence(TUMSequence):
-    """Frames of a folder such as ``rgbd_bonn_crowd``, with the poses of its camera as ground truth.
+    """Sequence of Bonn RGB-D Dynamic, such as ``rgbd_bonn_crowd``, with ground truth of its camera.
 
-    ``groundtruth.txt`` holds the poses of the markers, 2 cm from the camera: the published transforms take them to the
-    camera. Most published tables compare with the file as it stands, as ``python -m v3d_torch evaluate`` does.
+    ``groundtruth.txt`` contains the poses of the markers, 2 cm from the camera. The published transforms convert them
+    to camera poses. Most published results are computed from the unconverted file, and so are those of
+    ``python -m v3d_torch evaluate``.
 
     Args:
-        folder: the sequence's folder.
-        camera: the user's choice; None takes `CAMERA`, unless the folder holds a camera of its own.
+        folder: Folder of the sequence.
+        camera: Camera chosen by the user; None for the camera file in the folder, or else `CAMERA`.
 
     Raises:
-        InputError: as `TUMSequence`.
+        InputError: If the folder or one of its files is missing or invalid.
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
@@ -57,14 +58,14 @@ class BonnSequence(TUMSequence):
 
 
 def is_bonn(path: Path) -> bool:
-    """Whether a folder is called as the dataset's are and holds what they hold.
+    """Check whether a folder is an original sequence of the dataset, by its name and content.
 
-    One with a ``camera.yaml`` was written by ``python -m v3d_torch record``, its poses are the camera's.
+    A folder with ``camera.yaml`` was written by ``python -m v3d_torch record``: its ground truth is already converted.
     """
     return "rgbd_bonn" in path.resolve().name.lower() and is_tum(path) and not (path / "camera.yaml").is_file()
 
 
 def camera_poses(markers: Trajectory) -> Trajectory:
-    """Poses of the markers to poses of the camera: ``T_ROS^-1 T T_ROS T_markers_camera``, without the scale."""
+    """Convert poses of the markers to poses of the camera: ``T_ROS^-1 T T_ROS T_markers_camera``, without the scale."""
     T_markers_camera = rigid(_T_MARKERS_CAMERA)
     return Trajectory(markers.stamps, _T_ROS.T @ markers.T_wc @ _T_ROS @ T_markers_camera)

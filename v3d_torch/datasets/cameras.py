@@ -1,4 +1,4 @@
-"""Cameras from files: ``camera.yaml``, ``K.txt`` and the presets that come with the package."""
+"""Camera parameters from files (``camera.yaml``, ``K.txt``) and presets of the package."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _PRESETS = resources.files("v3d_torch.datasets") / "presets"
 PRESETS: tuple[str, ...] = tuple(
     sorted(entry.name.removesuffix(".yaml") for entry in _PRESETS.iterdir() if entry.name.endswith(".yaml"))
 )
-"""Names that `load_camera` knows without a file."""
+"""Names of the cameras that come with the package, see `load_camera`."""
 
 CameraChoice = str | Path | PinholeCamera | None
-"""What a user may say of the camera: itself, a preset's name or a file; None leaves it to the sequence."""
+"""Camera chosen by the user: a camera, the name of a preset or a file; None for the camera of the sequence."""
 
 _Focal = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 _Pixels = Annotated[int, Field(gt=0, le=1 << 13)]
@@ -34,7 +34,7 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _CameraFile(BaseModel):
-    """The keys of a ``camera.yaml``; no default for what would be wrong without a word on another camera."""
+    """Fields of a ``camera.yaml``. Fields whose default would be silently wrong for other cameras are required."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -50,53 +50,55 @@ class _CameraFile(BaseModel):
 
 
 def load_camera(path_or_name: str | Path) -> PinholeCamera:
-    """Read a camera.
+    """Load a camera from a file or a preset.
 
     Args:
-        path_or_name: a preset (`PRESETS`, such as ``tum_fr3``), or a file. ``*.yaml`` holds the fields of
-            `PinholeCamera` by name. Any other file holds numbers: ``fx fy cx cy depth_scale width height``, or a 3x3
-            camera matrix, then of 640x480 pixels and 5000 depth units per metre.
+        path_or_name: Name of a preset (`PRESETS`, such as ``tum_fr3``), or path of a file. A YAML file contains the
+            fields of `PinholeCamera` by name. Any other file contains numbers: ``fx fy cx cy depth_scale width
+            height``, or a 3x3 camera matrix of images with 640x480 pixels and 5000 depth units per metre.
 
     Raises:
-        InputError: neither a preset nor a file, or a file without a camera in it.
+        InputError: If there is no such preset or file, or the file does not contain a valid camera.
     """
     if str(path_or_name) in PRESETS:
         return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name))
     path = expand_user(path_or_name)
     if not path.is_file():
-        near = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
-        hint = f"did you mean {near[0]}?" if near else f"the presets are {', '.join(PRESETS)}"
-        raise InputError(f"{path_or_name}: is neither a camera file nor a preset; {hint}")
+        similar = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
+        hint = f"did you mean {similar[0]}?" if similar else f"the presets are {', '.join(PRESETS)}"
+        raise InputError(f"{path_or_name}: is not a camera file or preset; {hint}")
     text = read_text(path, "a camera is a YAML file or a K.txt")
     return _from_yaml(text, str(path)) if path.suffix in (".yaml", ".yml") else _from_numbers(text, str(path))
 
 
 def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera | None = None) -> PinholeCamera:
-    """The camera that the user names, else the one of the sequence's folder.
+    """Choose the camera of a sequence.
+
+    The first one available is used: the user's choice, ``camera.yaml`` or ``K.txt`` in the folder, the published camera
+    of the dataset, the TUM preset for the folder's name (``freiburg1``, ``fr2``, ...).
 
     Args:
-        camera: the user's choice.
-        folder: its ``camera.yaml`` or ``K.txt`` is taken, else what its dataset says, else the TUM camera that its
-            name tells.
-        published: the camera of the dataset that the folder belongs to, where all its sequences have one.
+        camera: Camera chosen by the user.
+        folder: Folder of the sequence.
+        published: Camera of the dataset, if all its sequences have the same.
 
     Raises:
-        InputError: nothing says what the camera is, or what says it is wrong.
+        InputError: If there is no camera, or the camera is invalid.
     """
     if isinstance(camera, PinholeCamera):
         return camera
-    chosen = _named_or_own(camera, folder, published)
-    if not _is_seen_through(chosen):
+    chosen = _find_camera(camera, folder, published)
+    if not _is_invertible_at_corners(chosen):
         raise InputError(
-            f"{camera or folder}: no point is seen at some corner of the image with the lens {chosen.distortion};"
-            " correct the camera's distortion (k1, k2, p1, p2, k3) or leave it out"
+            f"{camera or folder}: the distortion {chosen.distortion} cannot be inverted at the image corners; correct"
+            " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         )
     return chosen
 
 
-def _named_or_own(camera: str | Path | None, folder: Path, published: PinholeCamera | None) -> PinholeCamera:
+def _find_camera(camera: str | Path | None, folder: Path, published: PinholeCamera | None) -> PinholeCamera:
     if camera is not None and not isinstance(camera, str | os.PathLike):
-        raise InputError(f"the camera is a {type(camera).__name__}; give a PinholeCamera, a preset's name or a file")
+        raise InputError(f"camera is a {type(camera).__name__}; pass a PinholeCamera, the name of a preset or a file")
     if camera is not None:
         return load_camera(camera)
     for name in ("camera.yaml", "K.txt"):
@@ -107,8 +109,8 @@ def _named_or_own(camera: str | Path | None, folder: Path, published: PinholeCam
     if match := re.search(r"(?:freiburg|fr)_?([123])(?!\d)", folder.resolve().name.lower()):
         return load_camera(f"tum_fr{match[1]}")
     raise InputError(
-        f"{folder}: says nothing about its camera; put a camera.yaml there (fx, fy, cx, cy, width, height, depth_scale)"
-        f" or give --camera with a file or one of {', '.join(PRESETS)}"
+        f"{folder}: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height, depth_scale) or pass"
+        f" --camera with a file or one of {', '.join(PRESETS)}"
     )
 
 
@@ -118,7 +120,9 @@ def _from_yaml(text: str, source: str) -> PinholeCamera:
     except ValueError as error:
         raise InputError(f"{source}: is not valid YAML ({error}); repair it") from error
     if not isinstance(tree, dict):
-        raise InputError(f"{source}: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys")
+        raise InputError(
+            f"{source}: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"
+        )
     return checked_camera(tree, source)
 
 
@@ -128,7 +132,7 @@ def _from_numbers(text: str, source: str) -> PinholeCamera:
         numbers = [float(word) for word in words]
     except ValueError as error:
         raise InputError(
-            f"{source}: holds something that is not a number ({error}); write fx fy cx cy depth_scale width height"
+            f"{source}: contains a value that is not a number ({error}); write fx fy cx cy depth_scale width height"
         ) from error
     if len(numbers) == 7:
         fx, fy, cx, cy, depth_scale, width, height = numbers
@@ -137,18 +141,22 @@ def _from_numbers(text: str, source: str) -> PinholeCamera:
         depth_scale, width, height = PinholeCamera.depth_scale, PinholeCamera.width, PinholeCamera.height
     else:
         raise InputError(
-            f"{source}: holds {len(numbers)} numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            f"{source}: contains {len(numbers)} numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         )
     fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, "depth_scale": depth_scale}
     return checked_camera(fields, source)
 
 
 def checked_camera(fields: dict[Any, Any], source: str) -> PinholeCamera:
-    """A camera from the fields of `PinholeCamera`, read from ``source``.
+    """Create a camera from unchecked fields.
+
+    Args:
+        fields: Fields of `PinholeCamera` by name.
+        source: Origin of the fields, for messages.
 
     Raises:
-        InputError: a field is missing, unknown or no such number.
+        InputError: If a field is missing, unknown or out of range.
     """
     try:
         camera = PinholeCamera(**_CameraFile.model_validate(fields).model_dump())
@@ -156,15 +164,15 @@ def checked_camera(fields: dict[Any, Any], source: str) -> PinholeCamera:
         raise InputError(f"{source}: {first_error(error)}; correct the camera") from error
     if not (-camera.width <= camera.cx <= 2 * camera.width and -camera.height <= camera.cy <= 2 * camera.height):
         raise InputError(
-            f"{source}: the centre ({camera.cx:g}, {camera.cy:g}) lies far outside of {camera.width}x{camera.height}"
-            " pixels; correct cx and cy, or the size"
+            f"{source}: the principal point ({camera.cx:g}, {camera.cy:g}) is far outside the"
+            f" {camera.width}x{camera.height} image; correct cx and cy, or width and height"
         )
     return camera
 
 
-def _is_seen_through(camera: PinholeCamera) -> bool:
-    """Whether the lens can be undone at the corners: its polynomial bends rays back where its numbers are wrong."""
+def _is_invertible_at_corners(camera: PinholeCamera) -> bool:
+    """Check whether undistortion inverts distortion at the image corners. Invalid coefficients fold rays back there."""
     right, bottom = camera.width - 1.0, camera.height - 1.0
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
-    again = camera.distort(camera.undistort(corners))
-    return bool(((again - corners).abs() < 1).all())
+    projected = camera.distort(camera.undistort(corners))
+    return bool(((projected - corners).abs() < 1).all())

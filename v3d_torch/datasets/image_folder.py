@@ -1,4 +1,4 @@
-"""A folder of colour and depth images without lists: order, pairs and times come from the files' names."""
+"""Folders of colour and depth images without lists: pairs and timestamps come from the file names."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import re
 from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.file_names import images_in, stamp
+from v3d_torch.datasets.image_files import list_images, stamp_in_name
 from v3d_torch.datasets.lists import MAX_DIFFERENCE, ImagePair
-from v3d_torch.datasets.paired import PairedImages
+from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import associate
 
@@ -17,84 +17,95 @@ _DEPTH = re.compile(r"depth", re.IGNORECASE)
 
 
 class ImageFolder(PairedImages):
-    """Frames of a folder with two folders of images (``rgb`` and ``depth``), or with both kinds side by side.
+    """Sequence of images in two subfolders (``rgb`` and ``depth``), or of both kinds side by side in one folder.
 
-    Images belong together whose names are near times, else whose names differ in the kind only (``7_rgb.jpg`` and
-    ``7_depth.png``), else those at equal places in the order of names.
+    Colour and depth images are paired by the first rule that applies:
+
+    1. by nearest timestamps, if all names are timestamps;
+    2. by names that differ only in the kind, such as ``7_rgb.jpg`` and ``7_depth.png``;
+    3. by their position in the sorted lists of names.
 
     Args:
-        folder: the sequence's folder.
-        camera: the user's choice; None takes the ``camera.yaml`` or ``K.txt`` of the folder.
-        fps: frames a second; None takes the times from the names.
+        folder: Folder of the sequence.
+        camera: Camera chosen by the user; None for the ``camera.yaml`` or ``K.txt`` in the folder.
+        fps: Frame rate, Hz; None to read the timestamps from the file names.
 
     Raises:
-        InputError: there are no pairs, no times or no camera.
+        InputError: If there are no pairs, no timestamps or no camera.
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None, *, fps: float | None = None) -> None:
-        colour, depth = _kinds(folder)
-        files = _matched(folder, colour, depth)
+        colour, depth = _find_images(folder)
+        files = _pair(folder, colour, depth)
         stamps = _stamps(folder, [path for path, _ in files], fps)
         pairs = [
-            ImagePair(seconds, *(str(path.relative_to(folder)) for path in both))
-            for seconds, both in sorted(dict(zip(stamps, files, strict=True)).items())
+            ImagePair(stamp, *(str(path.relative_to(folder)) for path in pair))
+            for stamp, pair in sorted(dict(zip(stamps, files, strict=True)).items())
         ]
         super().__init__(folder, pairs, choose_camera(camera, folder))
 
 
 def is_image_folder(path: Path) -> bool:
-    """Whether a folder holds images of both kinds."""
-    return path.is_dir() and all(_kinds(path))
+    """Check whether a folder contains colour and depth images."""
+    return path.is_dir() and all(_find_images(path))
 
 
-def _kinds(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Colour and depth images, from a folder for each or from their own names."""
-    folders = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and images_in(entry)]
+def _find_images(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Find the colour and depth images, by the names of their subfolders or by their own names."""
+    folders = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and list_images(entry)]
     depth = [entry for entry in folders if _DEPTH.search(entry.name)]
     colour = [entry for entry in folders if entry not in depth and _COLOUR.search(entry.name)]
     if len(colour) > 1 or len(depth) > 1:
         names = ", ".join(entry.name for entry in colour + depth)
-        raise InputError(f"{folder}: holds {names}; leave one folder of colour and one of depth images there")
+        raise InputError(
+            f"{folder}: has too many image folders ({names}); keep one folder of colour and one of depth images"
+        )
     if colour and depth:
-        return images_in(colour[0]), images_in(depth[0])
-    images = images_in(folder)
+        return list_images(colour[0]), list_images(depth[0])
+    images = list_images(folder)
     depths = [path for path in images if _DEPTH.search(path.stem)]
     return [path for path in images if path not in depths and _COLOUR.search(path.stem)], depths
 
 
-def _matched(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Path, Path]]:
-    times, depth_times = _by_time(colour), _by_time(depth)
-    if len(times) == len(colour) and len(depth_times) == len(depth):
-        indices = associate(list(times), list(depth_times), MAX_DIFFERENCE)
+def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Path, Path]]:
+    """Pair colour and depth images by the rules of `ImageFolder`."""
+    colour_by_stamp, depth_by_stamp = _by_stamp(colour), _by_stamp(depth)
+    if len(colour_by_stamp) == len(colour) and len(depth_by_stamp) == len(depth):
+        indices = associate(list(colour_by_stamp), list(depth_by_stamp), MAX_DIFFERENCE)
         if not indices:
             raise InputError(
-                f"{folder}: no colour image is within {MAX_DIFFERENCE} s of a depth image; do they belong together?"
+                f"{folder}: no colour image is within {MAX_DIFFERENCE} s of a depth image; check that both belong to"
+                " the same recording"
             )
-        return [(list(times.values())[i], list(depth_times.values())[j]) for i, j in indices]
-    partners = {_without_kind(path): path for path in depth}
-    if named := [(path, partners[_without_kind(path)]) for path in colour if _without_kind(path) in partners]:
-        return named
+        return [(list(colour_by_stamp.values())[i], list(depth_by_stamp.values())[j]) for i, j in indices]
+    depth_by_name = {_without_kind(path): path for path in depth}
+    if pairs := [(path, depth_by_name[_without_kind(path)]) for path in colour if _without_kind(path) in depth_by_name]:
+        return pairs
     if len(colour) != len(depth):
         raise InputError(
-            f"{folder}: has {len(colour)} colour and {len(depth)} depth images whose names have nothing in common;"
-            " name those that belong together alike"
+            f"{folder}: has {len(colour)} colour and {len(depth)} depth images that cannot be paired by name;"
+            " give the two images of a frame the same name"
         )
     return list(zip(colour, depth, strict=True))
 
 
 def _without_kind(path: Path) -> str:
+    """File name without the words that denote colour or depth."""
     return _DEPTH.sub("", _COLOUR.sub("", path.stem)).strip("-_. ")
 
 
-def _by_time(paths: list[Path]) -> dict[float, Path]:
-    """Those whose names are times, in order of time."""
-    return dict(sorted((seconds, path) for path in paths if (seconds := stamp(path)) is not None))
+def _by_stamp(paths: list[Path]) -> dict[float, Path]:
+    """Images whose names are timestamps, in temporal order."""
+    return dict(sorted((stamp, path) for path in paths if (stamp := stamp_in_name(path)) is not None))
 
 
 def _stamps(folder: Path, colour: list[Path], fps: float | None) -> list[float]:
+    """Timestamps of the colour images, seconds, from the frame rate or the file names."""
     if fps is not None:
         return [index / fps for index in range(len(colour))]
-    stamps = [seconds for path in colour if (seconds := stamp(path)) is not None]
+    stamps = [stamp for path in colour if (stamp := stamp_in_name(path)) is not None]
     if len(stamps) != len(colour):
-        raise InputError(f"{folder}: names such as {colour[0].name} are no times; give the frames a second with --fps")
+        raise InputError(
+            f"{folder}: file names such as {colour[0].name} are not timestamps; pass the frame rate with --fps"
+        )
     return stamps

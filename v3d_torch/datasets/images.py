@@ -1,4 +1,4 @@
-"""Colour and depth images from files to tensors."""
+"""Decoding of colour and depth images to tensors."""
 
 from __future__ import annotations
 
@@ -17,143 +17,179 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
-"""What Pillow is let to try: some of its other formats start programs."""
+"""Formats that Pillow is allowed to open: some of its other decoders start external programs."""
 
 _MAX_PIXELS = 1 << 26
-"""Most pixels of an image: ten times those of any such camera. A file of a megabyte may claim gigabytes."""
+"""Maximum number of pixels of an image, far more than any RGB-D camera has. The header of a small file can claim an
+image that fills the memory."""
 
-SATURATED = np.iinfo(np.uint16).max
-"""Units of depth that no camera measures; some write it for no measurement."""
+SATURATED_DEPTH = np.iinfo(np.uint16).max
+"""Largest 16-bit depth value. No camera measures this value, and some datasets write it for missing depth."""
 
 
 def read_colour(path: Path) -> Tensor:
-    """Decode a colour image: PNG or JPEG, and rarer formats by Pillow.
+    """Read a colour image. PNG and JPEG are decoded by kornia_rs, other formats by Pillow.
 
     Returns:
-        uint8 RGB, shape :math:`(3, H, W)`; a view of rows of pixels (channels last in memory), so that a library that
-        wants :math:`(H, W, 3)` gets it without a copy.
+        RGB image, uint8, shape :math:`(3, H, W)`. The memory is channels-last, so that :math:`(H, W, 3)` is available
+        without a copy.
 
     Raises:
-        InputError: the file is missing, truncated, not an image, too large, or a 16-bit (depth) image.
+        InputError: If the file is missing, truncated, not an image, too large, or a 16-bit (depth) image.
     """
     image_size(path)
     try:
-        # Both refuse a truncated file, which kornia_rs.io.read_image and OpenCV fill up with grey.
+        # These two decoders reject truncated files; kornia_rs.io.read_image and OpenCV fill them up with grey.
         if path.suffix.lower() in (".jpg", ".jpeg"):
             pixels = io.read_image_jpegturbo(str(path))
         else:
             pixels = io.read_image_png_u8(str(path), "rgb")
-    except Exception:  # kornia_rs raises bare Exception for every cause: Pillow reads the rarer kinds or says why not
-        pixels = _uncommon_colour(path, path)
+    except Exception:  # kornia_rs raises bare Exception for every cause: Pillow decodes the image or names the cause
+        pixels = _decode_colour_with_pillow(path, path)
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
 def read_depth(path: Path, depth_scale: float) -> Tensor:
-    """Decode a depth image with 16 bits a pixel.
+    """Read a 16-bit depth image. PNG is decoded by kornia_rs, other formats by Pillow.
 
     Args:
-        path: PNG, or a rarer format with 16 bits by Pillow.
-        depth_scale: units per metre.
+        path: Path of the image.
+        depth_scale: Depth units per metre.
 
     Returns:
-        Metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+        Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
 
     Raises:
-        InputError: the file is missing, truncated, not an image, too large, or has not 16 bits.
+        InputError: If the file is missing, truncated, not an image, too large, or not 16-bit.
     """
     image_size(path)
     try:
         units = io.read_image_png_u16(str(path), "mono")[..., 0]
     except Exception:
-        units = _uncommon_depth(path, path)
+        units = _decode_depth_with_pillow(path, path)
     return metres(units, depth_scale)
 
 
 def decode_colour(content: bytes, source: object) -> Tensor:
-    """As `read_colour`, from the bytes of a file that ``source`` holds, for messages."""
-    _header(BytesIO(content), source)
+    """Decode a colour image from the bytes of an image file, like `read_colour`.
+
+    Args:
+        content: Bytes of the image file.
+        source: Origin of the bytes, for messages.
+
+    Returns:
+        RGB image, uint8, shape :math:`(3, H, W)`.
+
+    Raises:
+        InputError: See `read_colour`.
+    """
+    _read_header(BytesIO(content), source)
     try:
         pixels = io.decode_image_jpegturbo(content, "rgb")
-    except Exception:  # as above; a PNG ends here
-        pixels = _uncommon_colour(BytesIO(content), source)
+    except Exception:  # every format but JPEG
+        pixels = _decode_colour_with_pillow(BytesIO(content), source)
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
 def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
-    """Units of depth, shape (H, W), from the bytes of a file with 16 bits a pixel, raising as `read_depth`."""
-    return _uncommon_depth(BytesIO(content), source)
+    """Decode a 16-bit depth image from the bytes of an image file.
+
+    Args:
+        content: Bytes of the image file.
+        source: Origin of the bytes, for messages.
+
+    Returns:
+        Depth in units of the file, shape (H, W).
+
+    Raises:
+        InputError: See `read_depth`.
+    """
+    return _decode_depth_with_pillow(BytesIO(content), source)
 
 
 def metres(units: NDArray[Any], depth_scale: float) -> Tensor:
-    """Units of depth (H, W), of which there are ``depth_scale`` in a metre, as `RGBDFrame` holds depth."""
-    nothing = torch.from_numpy((units < 0) | (units >= SATURATED))
-    return torch.from_numpy(units.astype(np.float32)).div_(depth_scale).masked_fill_(nothing, 0.0).unsqueeze(0)
+    """Convert depth units to metres.
+
+    Args:
+        units: Depth in units of the file, shape (H, W); negative and saturated values are no measurements.
+        depth_scale: Depth units per metre.
+
+    Returns:
+        Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+    """
+    invalid = torch.from_numpy((units < 0) | (units >= SATURATED_DEPTH))
+    return torch.from_numpy(units.astype(np.float32)).div_(depth_scale).masked_fill_(invalid, 0.0).unsqueeze(0)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image, from its header.
+    """Width and height of an image, read from its header.
 
     Raises:
-        InputError: the file is missing, no image, or too large to be one of a camera.
+        InputError: If the file is missing, not an image, or too large.
     """
-    with _header(path, path) as image:
+    with _read_header(path, path) as image:
         return image.size
 
 
 def is_depth(path: Path) -> bool:
-    """Whether a file is a single-channel image of more than 8 bits; reads its header only."""
+    """Check whether a file is a single-channel image of more than 8 bits. Only the header is read."""
     try:
-        with _header(path, path) as image:
+        with _read_header(path, path) as image:
             return image.mode.startswith("I")
     except InputError:
         return False
 
 
-def _uncommon_colour(file: Path | BytesIO, source: object) -> NDArray[np.uint8]:
-    with _open(file, source) as image:
+def _decode_colour_with_pillow(file: Path | BytesIO, source: object) -> NDArray[np.uint8]:
+    with _decode(file, source) as image:
         if image.mode.startswith("I"):
-            raise InputError(f"{source}: is a 16-bit depth image where colour belongs; are colour and depth swapped?")
+            raise InputError(
+                f"{source}: is a 16-bit depth image, expected a colour image; check that colour and depth are not"
+                " swapped"
+            )
         return np.array(image.convert("RGB"))
 
 
-def _uncommon_depth(file: Path | BytesIO, source: object) -> NDArray[np.generic]:
-    with _open(file, source) as image:
+def _decode_depth_with_pillow(file: Path | BytesIO, source: object) -> NDArray[np.generic]:
+    with _decode(file, source) as image:
         if image.mode.startswith("I"):
             return np.array(image)
         if image.mode == "F":
-            raise InputError(f"{source}: has floating-point numbers; export the depth again, as PNG of 16 bits")
+            raise InputError(f"{source}: is a floating-point image; export depth as 16-bit PNG")
         if image.mode in ("L", "1", "P"):
-            raise InputError(f"{source}: is 8-bit, a depth image has 16 bits; export the depth again, unscaled")
-        raise InputError(f"{source}: is a colour image where depth belongs; are colour and depth swapped?")
+            raise InputError(f"{source}: is an 8-bit image, depth needs 16 bits; export depth again without rescaling")
+        raise InputError(
+            f"{source}: is a colour image, expected a depth image; check that colour and depth are not swapped"
+        )
 
 
-def _open(file: Path | BytesIO, source: object) -> Image.Image:
-    """The whole image, decoded."""
-    image = _header(file, source)
+def _decode(file: Path | BytesIO, source: object) -> Image.Image:
+    """Decode a whole image."""
+    image = _read_header(file, source)
     try:
         image.load()
-    except Exception as error:  # a decoder that meets nonsense raises whatever that leads to
+    except Exception as error:  # on invalid data a decoder can raise any exception
         image.close()
-        raise InputError(f"{source}: is truncated or broken; copy or download it again") from error
+        raise InputError(f"{source}: is truncated or damaged; copy or download it again") from error
     return image
 
 
-def _header(file: Path | BytesIO, source: object) -> Image.Image:
-    """The image, of which only the header has been read."""
+def _read_header(file: Path | BytesIO, source: object) -> Image.Image:
+    """Open an image and read its header only."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(file, formats=_FORMATS)
     except FileNotFoundError as error:
-        raise InputError(f"{source}: is listed but not there; copy the sequence again, whole") from error
+        raise InputError(f"{source}: is listed but does not exist; copy the whole sequence again") from error
     except UnidentifiedImageError as error:
-        raise InputError(f"{source}: is no image, or none of PNG, JPEG or TIFF; copy or export it again") from error
+        raise InputError(f"{source}: is not a PNG, JPEG or TIFF image; copy or export it again") from error
     except Image.DecompressionBombError as error:
         raise _too_large(source) from error
-    except Exception as error:  # of the file system, or of a decoder that meets nonsense
+    except Exception as error:  # an error of the file system, or any exception of a decoder on invalid data
         if isinstance(error, OSError) and error.errno is not None:
-            raise InputError(f"{source}: cannot be read ({error.strerror}); check who may read it") from error
-        raise InputError(f"{source}: is truncated or broken; copy or download it again") from error
+            raise InputError(f"{source}: cannot be read ({error.strerror}); check its permissions") from error
+        raise InputError(f"{source}: is truncated or damaged; copy or download it again") from error
     if image.width * image.height > _MAX_PIXELS:
         image.close()
         raise _too_large(source)
@@ -161,4 +197,6 @@ def _header(file: Path | BytesIO, source: object) -> Image.Image:
 
 
 def _too_large(source: object) -> InputError:
-    return InputError(f"{source}: claims more than {_MAX_PIXELS >> 20} million pixels; copy or export it again")
+    return InputError(
+        f"{source}: has more than {_MAX_PIXELS >> 20} million pixels according to its header; copy or export it again"
+    )

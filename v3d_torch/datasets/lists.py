@@ -1,4 +1,4 @@
-"""The text files of the TUM layout: lists of stamped images, and pairs of them."""
+"""Image lists of the TUM layout: timestamped files, and association of colour and depth images."""
 
 from __future__ import annotations
 
@@ -18,135 +18,170 @@ from v3d_torch.io.timestamps import associate, parse_timestamp
 
 _T = TypeVar("_T")
 
-_EXPECTED = "a list has lines of a stamp and a file"
+_EXPECTED = "a list has a timestamp and a file name on each line"
 
 _MAX_GAP = 10.0
-"""No camera that can be followed takes an image so rarely, seconds; one at 30 Hz does, by stamps in milliseconds."""
+"""Maximum median time between images, seconds. No trackable sequence has so few images; timestamps in milliseconds at
+30 Hz exceed this limit."""
 
 MAX_DIFFERENCE = 0.02
-"""Colour and depth farther apart than this are no pair, seconds (the benchmark's own choice)."""
+"""Maximum difference between the timestamps of a colour and a depth image of one frame, seconds: the default of the
+TUM benchmark's association tool."""
 
 
 @dataclass(frozen=True)
 class ImagePair:
-    """A colour and a depth image that belong together; files relative to the sequence's folder."""
+    """Colour and depth image file of one frame.
+
+    Attributes:
+        stamp: Timestamp of the colour image, seconds.
+        colour: Path of the colour image, relative to the sequence's folder.
+        depth: Path of the depth image, relative to the sequence's folder.
+        depth_delay: Depth stamp minus colour stamp, seconds.
+    """
 
     stamp: float
     colour: str
     depth: str
-    depth_delay: float = field(default=0.0, kw_only=True)  # of the depth image, seconds after the colour image
+    depth_delay: float = field(default=0.0, kw_only=True)
 
 
 def read_image_list(path: Path) -> list[tuple[float, str]]:
-    """Read lines of ``stamp file``, in order of time.
+    """Read a list with lines of ``stamp file``.
 
-    The file's name is all that follows the stamp, spaces included. Comments, blank lines, a byte order mark and either
-    line ending are allowed; of equal stamps the first counts.
+    The file name is everything after the stamp and can contain spaces. Comments, blank lines, a byte order mark and
+    all line endings are accepted. If a timestamp occurs more than once, the first line is used.
+
+    Args:
+        path: Path of the list.
 
     Returns:
-        (seconds, file), stamps strictly increasing.
+        Pairs of timestamp (seconds) and file name, timestamps strictly increasing.
 
     Raises:
-        InputError: the list cannot be read, is empty, or a line is not a stamp and a file.
+        InputError: If the list cannot be read, is empty, or contains an invalid line.
     """
     entries = []
     for number, line in numbered_lines(path, _EXPECTED):
         match = re.fullmatch(r"([^\s,]+)[\s,]+(.+)", line)
         if match is None:
             raise InputError(
-                f"{path}: line {number} is {line[:80]!r} where a stamp and a file are expected; repair or remove it"
+                f"{path}: line {number} is {line[:80]!r}, expected a timestamp and a file name; correct or remove it"
             )
-        entries.append((_stamp(match[1], path, number), match[2]))
-    return _in_order(entries, path)
+        entries.append((_parse_stamp(match[1], path, number), match[2]))
+    return _sort_unique(entries, path)
 
 
 def read_associations(path: Path) -> list[ImagePair]:
-    """Read lines of ``stamp file stamp file``, in order of the colour stamps.
+    """Read a list with lines of ``stamp file stamp file``.
 
-    Colour may come first or depth: both are in use, and a look at the images of the first line tells.
+    Both orders are in use, colour first and depth first. The image headers of the first line decide between them.
+
+    Args:
+        path: Path of the list, in the sequence's folder.
+
+    Returns:
+        Pairs in the order of the colour timestamps.
 
     Raises:
-        InputError: as `read_image_list`.
+        InputError: If the list cannot be read, is empty, or contains an invalid line.
     """
     rows = []
     for number, line in numbered_lines(path, _EXPECTED):
         words = list(re.finditer(r"[^\s,]+", line))
-        # The first name ends with a suffix and a number follows: names may hold spaces.
-        middle = next((i for i in range(2, len(words) - 1) if _parts_names(words[i - 1][0], words[i][0])), None)
+        # File names can contain spaces: the second stamp is a number that follows a file suffix.
+        middle = next(
+            (i for i in range(2, len(words) - 1) if _is_second_stamp(words[i - 1][0], words[i][0])),
+            None,
+        )
         if middle is None:
             raise InputError(
-                f"{path}: line {number} is {line[:80]!r} where stamp, file, stamp, file are expected; write it so, or"
-                " leave only rgb.txt and depth.txt there"
+                f"{path}: line {number} is {line[:80]!r}, expected timestamp, file, timestamp, file; correct it, or"
+                " remove this list and use rgb.txt and depth.txt"
             )
         first, second = words[0][0], words[middle][0]
         names = (line[words[1].start() : words[middle - 1].end()], line[words[middle + 1].start() :])
-        rows.append((_stamp(first, path, number), names[0], _stamp(second, path, number), names[1]))
+        rows.append((_parse_stamp(first, path, number), names[0], _parse_stamp(second, path, number), names[1]))
     if rows and is_depth(path.parent / rows[0][1]) and not is_depth(path.parent / rows[0][3]):
-        rows = [(stamp, colour, other, depth) for other, depth, stamp, colour in rows]
-    ordered = _in_order(((stamp, (colour, depth, other)) for stamp, colour, other, depth in rows), path)
+        rows = [(stamp, colour, depth_stamp, depth) for depth_stamp, depth, stamp, colour in rows]
+    ordered = _sort_unique(
+        ((stamp, (colour, depth, depth_stamp)) for stamp, colour, depth_stamp, depth in rows),
+        path,
+    )
     return [
-        ImagePair(stamp, colour, depth, depth_delay=_delay(stamp, other)) for stamp, (colour, depth, other) in ordered
+        ImagePair(stamp, colour, depth, depth_delay=_depth_delay(stamp, depth_stamp))
+        for stamp, (colour, depth, depth_stamp) in ordered
     ]
 
 
 def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
-    """Join the images of two lists in a folder one to one by nearest stamps, at most `MAX_DIFFERENCE` apart.
+    """Associate the images of two lists one to one by nearest timestamps, at most 20 ms apart.
+
+    Args:
+        colour: Path of the list of colour images, in the sequence's folder.
+        depth: Path of the list of depth images, in the same folder.
 
     Returns:
-        Pairs with the colour image's stamp.
+        Pairs in the order of the colour timestamps.
 
     Raises:
-        InputError: as `read_image_list`, a list is missing, or there is no pair.
+        InputError: If a list is missing or invalid (see `read_image_list`), or no timestamps match.
     """
     for path in (colour, depth):
         if not path.is_file():
             raise InputError(
-                f"{path.parent}: has no {path.name}; the sequence's images are listed in {colour.name} and {depth.name}"
+                f"{path.parent}: has no {path.name}; list the images of the sequence in {colour.name} and {depth.name}"
             )
     images, depths = read_image_list(colour), read_image_list(depth)
     indices = associate([stamp for stamp, _ in images], [stamp for stamp, _ in depths], MAX_DIFFERENCE)
     if not indices:
         raise InputError(
-            f"{colour.parent}: no stamp in {colour.name} lies within {MAX_DIFFERENCE} s of one in {depth.name};"
-            " do both lists belong to this sequence?"
+            f"{colour.parent}: no timestamp in {colour.name} is within {MAX_DIFFERENCE} s of one in {depth.name};"
+            " check that both lists belong to the same recording"
         )
-    return [ImagePair(*images[i], depths[j][1], depth_delay=_delay(images[i][0], depths[j][0])) for i, j in indices]
+    return [
+        ImagePair(*images[i], depths[j][1], depth_delay=_depth_delay(images[i][0], depths[j][0])) for i, j in indices
+    ]
 
 
-def refuse_other_units(pairs: Sequence[ImagePair], folder: Path) -> None:
-    """Raise InputError where frames lie so far apart that their stamps cannot be seconds."""
+def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
+    """Check that the time between images is plausible for timestamps in seconds.
+
+    Raises:
+        InputError: If the images are so far apart that the timestamps must be in another unit.
+    """
     gap = median(later.stamp - earlier.stamp for earlier, later in pairwise(pairs)) if len(pairs) > 1 else 0.0
     if gap > _MAX_GAP:
         raise InputError(
-            f"{folder}: by their stamps its images lie {gap:g} s apart; stamps are seconds, divide them in the lists if"
-            " they are milli- or nanoseconds"
+            f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps in the"
+            " lists to seconds (they are probably in milliseconds or nanoseconds)"
         )
 
 
-def _parts_names(before: str, word: str) -> bool:
-    """Whether a word is the stamp between two names of files, by it and by the word before."""
-    return re.fullmatch(r"[-+\d.e]+", word) is not None and re.search(r"\.\w+$", before) is not None
+def _is_second_stamp(previous: str, word: str) -> bool:
+    """Check whether a word is the timestamp between two file names."""
+    return re.fullmatch(r"[-+\d.e]+", word) is not None and re.search(r"\.\w+$", previous) is not None
 
 
-def _stamp(word: str, path: Path, number: int) -> float:
+def _parse_stamp(word: str, path: Path, number: int) -> float:
     try:
         stamp = parse_timestamp(word)
     except ValueError:
         stamp = math.nan
     if not math.isfinite(stamp):
         raise InputError(
-            f"{path}: line {number} has {word[:80]!r} where a stamp in seconds is expected; repair or remove the line"
+            f"{path}: line {number} has {word[:80]!r}, expected a timestamp in seconds; correct or remove the line"
         )
     return stamp
 
 
-def _delay(colour: float, depth: float) -> float:
-    """Seconds from one stamp to the other; 0 where they are of different clocks, as no pair lies so far apart."""
+def _depth_delay(colour: float, depth: float) -> float:
+    """Depth stamp minus colour stamp; 0 if the difference is so large that the stamps come from different clocks."""
     return depth - colour if abs(depth - colour) <= MAX_DIFFERENCE else 0.0
 
 
-def _in_order(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[float, _T]]:
-    """Sorted by stamp, the first of equal ones kept."""
+def _sort_unique(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[float, _T]]:
+    """Sort entries by timestamp and keep the first entry of each timestamp."""
     first: dict[float, _T] = {}
     for stamp, value in entries:
         first.setdefault(stamp, value)

@@ -1,4 +1,4 @@
-"""Where a sequence is: given, among the user's data, in the cache, or to be downloaded."""
+"""Search for sequences: the given path, the user's data, the cache, and download as the last resort."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from v3d_torch.datasets.names import canonical_name, download_url, short_name, unknown_name
+from v3d_torch.datasets.sequence_names import canonical_name, download_url, short_name, unknown_name_error
 from v3d_torch.datasets.tum import is_tum
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.io.download import Progress, cache_dir, fetch
@@ -15,36 +15,48 @@ from v3d_torch.io.files import file_lock
 from v3d_torch.io.paths import expand_user
 
 
-def sequence_path(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
-    """The folder or file of a sequence.
+def find_or_download(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
+    """Find the folder or file of a sequence, or download the sequence.
 
-    Looked for in this order: ``name`` as a folder or file; in ``data_root``, else ``$V3D_DATA``; in the cache
-    (`v3d_torch.io.download.cache_dir`). In the latter two a folder may be called by any name of the sequence. Last, a TUM
-    sequence is downloaded into ``data_root`` where it is given, else into the cache; ``$V3D_DATA`` is only read, it may
-    be shared.
+    The search order is: ``name`` as a path; ``data_root``, or else ``$V3D_DATA``; the cache
+    (`v3d_torch.io.download.cache_dir`). In the last two, a folder can have any name of the sequence. A missing TUM
+    sequence is downloaded to ``data_root`` if given, or else to the cache. ``$V3D_DATA`` can be shared and is never
+    written to.
+
+    Args:
+        name: Path or name of the sequence.
+        data_root: Folder with the user's sequences; None for ``$V3D_DATA``.
+        download: True if a missing TUM sequence is downloaded.
+        progress: Callback for the number of bytes downloaded; None for no reports.
+
+    Returns:
+        Path of the folder or file.
 
     Raises:
-        InputError: no such folder or file and no such sequence.
-        DownloadError: the sequence is not here and cannot be downloaded; the message says how to get it by hand.
+        InputError: If there is no such path and no such sequence.
+        DownloadError: If the download fails. The message explains how to download the sequence manually.
     """
     if not name:
-        raise InputError("the name of the sequence is empty; give a name, a folder or a file")
+        raise InputError("the sequence name is empty; pass a name, a folder or a file")
     if (found := stored_path(name, data_root)) is not None:
         return found
-    full_name, search = canonical_name(name), data_folder(data_root)
+    full_name, folder = canonical_name(name), data_folder(data_root)
     if full_name is None:
-        raise unknown_name(name)
-    put = f"by hand, unpack it and put the folder {full_name} into {search}"
+        raise unknown_name_error(name)
+    install = f"unpack it and move the folder {full_name} to {folder}"
     if not download:
-        raise InputError(f"{short_name(full_name)} is not in {search}; get {download_url(full_name)} {put}")
+        raise InputError(f"{short_name(full_name)}: is not in {folder}; download {download_url(full_name)}, {install}")
     try:
         return _download(full_name, data_root or cache_dir(), progress)
     except DownloadError as error:
-        raise DownloadError(f"{short_name(full_name)} is not in {search}: {error}; get that file {put}") from error
+        raise DownloadError(
+            f"{short_name(full_name)}: is not in {folder} and its download failed ({error}); download it manually,"
+            f" {install}"
+        ) from error
 
 
 def stored_path(name: str, data_root: Path | None) -> Path | None:
-    """The folder or file of a sequence that is here, looked for as `sequence_path` does; None where there is none."""
+    """Path of a sequence that is already on disk, with the search order of `find_or_download`; None if not found."""
     if (path := expand_user(name)).exists():
         return path
     found = (_find(root, name, canonical_name(name)) for root in (data_folder(data_root), cache_dir()))
@@ -52,13 +64,13 @@ def stored_path(name: str, data_root: Path | None) -> Path | None:
 
 
 def data_folder(data_root: Path | None) -> Path:
-    """Where sequences are kept: ``data_root`` if given, else ``$V3D_DATA``, else the cache."""
+    """Folder with the user's sequences: ``data_root`` if given, or else ``$V3D_DATA``, or else the cache."""
     shared = os.environ.get("V3D_DATA")
     return data_root or (expand_user(shared) if shared else cache_dir())
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:
-    """What is called so under ``root``, or a folder that another name of the same sequence stands on."""
+    """Find an entry of ``root`` by its name, or a folder by another name of the same TUM sequence."""
     if (root / name).exists():
         return root / name
     if full_name is None or not root.is_dir():
@@ -69,7 +81,8 @@ def _find(root: Path, name: str, full_name: str | None) -> Path | None:
 
 def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
     folder, archive = root / full_name, root / f"{full_name}.tgz"
-    with file_lock(cache_dir() / full_name):  # in the cache: the data may be on a file system without locks
+    # The lock is in the cache, because the file system of the data can be without locks.
+    with file_lock(cache_dir() / full_name):
         if not folder.is_dir():
             fetch(download_url(full_name), archive, progress=progress)
             try:
@@ -77,6 +90,6 @@ def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
             finally:
                 archive.unlink()
             if not is_tum(folder):
-                shutil.rmtree(folder)  # or it would be taken for the sequence from now on
-                raise InputError(f"{archive}: holds no rgb.txt and depth.txt; get the archive from another source")
+                shutil.rmtree(folder)  # otherwise the next search finds this folder
+                raise InputError(f"{archive}: contains no rgb.txt and depth.txt; get the archive from another source")
     return folder

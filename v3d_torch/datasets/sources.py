@@ -1,4 +1,4 @@
-"""The kinds of source, and which of them a path holds."""
+"""Supported kinds of sources, and recognition of the kind of a path."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from v3d_torch.io.download import Progress
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What a user may say of a source that does not say it itself.
+    """Options for sources that do not describe themselves completely.
 
     Args:
-        rgb_topic: of a bag's colour images; None guesses.
-        depth_topic: of its depth images; None guesses.
-        info_topic: of its camera; None guesses.
-        fps: frames a second, of images whose names are no times, or asked of a live camera.
+        rgb_topic: Topic of a bag's colour images; None for automatic selection.
+        depth_topic: Topic of a bag's depth images; None for automatic selection.
+        info_topic: Topic of a bag's camera info; None for automatic selection.
+        fps: Frame rate, Hz: of images without timestamps in their names, of videos, or requested from a live camera;
+            None for the source's own timestamps or the camera's default.
     """
 
     rgb_topic: str | None = None
@@ -44,24 +45,25 @@ class Source:
     """A kind of source.
 
     Args:
-        what: in words, for messages.
-        holds: whether a path is one.
-        open: opens it with the user's camera, the options that it takes, and a bar for what takes long.
-        options: names of `SourceOptions` that mean something to it.
+        description: Description with an article, for messages.
+        matches: Function that checks whether a path is a source of this kind.
+        open: Function that opens a path with the camera chosen by the user, the options and a progress callback.
+        options: Names of the supported fields of `SourceOptions`.
     """
 
-    what: str
-    holds: Callable[[Path], bool]
+    description: str
+    matches: Callable[[Path], bool]
     open: Callable[[Path, CameraChoice, SourceOptions, Progress | None], RGBDStream]
     options: frozenset[str] = frozenset()
+
+
+_TOPICS = frozenset({"rgb_topic", "depth_topic", "info_topic"})
 
 
 def _open_bag(path: Path, camera: CameraChoice, options: SourceOptions, progress: Progress | None) -> RGBDStream:
     topics = {name: value for name, value in asdict(options).items() if name in _TOPICS}
     return BagSequence(path, camera, **topics, progress=progress)
 
-
-_TOPICS = frozenset({"rgb_topic", "depth_topic", "info_topic"})
 
 SOURCES = (
     Source("a RealSense recording", is_recording, lambda path, camera, *_: open_recording(path, camera)),
@@ -71,7 +73,7 @@ SOURCES = (
     Source("a Bonn RGB-D Dynamic sequence", is_bonn, lambda path, camera, *_: BonnSequence(path, camera)),
     Source("a folder in TUM layout", is_tum, lambda path, camera, *_: TUMSequence(path, camera)),
     Source("a 7-Scenes sequence", is_seven_scenes, lambda path, camera, *_: SevenScenesSequence(path, camera)),
-    Source("a folder as ScanNet's", is_scannet, lambda path, camera, *_: ScanNetSequence(path, camera)),
+    Source("a ScanNet export", is_scannet, lambda path, camera, *_: ScanNetSequence(path, camera)),
     Source(
         "a video",
         is_video,
@@ -85,44 +87,62 @@ SOURCES = (
         frozenset({"fps"}),
     ),
 )
-"""In the order in which they are tried: what could be taken for another, less special kind comes before it."""
+"""Supported kinds of sources, in the order of recognition: special kinds come before similar general ones."""
 
-
-_UNPACK = {
-    (".tgz", ".tar", ".tar.gz", ".zip", ".7z", ".rar"): "is an archive; unpack it and give the folder",
-    (".sens",): "is a recording of ScanNet's; export it with ScanNet's SensReader and give that folder",
+_CONVERTIBLE = {
+    (".tgz", ".tar", ".tar.gz", ".zip", ".7z", ".rar"): "is an archive; unpack it and pass the folder",
+    (".sens",): "is a ScanNet recording; export it with ScanNet's SensReader and pass the exported folder",
 }
-"""What is no source yet, by the ends of its name, and what makes one of it."""
+"""Message for each file type that is not supported itself, by suffixes: the user can convert such a file."""
 
 _UNKNOWN = (
-    "is no sequence of a known kind; the README lists them, the simplest is a folder with a folder rgb of colour and a"
-    " folder depth of depth images"
+    "is not a sequence of a supported format; the README lists the formats, the simplest is a folder with colour images"
+    " in a subfolder rgb and depth images in a subfolder depth"
 )
+"""Message for every other path."""
 
 
 def is_source(path: Path) -> bool:
-    """Whether a path holds anything of a known kind; opening it tells whether it is in order."""
-    return any(source.holds(path) for source in SOURCES)
+    """Check whether a path is a source of any supported kind. Opening the source checks its content."""
+    return any(source.matches(path) for source in SOURCES)
 
 
 def open_path(path: Path, camera: CameraChoice, options: SourceOptions, progress: Progress | None) -> RGBDStream:
-    """Open what a path holds.
+    """Open a source from a path.
+
+    Args:
+        path: File or folder of any kind in `SOURCES`.
+        camera: Camera chosen by the user; None for the camera of the source.
+        options: Options of the source.
+        progress: Callback for the progress of slow sources; None for no reports.
 
     Raises:
-        InputError: it holds nothing known, an option means nothing to it, or something in it is wrong.
+        InputError: If the path is not a supported source, does not support an option, or has invalid content.
     """
     for source in SOURCES:
-        if source.holds(path):
-            reject_options(path, source.what, options, source.options)
+        if source.matches(path):
+            reject_options(path, source.description, options, source.options)
             return source.open(path, camera, options, progress)
-    how = next((how for ends, how in _UNPACK.items() if path.name.lower().endswith(ends)), _UNKNOWN)
-    if inside := [entry for entry in sorted(path.glob("*/")) if is_source(entry)]:
-        how = f"is no sequence itself but holds {len(inside)}, such as {inside[0].name}; give {inside[0]}"
-    raise InputError(f"{path}: {how}")
+    message = next((text for suffixes, text in _CONVERTIBLE.items() if path.name.lower().endswith(suffixes)), _UNKNOWN)
+    if sequences := [entry for entry in sorted(path.glob("*/")) if is_source(entry)]:
+        message = f"is not a sequence but contains {len(sequences)}, such as {sequences[0].name}; pass {sequences[0]}"
+    raise InputError(f"{path}: {message}")
 
 
-def reject_options(source: object, what: str, options: SourceOptions, taken: frozenset[str]) -> None:
-    """Raise InputError where an option is set that ``source`` has no use for."""
+def reject_options(source: object, description: str, options: SourceOptions, supported: frozenset[str]) -> None:
+    """Raise an error if an option is set that the source does not support.
+
+    Args:
+        source: Path or name of the source, for messages.
+        description: Description of its kind, for messages.
+        options: Options given by the user.
+        supported: Names of the supported options.
+
+    Raises:
+        InputError: If another option is set.
+    """
     for name, value in asdict(options).items():
-        if value is not None and name not in taken:
-            raise InputError(f"{source}: is {what}, --{name.replace('_', '-')} means nothing to it; leave it out")
+        if value is not None and name not in supported:
+            raise InputError(
+                f"{source}: is {description}, which does not support --{name.replace('_', '-')}; remove this option"
+            )

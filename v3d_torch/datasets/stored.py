@@ -1,10 +1,12 @@
-"""Frames that are kept somewhere and can be read in any order: what all such sequences have in common."""
+"""Sequences of stored frames, which can be read in any order."""
 
 from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,26 +15,30 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
 
-ReadTruth = Callable[[], Trajectory | None]
-"""Reads the ground truth; None where there is none."""
+_T = TypeVar("_T")
 
-_DEPTHS = (0.05, 50.0)
-"""Metres between which an RGB-D camera measures, with room to spare."""
+ReadGroundTruth = Callable[[], Trajectory | None]
+"""Function that reads the ground truth; it returns None if the sequence has none."""
+
+_MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
+"""Plausible range for the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
+wrong depth scale falls outside of it."""
 
 
 class StoredSequence(ABC):
-    """An `RGBDSequence` of which a subclass says how a frame's images are read.
+    """Base class of every `RGBDSequence` with stored frames. A subclass reads the images of a frame.
 
     Args:
-        name: for tables.
-        stamps: of the colour images, seconds, strictly increasing.
-        camera: that took all frames.
-        groundtruth: reads the measured poses of that camera.
-        delays: of the depth images, seconds after the colour images; None where both were taken at once.
+        name: Name of the sequence, used in tables.
+        stamps: Timestamps of the colour images, seconds, strictly increasing.
+        camera: Camera of all frames.
+        groundtruth: Function that reads the measured poses of the camera.
+        delays: Depth delay of each frame (depth stamp minus colour stamp), seconds; None if it is always 0.
 
     Attributes:
-        groundtruth: these poses; None where there are none, or they cannot be read, as the frames still can.
-        groundtruth_error: why they cannot be read.
+        groundtruth: Measured poses of the camera; None if there are none or they cannot be read. The frames remain
+            usable without them.
+        groundtruth_error: Error that occurred while reading the ground truth; None if it was read.
     """
 
     def __init__(
@@ -40,10 +46,10 @@ class StoredSequence(ABC):
         name: str,
         stamps: Sequence[float],
         camera: PinholeCamera,
-        groundtruth: ReadTruth | None = None,
+        groundtruth: ReadGroundTruth | None = None,
         delays: Sequence[float] | None = None,
     ) -> None:
-        self.name = name.encode(errors="replace").decode()  # a folder's name need not be text
+        self.name = name.encode(errors="replace").decode()  # the name of a folder can be invalid UTF-8
         self.stamps: Tensor = torch.tensor(stamps, dtype=torch.float64)
         self.camera = camera
         self._delays = delays or [0.0] * len(stamps)
@@ -61,83 +67,83 @@ class StoredSequence(ABC):
         return self.frames_from(0)
 
     def frames_from(self, index: int) -> Iterator[RGBDFrame]:
-        """The frames from one on, read as they are asked for."""
+        """Iterate over the frames from ``index`` on. Each frame is decoded when it is requested."""
         return FrameIterator(self, index)
 
     def __getitem__(self, index: int) -> RGBDFrame:
-        """Decode frame ``index``, from 0.
+        """Decode frame ``index``, counted from 0.
 
         Raises:
-            IndexError: there is no such frame.
-            InputError: an image is broken, of the wrong kind or not of the camera's size, or ``index`` is no number.
+            IndexError: If the sequence has no such frame.
+            InputError: If an image is damaged, of the wrong kind or not of the camera's size, or if ``index`` is not
+                an integer.
         """
         try:
             index = operator.index(index)
         except TypeError as error:
             raise InputError(
-                f"{self.name}: frames are read one by one, by their numbers, and not by {index!r}; take several with"
+                f"{self.name}: a frame index must be an integer, got {index!r}; read several frames with"
                 " itertools.islice(sequence, start, stop)"
             ) from error
         if not 0 <= index < len(self):
-            raise IndexError(f"{self.name} has {len(self)} frames, there is none with index {index}")
+            raise IndexError(f"{self.name} has {len(self)} frames, index {index} is out of range")
         image, depth = self._read(index)
         stamp = float(self.stamps[index])
         return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._delays[index])
 
     def check_first_frame(self, source: object) -> None:
-        """Decode the first frame, so that what is wrong with every frame is said before anything else is done.
+        """Decode the first frame, so that an error common to all frames is reported before anything is computed.
 
         Args:
-            source: of the frames, for messages.
+            source: Path of the sequence, for messages.
 
         Raises:
-            InputError: as `__getitem__`, or its depth is none that such a camera measures.
+            InputError: If the frame cannot be decoded or its median depth is implausible.
         """
         depth = self._read(0)[1]
-        middle = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
-        if not _DEPTHS[0] < middle < _DEPTHS[1]:
-            scale = f"{self.camera.depth_scale:g} units per metre"
+        median = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
+        if not _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
             raise InputError(
-                f"{source}: the depth of its first frame is {middle:.2g} m in the middle, at {scale}; correct the"
-                " camera's depth_scale (1000 where depth is in millimetres), or the images"
+                f"{source}: the median depth of the first frame is {median:.2g} m at {self.camera.depth_scale:g} units"
+                " per metre; correct the camera's depth_scale (1000 if depth is in millimetres) or the depth images"
             )
 
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
-        """Colour and depth of a frame that there is, as `RGBDFrame` holds them."""
+        """Read the colour and depth image of an existing frame, in the format of `RGBDFrame`."""
 
     def _registered(
         self,
         colour: tuple[object, Tensor],
         depth: tuple[object, Tensor],
-        cure: str = "export the depth that is registered to colour, pixel by pixel",
+        fix: str = "export depth that is registered to the colour image",
     ) -> tuple[Tensor, Tensor]:
-        """Colour and depth images (C, H, W), each with where it came from, if they have one size, the camera's."""
-        sizes = [f"{image.shape[2]}x{image.shape[1]}" for _, image in (depth, colour)]
-        if sizes[0] != sizes[1]:
-            raise InputError(f"{depth[0]}: has {sizes[0]} pixels, its colour image {sizes[1]}; {cure}")
-        return self._sized(*colour), depth[1]
+        """Return both images (C, H, W), given with their sources, if they have the same size as the camera."""
+        depth_size, colour_size = (f"{image.shape[2]}x{image.shape[1]}" for _, image in (depth, colour))
+        if depth_size != colour_size:
+            raise InputError(f"{depth[0]}: has {depth_size} pixels, but its colour image has {colour_size}; {fix}")
+        return self._check_size(*colour), depth[1]
 
-    def _sized(self, source: object, image: Tensor) -> Tensor:
-        """The image (C, H, W), which came from ``source``, if it has the camera's size."""
+    def _check_size(self, source: object, image: Tensor) -> Tensor:
+        """Return the image (C, H, W) read from ``source`` if it has the camera's size."""
         height, width = image.shape[1:]
         if (width, height) != (self.camera.width, self.camera.height):
             raise InputError(
-                f"{source}: has {width}x{height} pixels, the camera {self.camera.width}x{self.camera.height};"
-                " give the camera that took it with --camera"
+                f"{source}: has {width}x{height} pixels, but the camera has {self.camera.width}x{self.camera.height};"
+                " pass the camera of these images with --camera"
             )
         return image
 
 
 class FrameIterator(Iterator[RGBDFrame]):
-    """Frames of a stored sequence one after the other.
+    """Iterator over the frames of a stored sequence.
 
     Args:
-        sequence: of the frames.
-        first: index of the first.
+        sequence: Sequence to iterate over.
+        first: Index of the first frame.
 
     Attributes:
-        index: of the next; who has got that frame otherwise may step over it.
+        index: Index of the next frame. It can be increased to skip frames that were read by other means.
     """
 
     def __init__(self, sequence: StoredSequence, first: int) -> None:
@@ -146,7 +152,7 @@ class FrameIterator(Iterator[RGBDFrame]):
 
     @property
     def remaining(self) -> int:
-        """Frames from the next on."""
+        """Number of frames left."""
         return max(len(self.sequence) - self.index, 0)
 
     def __next__(self) -> RGBDFrame:
@@ -155,3 +161,36 @@ class FrameIterator(Iterator[RGBDFrame]):
         frame = self.sequence[self.index]
         self.index += 1
         return frame
+
+
+class Cursor(Generic[_T]):
+    """Random access to the items of a stream that can only be read forward.
+
+    Reading forward continues the stream, reading backward starts it again.
+
+    Args:
+        start: Function that returns an iterator over all items.
+    """
+
+    def __init__(self, start: Callable[[], Iterator[_T]]) -> None:
+        self._start = start
+        self._items: Iterator[_T] = iter(())
+        self._index: int | None = None
+        self._item: _T | None = None
+
+    def __getitem__(self, index: int) -> _T:
+        """Return item ``index``, counted from 0.
+
+        Raises:
+            IndexError: If the stream has no such item.
+        """
+        if self._item is not None and index == self._index:
+            return self._item
+        if self._index is None or index < self._index:
+            self._items, self._index = self._start(), -1
+        self._item = next(islice(self._items, index - self._index - 1, None), None)
+        self._index = index
+        if self._item is None:
+            self._index = None
+            raise IndexError(index)
+        return self._item

@@ -1,4 +1,4 @@
-"""A folder in the layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012)."""
+"""Folders in the layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012)."""
 
 from __future__ import annotations
 
@@ -10,47 +10,51 @@ from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.images import image_size
-from v3d_torch.datasets.lists import ImagePair, pair_lists, read_associations, refuse_other_units
-from v3d_torch.datasets.names import short_name
-from v3d_torch.datasets.paired import PairedImages
+from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
+from v3d_torch.datasets.paired_images import PairedImages
+from v3d_torch.datasets.sequence_names import short_name
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 
 
 class TUMSequence(PairedImages):
-    """Frames of a folder with ``associations.txt``, or ``rgb.txt`` and ``depth.txt``.
+    """Sequence with ``associations.txt``, or ``rgb.txt`` and ``depth.txt``.
 
-    A folder ``masks`` in it holds true masks, for evaluation, under the names of the depth images.
+    Ground truth is read from ``groundtruth.txt``. A subfolder ``masks`` can contain ground-truth motion masks for
+    evaluation, with the names of the depth images.
 
     Args:
-        folder: the sequence's folder; a ``groundtruth.txt`` in it is read, too.
-        camera: a camera, a preset's name or a camera file; None takes what the folder says (see `choose_camera`).
-        name: for tables; None makes it from the folder's name.
+        folder: Folder of the sequence.
+        camera: A camera, the name of a preset or a camera file; None for the camera of the folder (`choose_camera`).
+        name: Name used in tables; None to derive it from the folder's name.
 
     Raises:
-        InputError: the folder or one of its files is missing or wrong; the message names it and the cure.
+        InputError: If the folder or one of its files is missing or invalid.
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None, *, name: str | None = None) -> None:
         if not folder.is_dir():
-            what = "is a file" if folder.exists() else "is not there"
-            raise InputError(f"{folder}: {what}; a sequence is a folder with rgb.txt and depth.txt")
+            cause = "is not a folder" if folder.exists() else "does not exist"
+            raise InputError(f"{folder}: {cause}; pass a folder with rgb.txt and depth.txt")
         pairs = _read_pairs(folder)
-        refuse_other_units(pairs, folder)
-        truth = folder / "groundtruth.txt"
+        check_stamp_unit(pairs, folder)
+        groundtruth = folder / "groundtruth.txt"
         super().__init__(
             folder,
             pairs,
             choose_camera(camera, folder),
-            lambda: read_trajectory(truth) if truth.is_file() else None,
+            lambda: read_trajectory(groundtruth) if groundtruth.is_file() else None,
             name=short_name(folder.resolve().name) if name is None else name,
         )
 
     def motion_mask(self, index: int) -> Tensor | None:
-        """True mask of frame ``index``, see `HasMotionMasks`; None where there is no such file.
+        """Read the ground-truth motion mask of frame ``index``; None if there is no such file.
+
+        Returns:
+            Mask, uint8, shape :math:`(H, W)`, see `HasMotionMasks.motion_mask`.
 
         Raises:
-            InputError: it is broken, not 8-bit grey or not of the camera's size.
+            InputError: If the mask is damaged, not 8-bit greyscale or not of the camera's size.
         """
         path = (self.folder / "masks" / Path(self._pairs[index].depth).name).with_suffix(".png")
         if not path.is_file():
@@ -60,14 +64,14 @@ class TUMSequence(PairedImages):
             ids = io.read_image_png_u8(str(path), "mono")
         except Exception as error:  # kornia_rs raises bare Exception for every cause
             raise InputError(
-                f"{path}: is truncated or not 8-bit grey, as a true mask is; copy it again, or give the folder masks"
-                " another name where it holds something else"
+                f"{path}: is truncated or not an 8-bit greyscale motion mask; copy it again, or rename the folder masks"
+                " if it contains something else"
             ) from error
-        return self._sized(path, torch.from_numpy(ids).permute(2, 0, 1))[0]
+        return self._check_size(path, torch.from_numpy(ids).permute(2, 0, 1))[0]
 
 
 def is_tum(path: Path) -> bool:
-    """Whether a folder has one of the lists of the TUM layout; opening it tells which are missing."""
+    """Check whether a folder has any list of the TUM layout. Opening the sequence reports missing ones."""
     return any((path / name).is_file() for name in ("associations.txt", "rgb.txt", "depth.txt"))
 
 

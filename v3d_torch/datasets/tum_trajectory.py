@@ -1,4 +1,4 @@
-"""Trajectory files in the layout of the TUM RGB-D benchmark: ``stamp tx ty tz qx qy qz qw`` of ``T_wc``."""
+"""Trajectory files in TUM format: lines of ``timestamp tx ty tz qx qy qz qw`` with camera-to-world poses."""
 
 from __future__ import annotations
 
@@ -15,39 +15,44 @@ from v3d_torch.io.timestamps import parse_timestamp
 from v3d_torch.types import Trajectory
 
 _MAX_DISTANCE = 1e7
-"""Metres from the origin: the radius of the earth, for ground truth in a geocentric frame."""
+"""Maximum coordinate of a position, metres: the order of the earth's radius, for poses in a geocentric frame."""
 
-_MAX_LENGTH = 1e3
-"""Of a quaternion, and its inverse the least: what is off by more is no rounding and no other scale."""
+_MAX_QUATERNION_NORM = 1e3
+"""Maximum norm of a quaternion; its inverse is the minimum. Rounding and other scales stay within this range."""
 
-_COLUMNS = "stamp tx ty tz qx qy qz qw"
+_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
 def read_trajectory(path: StrPath) -> Trajectory:
-    """Read camera poses.
+    """Read a trajectory in TUM format.
 
-    Comments (#), blank lines, a byte order mark, either line ending and commas for spaces are allowed. Quaternions are
-    normalised, poses come out in order of time, and of equal stamps the first counts.
+    Comments (#), blank lines, a byte order mark, all line endings and commas between the columns are accepted.
+    Quaternions are normalised and poses are sorted by timestamp. If a timestamp occurs more than once, the first line
+    is used.
 
     Args:
-        path: lines of ``stamp tx ty tz qx qy qz qw``: seconds, metres, unit quaternion with the scalar last.
+        path: Path of a file with lines of ``timestamp tx ty tz qx qy qz qw``: seconds, metres, and a quaternion with
+            the scalar last.
 
     Returns:
-        Convention: ``T_wc`` maps camera to world, as the benchmark's files do.
+        Camera-to-world poses with timestamps in seconds. Convention: ``T_wc`` maps camera to world.
 
     Raises:
-        InputError: the file cannot be read, holds no pose, or a line is not eight sensible numbers with a rotation.
+        InputError: If the file cannot be read, contains no poses, or contains an invalid line.
     """
-    numbers, poses = _parse(Path(path))
+    line_numbers, poses = _parse(Path(path))
     with np.errstate(over="ignore"):
-        length = np.linalg.norm(poses[:, 4:], axis=1)
-    for wrong, what in (
+        norms = np.linalg.norm(poses[:, 4:], axis=1)
+    for invalid, cause in (
         (~np.isfinite(poses).all(axis=1), "a number that is not finite"),
         ((np.abs(poses[:, 1:4]) > _MAX_DISTANCE).any(axis=1), f"a position more than {_MAX_DISTANCE:g} m away"),
-        (~((length > 1 / _MAX_LENGTH) & (length < _MAX_LENGTH)), "a quaternion of zeros, or far from a unit one"),
+        (
+            ~((norms > 1 / _MAX_QUATERNION_NORM) & (norms < _MAX_QUATERNION_NORM)),
+            "a quaternion that is zero or far from unit length",
+        ),
     ):
-        if wrong.any():
-            raise InputError(f"{path}: line {numbers[wrong.argmax()]} has {what}; remove or repair it")
+        if invalid.any():
+            raise InputError(f"{path}: line {line_numbers[invalid.argmax()]} has {cause}; correct or remove it")
     stamps, order = np.unique(poses[:, 0], return_index=True)
     T_wc = torch.eye(4, dtype=torch.float64).repeat(len(stamps), 1, 1)
     T_wc[:, :3, :3] = torch.from_numpy(Rotation.from_quat(poses[order, 4:]).as_matrix())
@@ -56,23 +61,28 @@ def read_trajectory(path: StrPath) -> Trajectory:
 
 
 def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
-    """Write camera poses whole or not at all: stamps with 6 decimals, the rest with 9, quaternions with qw >= 0.
+    """Write a trajectory in TUM format.
+
+    Timestamps have 6 decimals, the other columns 9. Quaternions have qw >= 0. The file is replaced atomically, so that
+    it is never incomplete.
 
     Args:
-        path: file to write; its folder is made when it is not there.
-        trajectory: poses; none make an empty file.
+        path: Path of the file; missing folders are created.
+        trajectory: Camera-to-world poses; an empty trajectory creates an empty file.
 
     Raises:
-        InputError: what is given is no trajectory, or a pose in it no rigid motion.
-        OutputError: when the folder cannot be written or the disk is full.
+        InputError: If ``trajectory`` is not a `Trajectory`, or one of its poses is not a rigid transform.
+        OutputError: If the file cannot be written or the disk is full.
     """
     if not isinstance(trajectory, Trajectory):
-        raise InputError(f"write_trajectory takes a path and a Trajectory, this is a {type(trajectory).__name__}")
+        raise InputError(
+            f"write_trajectory: expected a Trajectory, got {type(trajectory).__name__}; pass the path first"
+        )
     T_wc = trajectory.T_wc.detach().numpy()
     with np.errstate(invalid="ignore"):
         rigid = np.isfinite(T_wc).all(axis=(1, 2)) & (np.linalg.det(T_wc[:, :3, :3]) > 0)
     if not rigid.all():
-        raise InputError(f"{path}: pose {rigid.argmin()} has no rotation or no finite position; repair or leave it out")
+        raise InputError(f"{path}: pose {rigid.argmin()} is not a valid rigid transform; repair or remove it")
     lines = []
     if len(trajectory):
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
@@ -85,8 +95,8 @@ def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
 
 
 def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Line numbers from 1, and the eight numbers of each line, shape (N, 8)."""
-    numbers, poses = [], []
+    """Parse a file to line numbers, counted from 1, and the eight columns of each line, shape (N, 8)."""
+    line_numbers, poses = [], []
     for number, line in numbered_lines(path, f"a trajectory has lines of {_COLUMNS}"):
         words = line.replace(",", " ").split()
         try:
@@ -94,9 +104,9 @@ def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
         except ValueError:
             pose = []
         if len(pose) != len(_COLUMNS.split()):
-            raise InputError(f"{path}: line {number} is {line[:80]!r} where {_COLUMNS} is expected; repair it")
-        numbers.append(number)
+            raise InputError(f"{path}: line {number} is {line[:80]!r}, expected {_COLUMNS}; correct or remove it")
+        line_numbers.append(number)
         poses.append(pose)
     if not poses:
-        raise InputError(f"{path}: holds no pose; lines of {_COLUMNS} are expected, copy it again")
-    return numbers, np.array(poses, dtype=np.float64)
+        raise InputError(f"{path}: contains no poses; copy it again, it must have lines of {_COLUMNS}")
+    return line_numbers, np.array(poses, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Saves frames as a folder in TUM layout."""
+"""Writer of sequences in TUM layout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from v3d_torch.datasets.images import SATURATED
+from v3d_torch.datasets.images import SATURATED_DEPTH
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -20,20 +20,22 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 
 class TUMWriter:
-    """A folder that is being written; as a context manager it writes its lists at the end, however it comes.
+    """Writer of RGB-D frames to a folder in TUM layout, used as a context manager.
+
+    Images are written immediately. The lists of images are written at the end of the context, also after an exception.
 
     Args:
-        folder: new or empty.
-        camera: of the frames, kept as ``camera.yaml``; depth is written in its units.
-        groundtruth: poses of that camera, kept as ``groundtruth.txt``.
+        folder: Folder of the sequence, new or empty.
+        camera: Camera of the frames, written to ``camera.yaml``; its depth scale is the unit of the depth images.
+        groundtruth: Measured poses of the camera, written to ``groundtruth.txt``; None for no such file.
 
     Raises:
-        OutputError: the folder holds something, cannot be written, or the disk is full; also later.
+        OutputError: If the folder is not empty or cannot be written, or the disk is full. Every method can raise it.
     """
 
     def __init__(self, folder: Path, camera: PinholeCamera, groundtruth: Trajectory | None = None) -> None:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutputError(f"{folder}: holds something already; choose another folder with --out")
+            raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")
         self.folder = folder
         self.camera = camera
         self._written: list[tuple[str, str]] = []
@@ -48,23 +50,23 @@ class TUMWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        lines = {
+        lists = {
             "rgb.txt": [f"{stamp} rgb/{stamp}.png" for stamp, _ in self._written],
             "depth.txt": [f"{stamp} depth/{stamp}.png" for _, stamp in self._written],
             "associations.txt": [f"{rgb} rgb/{rgb}.png {depth} depth/{depth}.png" for rgb, depth in self._written],
         }
-        for name, entries in lines.items():
-            write_text(self.folder / name, "".join(f"{entry}\n" for entry in entries))
+        for name, lines in lists.items():
+            write_text(self.folder / name, "".join(f"{line}\n" for line in lines))
 
     def __len__(self) -> int:
-        """Frames written."""
+        """Number of frames written."""
         return len(self._written)
 
     def add(self, frame: RGBDFrame) -> None:
-        """Write a frame's images; depth that 16 bits of the camera's units cannot tell is no measurement."""
+        """Write the images of a frame. Depth beyond the 16-bit range is written as 0, no measurement."""
         stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self.camera.depth_scale)
-        units[units >= SATURATED] = 0
+        units[units >= SATURATED_DEPTH] = 0
         colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
         _save(self.folder / "rgb" / f"{stamps[0]}.png", colour)
         _save(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))

@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.images import metres
 from v3d_torch.datasets.lists import MAX_DIFFERENCE
-from v3d_torch.datasets.stored import StoredSequence
+from v3d_torch.datasets.stored import Cursor, StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
 from v3d_torch.io.timestamps import associate

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import yaml
 from rich.table import Table
 
-from v3d_torch.datasets.names import PAPER_SEQUENCES, canonical_name, short_name
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, canonical_name, short_name
 from v3d_torch.evaluation.evaluation import Evaluation
 
 

@@ -1,4 +1,4 @@
-"""Broken sequences, and how a run of each has to end."""
+"""Corpus of damaged inputs, and the expected end of a run for each of them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from helpers.corpus import (
 CATEGORIES = {
     "lists of images": lists.CASES,
     "image files": images.CASES,
-    "what the images show": views.CASES,
+    "image content": views.CASES,
     "ground truth": truths.CASES,
     "cameras": cameras.CASES,
     "configurations": configs.CASES,
@@ -30,8 +30,8 @@ CATEGORIES = {
     "bags": recordings.CASES,
     "videos": videos.CASES,
     "folders of other datasets": layouts.CASES,
-    "what --seq names": names.CASES,
+    "sequence names": names.CASES,
     "archives": archives.CASES,
     "maps of earlier runs": maps.CASES,
-    "results and rights": outputs.CASES,
+    "results and permissions": outputs.CASES,
 }

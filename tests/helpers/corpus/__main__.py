@@ -1,11 +1,11 @@
-"""``python -m corpus`` in ``tests``: how many cases there are, and how they end, as a table for the README."""
+"""Print a table of the cases and their expected ends: ``python -m helpers.corpus`` in ``tests``."""
 
 from __future__ import annotations
 
 from helpers.corpus import CATEGORIES
 from helpers.corpus.case import Right, Says
 
-print("| | cases | right result | one sentence | with what was computed |")
+print("| | cases | right result | error message | with partial results |")
 print("|---|---:|---:|---:|---:|")
 rows = [(name, [case.ends for case in cases]) for name, cases in CATEGORIES.items()]
 for name, ends in [*rows, ("all", [end for _, each in rows for end in each])]:

@@ -1,4 +1,4 @@
-"""Archives of sequences that are downloaded: they are made here, and nothing is fetched."""
+"""Damaged archives of downloaded sequences. The archives are created here, nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEQ = all_of(seq("fr3/w/xyz"), options("--data-root", "{root}/data"))
 
 @contextmanager
 def served(place: Place) -> Iterator[None]:
-    """The archive comes as if it had been downloaded."""
+    """Replace the download by a copy of the archive."""
 
     def fetch(url: str, target: Path, **_: object) -> Path:
         assert url.endswith(f"/{NAME}.tgz")
@@ -31,7 +31,7 @@ def served(place: Place) -> Iterator[None]:
 
 
 def archive(add: Callable[[tarfile.TarFile], None] | None = None, kind: str = "w:gz") -> Make:
-    """The sequence in an archive, with more in it."""
+    """Pack the sequence into an archive, with an optional extra member."""
 
     def make(place: Place) -> None:
         with tarfile.open(place.root / "archive.tgz", kind) as tar:
@@ -44,6 +44,8 @@ def archive(add: Callable[[tarfile.TarFile], None] | None = None, kind: str = "w
 
 
 def member(name: str, kind: bytes = tarfile.REGTYPE, to: str = "", size: int = 0) -> Callable[[tarfile.TarFile], None]:
+    """Add a member of any kind."""
+
     def add(tar: tarfile.TarFile) -> None:
         info = tarfile.TarInfo(name)
         info.type, info.linkname, info.size = kind, to, size
@@ -53,7 +55,7 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, to: str = "", size: int = 0
 
 
 def claims(size: int) -> Callable[[tarfile.TarFile], None]:
-    """A member that says to be so large, of which nothing is there."""
+    """Add the header of a member of this size, without its content."""
 
     def add(tar: tarfile.TarFile) -> None:
         info = tarfile.TarInfo(f"{NAME}/large.bin")
@@ -64,7 +66,7 @@ def claims(size: int) -> Callable[[tarfile.TarFile], None]:
 
 
 def long_name(size: int) -> Callable[[tarfile.TarFile], None]:
-    """A header whose name is so long, of zeros, which are small in the archive."""
+    """Add an extended header of this size; its zeros compress to almost nothing."""
 
     def add(tar: tarfile.TarFile) -> None:
         info = tarfile.TarInfo("././@PaxHeader")
@@ -77,6 +79,8 @@ def long_name(size: int) -> Callable[[tarfile.TarFile], None]:
 
 
 def changed(change: Callable[[bytes], bytes]) -> Make:
+    """Change the bytes of the archive."""
+
     def make(place: Place) -> None:
         path = place.root / "archive.tgz"
         path.write_bytes(change(path.read_bytes()))
@@ -84,23 +88,25 @@ def changed(change: Callable[[bytes], bytes]) -> Make:
     return make
 
 
-def flipped(content: bytes) -> bytes:
+def flip_byte(content: bytes) -> bytes:
+    """Invert the byte in the middle."""
     at = len(content) // 2
     return content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :]
 
 
-def text(content: bytes) -> Make:
+def content_of(content: bytes) -> Make:
+    """Write an archive with this content."""
     return all_of(lambda place: (place.root / "archive.tgz").write_bytes(content), SEQ)  # type: ignore[arg-type, return-value]
 
 
 CASES = [
     Case(name, make, ends, served)
     for name, make, ends in (
-        ("whole", archive(), Right()),
+        ("gzip", archive(), Right()),
         ("bzip2", archive(kind="w:bz2"), Right()),
         ("xz", archive(kind="w:xz"), Right()),
         (
-            "a file outside by ..",
+            "file outside the folder, by ..",
             archive(member("../outside.txt")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -108,15 +114,15 @@ CASES = [
             ),
         ),
         (
-            "a file outside by an absolute path",
+            "file outside the folder, by an absolute path",
             archive(member("/outside.txt", size=3)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: holds no rgb.txt and depth.txt; get the"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
                 " archive from another source"
             ),
         ),
         (
-            "a link outside",
+            "symlink to outside the folder",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "../../..")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -124,7 +130,7 @@ CASES = [
             ),
         ),
         (
-            "a link to an absolute path",
+            "symlink to an absolute path",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "/etc")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -132,7 +138,7 @@ CASES = [
             ),
         ),
         (
-            "a hard link outside",
+            "hard link to outside the folder",
             archive(member(f"{NAME}/x", tarfile.LNKTYPE, "../../etc/passwd")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -140,7 +146,7 @@ CASES = [
             ),
         ),
         (
-            "a device",
+            "device file",
             archive(member(f"{NAME}/zero", tarfile.CHRTYPE)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -148,7 +154,7 @@ CASES = [
             ),
         ),
         (
-            "a pipe",
+            "named pipe",
             archive(member(f"{NAME}/rgb.pipe", tarfile.FIFOTYPE)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
@@ -156,7 +162,7 @@ CASES = [
             ),
         ),
         (
-            "a member of a petabyte",
+            "member with a size of a petabyte",
             archive(claims(10**15)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, it unpacks to more than"
@@ -164,7 +170,7 @@ CASES = [
             ),
         ),
         (
-            "a header of 64 megabytes",
+            "header of 64 megabytes",
             archive(long_name(1 << 26)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (a header of"
@@ -172,7 +178,7 @@ CASES = [
             ),
         ),
         (
-            "breaks off",
+            "truncated gzip",
             all_of(archive(), changed(half)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -180,7 +186,7 @@ CASES = [
             ),
         ),
         (
-            "xz breaks off",
+            "truncated xz",
             all_of(archive(kind="w:xz"), changed(half)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -188,7 +194,7 @@ CASES = [
             ),
         ),
         (
-            "bzip2 breaks off",
+            "truncated bzip2",
             all_of(archive(kind="w:bz2"), changed(half)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
@@ -196,58 +202,58 @@ CASES = [
             ),
         ),
         (
-            "a wrong byte",
-            all_of(archive(), changed(flipped)),
+            "wrong byte in gzip",
+            all_of(archive(), changed(flip_byte)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
-            "a wrong byte in xz",
-            all_of(archive(kind="w:xz"), changed(flipped)),
+            "wrong byte in xz",
+            all_of(archive(kind="w:xz"), changed(flip_byte)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
-            "a wrong byte in bzip2",
-            all_of(archive(kind="w:bz2"), changed(flipped)),
+            "wrong byte in bzip2",
+            all_of(archive(kind="w:bz2"), changed(flip_byte)),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
-            "empty",
-            text(b""),
+            "empty file",
+            content_of(b""),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
-            "a web page",
-            text(b"<html>404</html>" * 100),
+            "web page",
+            content_of(b"<html>404</html>" * 100),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
-            "gzip of nothing",
-            text(gzip.compress(b"")),
+            "gzip of an empty file",
+            content_of(gzip.compress(b"")),
             Says(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
-            "without a sequence",
+            "archive without a sequence",
             all_of(lambda p: shutil.rmtree(p.folder), lambda p: p.folder.mkdir(), archive()),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: holds no rgb.txt and depth.txt; get the"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
                 " archive from another source"
             ),
         ),

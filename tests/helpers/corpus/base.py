@@ -1,4 +1,4 @@
-"""The whole sequence that the cases break: a camera slides along a wall of noise, 0.8 s in TUM layout."""
+"""The intact sequence that the cases damage: 0.8 s in TUM layout, a camera that moves along a textured wall."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from v3d_torch.types import Trajectory
 WIDTH, HEIGHT, FRAMES = 80, 60, 8
 FOCAL, SCALE, DEPTH = 64.0, 5000, 1.0
 STEP = 2
-"""Pixels by which the image moves from frame to frame."""
+"""Motion of the image between two frames, pixels."""
 CAMERA = (
     f"fx: {FOCAL}\nfy: {FOCAL}\ncx: {(WIDTH - 1) / 2}\ncy: {(HEIGHT - 1) / 2}\n"
     f"width: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: {SCALE}\nreadout: 0\n"
@@ -26,22 +26,24 @@ STAMPS = [f"{1305031102 + i / 10:.6f}" for i in range(FRAMES)]
 
 
 def colour(x: int, y: int = 0) -> NDArray[np.uint8]:
-    """What the camera sees from a place on the wall, pixels; BGR, shape (H, W, 3)."""
+    """Colour image at a camera position on the wall (pixels), BGR, shape (H, W, 3)."""
     noise = np.random.default_rng(0).integers(0, 256, (28, 40, 3), dtype=np.uint8)
     wall = cv2.resize(noise, (120, 84), interpolation=cv2.INTER_CUBIC)
     return wall[y : y + HEIGHT, x : x + WIDTH]
 
 
 def depth(metres: float = DEPTH) -> NDArray[np.uint16]:
+    """Depth image of the wall at a constant distance, shape (H, W)."""
     return np.full((HEIGHT, WIDTH), metres * SCALE, np.uint16)
 
 
 def png(image: NDArray[np.generic]) -> bytes:
+    """Encode an image as PNG."""
     return cv2.imencode(".png", image)[1].tobytes()
 
 
 def way(frame: int) -> tuple[int, int]:
-    """Where on the wall the camera is: to the right, up and down."""
+    """Position of the camera on the wall, pixels: it moves to the right, and up and down."""
     return STEP * frame, 4 + 2 * (frame % 4)
 
 
@@ -54,7 +56,7 @@ def write_base(folder: Path) -> None:
         (folder / "rgb" / f"{stamp}.png").write_bytes(png(colour(*way(i))))
         (folder / "depth" / f"{stamp}.png").write_bytes(png(depth()))
         T_wc[i, :2, 3] = torch.tensor(way(i)) * DEPTH / FOCAL
-        # Turned by next to nothing: orientations that never change are taken for placeholders.
+        # A tiny rotation: constant orientations count as placeholders in the evaluation.
         T_wc[i, :3, :3] = se3_exp(torch.tensor([0, 0, 0, 1e-6 * i, 0, 0], dtype=torch.float64))[:3, :3]
     for kind in ("rgb", "depth"):
         (folder / f"{kind}.txt").write_text("".join(f"{stamp} {kind}/{stamp}.png\n" for stamp in STAMPS))

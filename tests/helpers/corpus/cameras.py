@@ -1,4 +1,4 @@
-"""Cameras: ``camera.yaml``, ``K.txt``, ``--camera``."""
+"""Invalid cameras: ``camera.yaml``, ``K.txt``, ``--camera``."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ NUMBERS = f"{FOCAL} {FOCAL} {(WIDTH - 1) / 2} {(HEIGHT - 1) / 2} {SCALE} {WIDTH}
 
 
 def field(name: str, value: str) -> Make:
-    """Give a field of the camera another value."""
+    """Set a field of ``camera.yaml``."""
     lines = [f"{name}: {value}" if line.startswith(f"{name}:") else line for line in CAMERA.splitlines()]
     return write(YAML, "\n".join(lines) + "\n")
 
 
 def numbers(text: str) -> Make:
-    """A K.txt instead of the YAML file."""
+    """Replace ``camera.yaml`` by a ``K.txt``."""
     return all_of(remove(YAML), write("K.txt", text))
 
 
 def bomb() -> str:
-    """Anchors that multiply: a list of 10^9 in a few lines."""
+    """YAML with nested aliases: a few lines that expand to 10^9 elements."""
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join(10 * [f'*a{i - 1}'])}]" for i in range(1, 9)]
     return "\n".join(lines) + "\n"
@@ -29,26 +29,26 @@ def bomb() -> str:
 
 CASES = [
     Case(
-        "no camera",
+        "missing camera file",
         remove(YAML),
         Says(
-            "{seq}: says nothing about its camera; put a camera.yaml there (fx, fy, cx, cy, width, height,"
-            " depth_scale) or give --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
+            "{seq}: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height, depth_scale) or"
+            " pass --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
         ),
     ),
     Case(
         "empty file",
         write(YAML, ""),
-        Says("{seq}/camera.yaml: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Says("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
     ),
-    Case("broken YAML", write(YAML, "fx: {525.0\n"), Says("{seq}/camera.yaml: is not valid YAML (...); repair it")),
+    Case("invalid YAML", write(YAML, "fx: {525.0\n"), Says("{seq}/camera.yaml: is not valid YAML (...); repair it")),
     Case(
         "YAML that runs a command",
         write(YAML, "!!python/object/apply:os.system ['touch /tmp/owned']\n"),
         Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
-        "YAML that multiplies",
+        "YAML with nested aliases",
         write(YAML, bomb() + "fx: *a8\n"),
         Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
@@ -58,22 +58,22 @@ CASES = [
         Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
-        "YAML with a date that is none",
+        "YAML with an invalid date",
         field("fx", "2024-99-99"),
         Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
-        "YAML nested a thousand times",
+        "deeply nested YAML",
         write(YAML, 3000 * "[" + 3000 * "]"),
         Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
-        "a list",
+        "list instead of fields",
         write(YAML, "- 525.0\n- 525.0\n"),
-        Says("{seq}/camera.yaml: holds no camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Says("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
     ),
     Case(
-        "a field is missing",
+        "missing field",
         edit(YAML, replaced("fy:", "#fy:")),
         Says(
             "{seq}/camera.yaml: fy: field required, got {'cx': 39.5, 'cy': 29.5, 'depth_scale': 5000, 'fx':"
@@ -81,17 +81,17 @@ CASES = [
         ),
     ),
     Case(
-        "a field twice",
+        "duplicate field",
         edit(YAML, lambda content: content + b"fx: 100\n"),
         Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
-        "an unknown field",
+        "unknown field",
         edit(YAML, lambda content: content + b"focal: 525\n"),
         Says("{seq}/camera.yaml: focal: extra inputs are not permitted, got 525; correct the camera"),
     ),
     Case(
-        "a word for a number",
+        "word instead of a number",
         field("cx", "middle"),
         Says(
             "{seq}/camera.yaml: cx: input should be a valid number, unable to parse string as a number, got"
@@ -109,31 +109,31 @@ CASES = [
         Says("{seq}/camera.yaml: fy: input should be greater than or equal to 1, got 0; correct the camera"),
     ),
     Case(
-        "focal length that is not a number",
+        "focal length NaN",
         field("fx", ".nan"),
         Says("{seq}/camera.yaml: fx: input should be a finite number, got nan; correct the camera"),
     ),
     Case(
-        "next to no focal length",
+        "tiny focal length",
         field("fx", "1e-30"),
         Says("{seq}/camera.yaml: fx: input should be greater than or equal to 1, got '1e-30'; correct the camera"),
     ),
     Case(
-        "endless focal length",
+        "huge focal length",
         field("fx", "1e300"),
         Says("{seq}/camera.yaml: fx: input should be less than or equal to 1000000, got '1e300'; correct the camera"),
     ),
     Case(
-        "infinite centre",
+        "infinite principal point",
         field("cy", ".inf"),
         Says("{seq}/camera.yaml: cy: input should be a finite number, got inf; correct the camera"),
     ),
     Case(
-        "centre far outside",
+        "principal point far outside the image",
         field("cx", "1e6"),
         Says(
-            "{seq}/camera.yaml: the centre (1e+06, 29.5) lies far outside of 80x60 pixels; correct cx and"
-            " cy, or the size"
+            "{seq}/camera.yaml: the principal point (1e+06, 29.5) is far outside the 80x60 image; correct cx"
+            " and cy, or width and height"
         ),
     ),
     Case(
@@ -142,7 +142,7 @@ CASES = [
         Says("{seq}/camera.yaml: width: input should be greater than 0, got 0; correct the camera"),
     ),
     Case(
-        "half a pixel",
+        "fractional height",
         field("height", "47.5"),
         Says(
             "{seq}/camera.yaml: height: input should be a valid integer, got a number with a fractional"
@@ -150,18 +150,18 @@ CASES = [
         ),
     ),
     Case(
-        "a billion pixels wide",
+        "width of a billion pixels",
         field("width", "1000000000"),
         Says(
             "{seq}/camera.yaml: width: input should be less than or equal to 8192, got 1000000000; correct the camera"
         ),
     ),
     Case(
-        "size of other images",
+        "size of a different camera",
         field("width", "640"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 640x60; give the camera that"
-            " took it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x60; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
@@ -173,8 +173,8 @@ CASES = [
             )
         ),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 60x80; give the camera that took"
-            " it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 60x80; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
@@ -190,7 +190,7 @@ CASES = [
         ),
     ),
     Case(
-        "next to no depth scale",
+        "tiny depth scale",
         field("depth_scale", "1e-30"),
         Says(
             "{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got '1e-30';"
@@ -198,7 +198,7 @@ CASES = [
         ),
     ),
     Case(
-        "metres per unit for units per metre",
+        "depth scale in metres per unit",
         field("depth_scale", "0.0002"),
         Says(
             "{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got 0.0002; correct the camera"
@@ -210,29 +210,29 @@ CASES = [
         Says("{seq}/camera.yaml: readout: input should be less than or equal to 0.05, got 33; correct the camera"),
     ),
     Case(
-        "lens of four numbers",
+        "distortion with four numbers",
         edit(YAML, lambda content: content + b"distortion: [0.1, 0.1, 0, 0]\n"),
         Says("{seq}/camera.yaml: distortion.4: field required, got [0.1, 0.1, 0, 0]; correct the camera"),
     ),
     Case(
-        "lens with NaN",
+        "distortion with NaN",
         edit(YAML, lambda content: content + b"distortion: [.nan, 0, 0, 0, 0]\n"),
         Says("{seq}/camera.yaml: distortion.0: input should be a finite number, got nan; correct the camera"),
     ),
     Case(
-        "lens that bends rays back",
+        "distortion that cannot be inverted",
         edit(YAML, lambda content: content + b"distortion: [-50, 0, 0, 0, 0]\n"),
         Says(
-            "{seq}: no point is seen at some corner of the image with the lens (-50.0, 0.0, 0.0, 0.0, 0.0);"
-            " correct the camera's distortion (k1, k2, p1, p2, k3) or leave it out"
+            "{seq}: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
+            " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
     Case(
-        "lens that bends rays anywhere",
+        "huge distortion",
         edit(YAML, lambda content: content + b"distortion: [1e30, 1e30, 1e30, 1e30, 1e30]\n"),
         Says(
-            "{seq}: no point is seen at some corner of the image with the lens (1e+30, 1e+30, 1e+30, 1e+30,"
-            " 1e+30); correct the camera's distortion (k1, k2, p1, p2, k3) or leave it out"
+            "{seq}: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image corners;"
+            " correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
     Case(
@@ -241,44 +241,46 @@ CASES = [
         Says("{seq}/camera.yaml: is not a text file in UTF-8; convert it to that, a camera is a YAML file or a K.txt"),
     ),
     Case(
-        "byte order mark and Windows line ends",
+        "byte order mark and Windows line endings",
         edit(YAML, lambda content: b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n")),
         Right(),
     ),
     Case("K.txt", numbers(NUMBERS), Right()),
     Case(
-        "K.txt with commas, comments, mark", numbers("\ufeff# fx, fy ...\r\n" + NUMBERS.replace(" ", ",\r\n")), Right()
+        "K.txt with commas, comments and byte order mark",
+        numbers("\ufeff# fx, fy ...\r\n" + NUMBERS.replace(" ", ",\r\n")),
+        Right(),
     ),
     Case(
-        "K.txt empty",
+        "empty K.txt",
         numbers(""),
         Says(
-            "{seq}/K.txt: holds 0 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 0 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with three numbers",
         numbers("525 319.5 239.5\n"),
         Says(
-            "{seq}/K.txt: holds 3 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 3 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with eight numbers",
         numbers(NUMBERS + "1\n"),
         Says(
-            "{seq}/K.txt: holds 8 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 8 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with words",
         numbers("fx=525 fy=525\n"),
         Says(
-            "{seq}/K.txt: holds something that is not a number (could not convert string to float:"
-            " 'fx=525'); write fx fy cx cy depth_scale width height"
+            "{seq}/K.txt: contains a value that is not a number (could not convert string to float: 'fx=525');"
+            " write fx fy cx cy depth_scale width height"
         ),
     ),
     Case(
@@ -292,7 +294,7 @@ CASES = [
         Says("{seq}/K.txt: fx: input should be greater than or equal to 1, got 0.0; correct the camera"),
     ),
     Case(
-        "K.txt with half a pixel",
+        "K.txt with a fractional width",
         numbers(NUMBERS.replace(f" {WIDTH} ", f" {WIDTH}.5 ")),
         Says(
             "{seq}/K.txt: width: input should be a valid integer, got a number with a fractional part, got"
@@ -300,51 +302,51 @@ CASES = [
         ),
     ),
     Case(
-        "K.txt as a matrix, of 640x480 pixels",
+        "K.txt with a matrix, for 640x480 pixels",
         numbers("525 0 319.5\n0 525 239.5\n0 0 1\n"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 640x480; give the camera that"
-            " took it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
-        "K.txt as a matrix with skew",
+        "K.txt with a matrix with skew",
         numbers("525 3 319.5\n0 525 239.5\n0 0 1\n"),
         Says(
-            "{seq}/K.txt: holds 9 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 9 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "K.txt with a number of 5000 digits",
         numbers(5000 * "1"),
         Says(
-            "{seq}/K.txt: holds 1 numbers that are no camera; write fx fy cx cy depth_scale width height,"
-            " or a 3x3 camera matrix without skew"
+            "{seq}/K.txt: contains 1 numbers that do not form a camera; write fx fy cx cy depth_scale width"
+            " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
-        "--camera that is nothing",
+        "--camera unknown",
         options("--camera", "kinect"),
-        Says("kinect: is neither a camera file nor a preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
+        Says("kinect: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
     ),
     Case(
-        "--camera nearly right",
+        "--camera misspelled",
         options("--camera", "tum_f3"),
-        Says("tum_f3: is neither a camera file nor a preset; did you mean tum_fr3?"),
+        Says("tum_f3: is not a camera file or preset; did you mean tum_fr3?"),
     ),
     Case(
-        "--camera of other images",
+        "--camera with another image size",
         options("--camera", "tum_fr3"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, the camera 640x480; give the camera that"
-            " took it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
         "--camera is a folder",
         options("--camera", "{seq}"),
-        Says("{seq}: is neither a camera file nor a preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
+        Says("{seq}: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
     ),
     Case(
         "--camera is an image",
@@ -355,7 +357,7 @@ CASES = [
         ),
     ),
     Case(
-        "--camera instead of a broken file",
+        "--camera instead of an invalid file",
         all_of(write(YAML, "?"), write("other.yaml", CAMERA), options("--camera", "{seq}/other.yaml")),
         Right(),
     ),

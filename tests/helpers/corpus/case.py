@@ -1,4 +1,4 @@
-"""What a case is: a way to break a small sequence, and how its run has to end."""
+"""Test cases of the corpus: how to damage a small sequence, and how its run must end."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from helpers.corpus.base import FRAMES
 
 @dataclass
 class Place:
-    """Where a case is made and run.
+    """Folder and command line of one case.
 
     Attributes:
-        root: an empty folder, in which the command runs; ``seq`` in it holds a whole sequence to be broken.
-        seq: what is given as ``--seq``.
-        options: further options of the command.
+        root: Empty folder, the working directory of the command. The intact sequence is in its subfolder ``seq``.
+        seq: Value of ``--seq``.
+        options: Other options of the command.
     """
 
     root: Path
@@ -27,80 +27,71 @@ class Place:
 
     @property
     def folder(self) -> Path:
-        """Of the sequence."""
+        """Folder of the sequence."""
         return self.root / "seq"
 
     @property
     def out(self) -> Path:
-        """Given as ``--out``, not there yet."""
+        """Folder of the results, the value of ``--out``. It does not exist before the run."""
         return self.root / "out"
 
     def filled(self, text: str) -> str:
-        """A text with ``{seq}``, ``{out}`` and ``{root}`` replaced by the paths."""
+        """Replace ``{seq}``, ``{out}`` and ``{root}`` in a text by the paths."""
         return text.replace("{seq}", str(self.folder)).replace("{out}", str(self.out)).replace("{root}", str(self.root))
 
 
 Make = Callable[[Place], None]
-"""Breaks what is in a place."""
+"""Function that damages the sequence, or changes the command line, of a case."""
 
 
 @dataclass(frozen=True)
 class Right:
-    """The run ends well, and its result is right.
-
-    Attributes:
-        frames: poses in the trajectory.
-        lost: frames that were not found.
-        ate: more than the error against ground truth may be, metres; None where there is no ground truth.
-        note: what is said beside the scores.
-    """
+    """Expected end of a run: exit code 0 and a correct result."""
 
     frames: int = FRAMES
+    """Number of poses in the trajectory."""
     lost: int = 0
+    """Number of frames with lost tracking."""
     ate: float | None = 0.005
+    """Upper limit of the absolute trajectory error (rmse), metres; None if the run has no scores."""
     note: str = ""
+    """Text in the output of the command."""
 
 
 @dataclass(frozen=True)
 class Says:
-    """The run ends with exit code 2 and one sentence on stderr.
-
-    Attributes:
-        sentence: all of it behind ``error: ``; ``{seq}``, ``{out}`` and ``{root}`` are paths, ``...`` is any text.
-        kept: poses that are in the results all the same; None where it ended before there were any results.
-    """
+    """Expected end of a run: exit code 2 and a single error message on stderr."""
 
     sentence: str
+    """Whole text after ``error: ``. ``{seq}``, ``{out}`` and ``{root}`` stand for paths, ``...`` for any text."""
     kept: int | None = None
+    """Number of poses in the results; None if the run ends before any results are written."""
 
     def fits(self, text: str, place: Place) -> bool:
-        """Whether a sentence is this one."""
+        """Check whether a message is the expected one."""
         parts = (re.escape(part) for part in place.filled(self.sentence).split("..."))
         return re.fullmatch(".*".join(parts), text) is not None
 
 
 @dataclass(frozen=True)
 class Case:
-    """A way to break a sequence.
-
-    Attributes:
-        name: in a few words.
-        make: does it.
-        ends: how the run has to end.
-        during: what is the case around the run.
-    """
+    """A damaged sequence and the expected end of its run."""
 
     name: str
+    """Short description."""
     make: Make
+    """Function that damages the sequence or changes the command line."""
     ends: Right | Says
+    """Expected end of the run."""
     during: Callable[[Place], AbstractContextManager[object]] = lambda place: nullcontext()
+    """Function that returns a context manager around the run."""
 
 
-# ---------------------------------------------------------------- ways to break something
+# ---------------------------------------------------------------- ways to damage a sequence
 
 
 def edit(file: str, change: Callable[[bytes], bytes]) -> Make:
-    """Change a file of the sequence."""
+    """Change the content of a file of the sequence."""
 
     def make(place: Place) -> None:
         path = place.folder / file
@@ -110,7 +101,7 @@ def edit(file: str, change: Callable[[bytes], bytes]) -> Make:
 
 
 def write(file: str, content: str | bytes) -> Make:
-    """Write a file of the sequence; paths in a text are filled in."""
+    """Write a file of the sequence; path placeholders in a text are replaced."""
 
     def make(place: Place) -> None:
         path = place.folder / file
@@ -131,7 +122,7 @@ def remove(*files: str) -> Make:
 
 
 def options(*more: str) -> Make:
-    """Give further options; paths in them are filled in."""
+    """Add command line options; path placeholders are replaced."""
 
     def make(place: Place) -> None:
         place.options += [place.filled(option) for option in more]
@@ -140,7 +131,7 @@ def options(*more: str) -> Make:
 
 
 def only(*given: str) -> Make:
-    """Give these options instead of the usual ones; paths in them are filled in."""
+    """Replace the default command line options; path placeholders are replaced."""
 
     def make(place: Place) -> None:
         place.options = [place.filled(option) for option in given]
@@ -149,7 +140,7 @@ def only(*given: str) -> Make:
 
 
 def seq(name: str) -> Make:
-    """Give something else as the sequence; paths in it are filled in."""
+    """Set the value of ``--seq``; path placeholders are replaced."""
 
     def make(place: Place) -> None:
         place.seq = place.filled(name)
@@ -158,7 +149,7 @@ def seq(name: str) -> Make:
 
 
 def all_of(*makes: Make) -> Make:
-    """One after the other."""
+    """Combine several changes, applied in this order."""
 
     def make(place: Place) -> None:
         for each in makes:
@@ -168,10 +159,10 @@ def all_of(*makes: Make) -> Make:
 
 
 def replaced(old: str, new: str) -> Callable[[bytes], bytes]:
-    """A change of a text."""
+    """Return a change that replaces a text."""
     return lambda content: content.replace(old.encode(), new.encode())
 
 
 def half(content: bytes) -> bytes:
-    """The first half of a file, as a copy that broke off leaves it."""
+    """First half of a file, as an interrupted copy leaves it."""
     return content[: len(content) // 2]

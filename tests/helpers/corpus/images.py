@@ -1,4 +1,4 @@
-"""Image files."""
+"""Damaged image files."""
 
 from __future__ import annotations
 
@@ -20,45 +20,48 @@ DEPTH = [f"depth/{stamp}.png" for stamp in STAMPS]
 
 
 def every(files: list[str], content: Callable[[int], bytes]) -> Make:
-    """Write each of these files anew."""
+    """Rewrite each of these files, by its index."""
     return all_of(*(write(file, content(i)) for i, file in enumerate(files)))
 
 
 def saved(image: NDArray[np.generic], form: str, **settings: object) -> bytes:
-    """As Pillow writes it."""
+    """Encode an image with Pillow."""
     file = BytesIO()
     Image.fromarray(image).save(file, form, **settings)
     return file.getvalue()
 
 
 def deep_colour(frame: int) -> bytes:
-    """16 bits a channel, whose low bytes say nothing."""
+    """Colour image with 16 bits per channel, of which the low bytes are random."""
     low = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3))
     return png((colour(*way(frame)).astype(np.uint16) << 8) + low.astype(np.uint16))
 
 
-def see_through(frame: int) -> bytes:
-    """With an alpha channel, half of it 0."""
+def with_alpha(frame: int) -> bytes:
+    """Colour image with an alpha channel that is 0 for half of the pixels."""
     alpha = np.tile(np.array([0, 255], np.uint8), (HEIGHT, WIDTH // 2))
     return png(np.dstack([colour(*way(frame)), alpha]))
 
 
 def grey(frame: int) -> bytes:
+    """Greyscale image."""
     return png(cv2.cvtColor(colour(*way(frame)), cv2.COLOR_BGR2GRAY))
 
 
 def palette(frame: int) -> bytes:
+    """Colour image with a palette."""
     file = BytesIO()
     Image.fromarray(colour(*way(frame))[..., ::-1]).quantize(256).save(file, "png")
     return file.getvalue()
 
 
 def jpeg(frame: int) -> bytes:
+    """Colour image encoded as JPEG."""
     return cv2.imencode(".jpg", colour(*way(frame)), [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
 
 
 def bomb(width: int, height: int, bits: int, kind: int) -> bytes:
-    """A PNG of zeros, small in the file and large in memory."""
+    """PNG of zeros, small on disk and large in memory (decompression bomb)."""
 
     def chunk(name: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
@@ -69,13 +72,14 @@ def bomb(width: int, height: int, bits: int, kind: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", content) + chunk(b"IEND", b"")
 
 
-def flipped(content: bytes) -> bytes:
-    """One bit of the pixels is wrong."""
+def flip_bit(content: bytes) -> bytes:
+    """Flip one bit of the pixel data."""
     at = len(content) - 30
     return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
-def swapped_lists(place: Place) -> None:
+def swap_lists(place: Place) -> None:
+    """Swap the lists of colour and depth images."""
     colours, depths = (place.folder / name for name in ("rgb.txt", "depth.txt"))
     text = colours.read_text()
     colours.write_text(depths.read_text())
@@ -87,159 +91,169 @@ PAGE = "<!DOCTYPE html>\n<html><body>404 Not Found</body></html>\n"
 
 CASES = [
     Case(
-        "the first colour image breaks off",
+        "first colour image truncated",
         edit(RGB[0], half),
-        Says("{seq}/rgb/1305031102.000000.png: is truncated or broken; copy or download it again"),
+        Says("{seq}/rgb/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
-        "the first depth image breaks off",
+        "first depth image truncated",
         edit(DEPTH[0], half),
-        Says("{seq}/depth/1305031102.000000.png: is truncated or broken; copy or download it again"),
+        Says("{seq}/depth/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
-        "a colour image breaks off",
+        "colour image truncated",
         edit(RGB[5], half),
         Says(
-            "{seq}/rgb/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
     Case(
-        "a depth image breaks off",
+        "depth image truncated",
         edit(DEPTH[5], half),
         Says(
-            "{seq}/depth/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
     Case(
-        "a bit of a colour image is wrong",
-        edit(RGB[5], flipped),
+        "colour image with a flipped bit",
+        edit(RGB[5], flip_bit),
         Says(
-            "{seq}/rgb/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
     Case(
-        "a bit of a depth image is wrong",
-        edit(DEPTH[5], flipped),
+        "depth image with a flipped bit",
+        edit(DEPTH[5], flip_bit),
         Says(
-            "{seq}/depth/1305031102.500000.png: is truncated or broken; copy or download it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
+            " of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
     Case(
-        "an empty colour image",
+        "empty colour image",
         write(RGB[5], ""),
         Says(
-            "{seq}/rgb/1305031102.500000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it"
-            " again (the results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
     Case(
-        "an empty depth image",
+        "empty depth image",
         write(DEPTH[5], ""),
         Says(
-            "{seq}/depth/1305031102.500000.png: is no image, or none of PNG, JPEG or TIFF; copy or export"
-            " it again (the results of the 5 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results of the 5 frames before are in {out}; go on with --resume {out})",
             kept=5,
         ),
     ),
     Case(
-        "a web page for an image",
+        "web page instead of an image",
         write(RGB[2], PAGE),
         Says(
-            "{seq}/rgb/1305031102.200000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it"
-            " again (the results of the 2 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results of the 2 frames before are in {out}; go on with --resume {out})",
             kept=2,
         ),
     ),
     Case(
         "colour and depth swapped in the lists",
-        swapped_lists,
+        swap_lists,
         Says(
-            "{seq}/depth/1305031102.000000.png: is a 16-bit depth image where colour belongs; are colour"
-            " and depth swapped?"
+            "{seq}/depth/1305031102.000000.png: is a 16-bit depth image, expected a colour image; check that"
+            " colour and depth are not swapped"
         ),
     ),
     Case(
-        "depth where one colour image belongs",
+        "depth image instead of a colour image",
         write(RGB[4], png(depth())),
         Says(
-            "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image where colour belongs; are colour and"
-            " depth swapped? (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image, expected a colour image; check that"
+            " colour and depth are not swapped (the results of the 4 frames before are in {out}; go on with"
+            " --resume {out})",
             kept=4,
         ),
     ),
     Case(
-        "colour where one depth image belongs",
+        "colour image instead of a depth image",
         write(DEPTH[4], png(colour(0))),
         Says(
-            "{seq}/depth/1305031102.400000.png: is a colour image where depth belongs; are colour and depth"
-            " swapped? (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped (the results of the 4 frames before are in {out}; go on with --resume"
+            " {out})",
             kept=4,
         ),
     ),
     Case(
-        "depth of 8 bits",
+        "8-bit depth",
         every(DEPTH, lambda i: png((depth() >> 8).astype(np.uint8))),
         Says(
-            "{seq}/depth/1305031102.000000.png: is 8-bit, a depth image has 16 bits; export the depth again, unscaled"
+            "{seq}/depth/1305031102.000000.png: is an 8-bit image, depth needs 16 bits; export depth again"
+            " without rescaling"
         ),
     ),
     Case(
-        "depth of 8 bits in one frame",
+        "8-bit depth in one frame",
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
         Says(
-            "{seq}/depth/1305031102.400000.png: is 8-bit, a depth image has 16 bits; export the depth"
-            " again, unscaled (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.400000.png: is an 8-bit image, depth needs 16 bits; export depth again"
+            " without rescaling (the results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
     ),
     Case(
-        "depth as a colour map",
+        "colour-mapped depth",
         every(DEPTH, lambda i: png(cv2.applyColorMap((depth() >> 8).astype(np.uint8), 2))),
-        Says("{seq}/depth/1305031102.000000.png: is a colour image where depth belongs; are colour and depth swapped?"),
+        Says(
+            "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped"
+        ),
     ),
     Case(
-        "depth of 16 bits in three channels",
+        "16-bit depth with three channels",
         every(DEPTH, lambda i: png(np.dstack(3 * [depth()]))),
-        Says("{seq}/depth/1305031102.000000.png: is a colour image where depth belongs; are colour and depth swapped?"),
+        Says(
+            "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped"
+        ),
     ),
-    Case("colour of 16 bits", every(RGB, deep_colour), Right()),
-    Case("colour with an alpha channel", every(RGB, see_through), Right()),
-    Case("grey images", every(RGB, grey), Right()),
+    Case("16-bit colour", every(RGB, deep_colour), Right()),
+    Case("colour with an alpha channel", every(RGB, with_alpha), Right()),
+    Case("greyscale images", every(RGB, grey), Right()),
     Case("images with a palette", every(RGB, palette), Right()),
-    Case("JPEG called PNG", every(RGB, jpeg), Right()),
+    Case("JPEG named PNG", every(RGB, jpeg), Right()),
     Case(
         "depth as JPEG",
         every(DEPTH, jpeg),
-        Says("{seq}/depth/1305031102.000000.png: is a colour image where depth belongs; are colour and depth swapped?"),
+        Says(
+            "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
+            " and depth are not swapped"
+        ),
     ),
     Case(
-        "depth in floating point with NaN",
+        "floating-point depth with NaN",
         every(DEPTH, lambda i: saved(np.full((HEIGHT, WIDTH), np.nan, np.float32), "tiff")),
-        Says(
-            "{seq}/depth/1305031102.000000.png: has floating-point numbers; export the depth again, as PNG of 16 bits"
-        ),
+        Says("{seq}/depth/1305031102.000000.png: is a floating-point image; export depth as 16-bit PNG"),
     ),
     Case(
         "depth as OpenEXR",
         every(DEPTH, lambda i: b"v/1\x01\x02\0\0\0channels\0chlist\0" + bytes(300)),
-        Says("{seq}/depth/1305031102.000000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it again"),
+        Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "depth as a NumPy array",
         every(DEPTH, lambda i: b"\x93NUMPY\x01\0v\0{'descr': '<f4', 'fortran_order': False}" + bytes(300)),
-        Says("{seq}/depth/1305031102.000000.png: is no image, or none of PNG, JPEG or TIFF; copy or export it again"),
+        Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
-        "depth of 32 bits, negative for none",
+        "32-bit depth, negative for missing depth",
         every(DEPTH, lambda i: saved(np.where(np.arange(WIDTH) % 8, depth(), -1).astype(np.int32), "tiff")),
         Right(),
     ),
@@ -247,77 +261,80 @@ CASES = [
         "colour smaller than depth",
         every(RGB, lambda i: png(cv2.resize(colour(*way(i)), (WIDTH // 2, HEIGHT // 2)))),
         Says(
-            "{seq}/depth/1305031102.000000.png: has 80x60 pixels, its colour image 40x30; export the depth"
-            " that is registered to colour, pixel by pixel"
+            "{seq}/depth/1305031102.000000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            " that is registered to the colour image"
         ),
     ),
     Case(
         "depth smaller than colour",
         every(DEPTH, lambda i: png(depth()[::2, ::2])),
         Says(
-            "{seq}/depth/1305031102.000000.png: has 40x30 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel"
+            "{seq}/depth/1305031102.000000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            " that is registered to the colour image"
         ),
     ),
     Case(
-        "both smaller than the camera",
+        "both images smaller than the camera",
         all_of(every(RGB, lambda i: png(SMALL)), every(DEPTH, lambda i: png(depth()[::2, ::2]))),
         Says(
-            "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, the camera 80x60; give the camera that took"
-            " it with --camera"
+            "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, but the camera has 80x60; pass the camera of"
+            " these images with --camera"
         ),
     ),
     Case(
-        "a colour image of another size",
+        "one colour image of another size",
         write(RGB[3], png(SMALL)),
         Says(
-            "{seq}/depth/1305031102.300000.png: has 80x60 pixels, its colour image 40x30; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
-            " go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " with --resume {out})",
             kept=3,
         ),
     ),
     Case(
-        "a depth image of another size",
+        "one depth image of another size",
         write(DEPTH[3], png(depth()[::2, ::2])),
         Says(
-            "{seq}/depth/1305031102.300000.png: has 40x30 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
-            " go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " with --resume {out})",
             kept=3,
         ),
     ),
     Case(
-        "a depth image on its side",
+        "one rotated depth image",
         write(DEPTH[3], png(depth().T.copy())),
         Says(
-            "{seq}/depth/1305031102.300000.png: has 60x80 pixels, its colour image 80x60; export the depth"
-            " that is registered to colour, pixel by pixel (the results of the 3 frames before are in {out};"
-            " go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " with --resume {out})",
             kept=3,
         ),
     ),
     Case(
-        "a colour image that claims 40000 x 40000 pixels",
+        "colour image with a header of 40000 x 40000 pixels",
         write(RGB[3], bomb(40000, 40000, 8, 2)),
         Says(
-            "{seq}/rgb/1305031102.300000.png: claims more than 64 million pixels; copy or export it again"
-            " (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
+            " export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
     Case(
-        "a depth image that claims 40000 x 40000 pixels",
+        "depth image with a header of 40000 x 40000 pixels",
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
         Says(
-            "{seq}/depth/1305031102.300000.png: claims more than 64 million pixels; copy or export it again"
-            " (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy"
+            " or export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
     ),
     Case(
-        "the first image claims 40000 x 40000 pixels",
+        "first image with a header of 40000 x 40000 pixels",
         write(RGB[0], bomb(40000, 40000, 8, 2)),
-        Says("{seq}/rgb/1305031102.000000.png: claims more than 64 million pixels; copy or export it again"),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: has more than 64 million pixels according to its header; copy or"
+            " export it again"
+        ),
     ),
 ]

@@ -1,4 +1,4 @@
-"""Folders as other datasets have them."""
+"""Folders in the layouts of other datasets."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ LOST = 4 * b"-inf -inf -inf -inf\n"
 
 
 def pose(frame: int) -> str:
-    """True pose; turned by next to nothing, as orientations that never change are taken for placeholders."""
+    """True pose, with a tiny rotation: constant orientations count as placeholders in the evaluation."""
     x, y = way(frame)
     return f"1 0 0 {x / FOCAL}\n0 1 {-1e-6 * frame} {y / FOCAL}\n0 {1e-6 * frame} 1 0\n0 0 0 1\n"
 
 
 def take(files: dict[str, bytes]) -> Make:
-    """A folder of these files, given as the sequence."""
+    """Write these files to a new folder and use it as the sequence."""
 
     def make(place: Place) -> None:
         for name, content in files.items():
@@ -34,7 +34,7 @@ def take(files: dict[str, bytes]) -> Make:
 
 
 def scannet() -> dict[str, bytes]:
-    """The sequence as ScanNet's reader exports one."""
+    """Files of the sequence as exported by ScanNet's SensReader."""
     files = {f"intrinsic/intrinsic_{kind}.txt": CAMERA_MATRIX.encode() for kind in ("color", "depth")}
     for i in range(FRAMES):
         files |= {
@@ -46,6 +46,7 @@ def scannet() -> dict[str, bytes]:
 
 
 def seven_scenes() -> dict[str, bytes]:
+    """Files of the sequence in the layout of 7-Scenes."""
     files = {"camera.yaml": CAMERA.replace("5000", "1000").encode()}
     for i in range(FRAMES):
         name = f"frame-{i:06d}"
@@ -55,7 +56,7 @@ def seven_scenes() -> dict[str, bytes]:
 
 
 def images() -> dict[str, bytes]:
-    """The images alone, with names that are no times."""
+    """Images without lists, with names that are not timestamps."""
     files = {"camera.yaml": CAMERA.encode()}
     for i in range(FRAMES):
         files |= {f"rgb/{i}.png": png(colour(*way(i))), f"depth/{i}.png": png(depth())}
@@ -63,20 +64,22 @@ def images() -> dict[str, bytes]:
 
 
 def changed(files: dict[str, bytes], name: str, change: Callable[[bytes], bytes]) -> Make:
+    """Use these files as the sequence, after a change of one of them."""
     return take(files | {name: change(files[name])})
 
 
 def larger_colour(files: dict[str, bytes]) -> dict[str, bytes]:
-    """Colour of another camera than depth."""
+    """Replace the colour images by larger ones, which need the colour camera."""
     return files | {f"color/{i}.png": png(np.zeros((97, 130, 3), np.uint8)) for i in range(FRAMES)}
 
 
 def without(files: dict[str, bytes], *prefixes: str) -> dict[str, bytes]:
+    """Remove the files whose names begin with a prefix."""
     return {name: content for name, content in files.items() if not name.startswith(prefixes)}
 
 
 def openloris(sensors: str | bytes) -> Make:
-    """The sequence as an OpenLORIS package."""
+    """Convert the sequence to an OpenLORIS package."""
 
     def rename(place: Place) -> None:
         (place.folder / "rgb.txt").rename(place.folder / "color.txt")
@@ -86,78 +89,75 @@ def openloris(sensors: str | bytes) -> Make:
     return all_of(rename, write("sensors.yaml", sensors))
 
 
-def icl_nuim(truth: str) -> Make:
-    """The sequence as one of ICL-NUIM: frames have numbers."""
+def icl_nuim(groundtruth: str) -> Make:
+    """Convert the sequence to the layout of ICL-NUIM, with frame numbers instead of timestamps."""
     listed = "".join(f"{i} depth/{stamp}.png {i} rgb/{stamp}.png\n" for i, stamp in enumerate(STAMPS))
-    return all_of(write("associations.txt", listed), write("traj0.gt.freiburg", truth))
+    return all_of(write("associations.txt", listed), write("traj0.gt.freiburg", groundtruth))
 
 
 CASES = [
     Case("ScanNet", take(scannet()), Right()),
-    Case("ScanNet, a lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Right()),
+    Case("ScanNet, lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Right()),
     Case("ScanNet, no poses", take(without(scannet(), "pose")), Right(ate=None)),
     Case(
-        "ScanNet, a pose breaks off",
+        "ScanNet, truncated pose",
         changed(scannet(), "pose/3.txt", half),
         Says(
-            "{root}/take/pose/3.txt: is no matrix of 3 or 4 lines with as many numbers each; copy it again"
-            " (the results are in {out})",
+            "{root}/take/pose/3.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "ScanNet, a pose that is no motion",
+        "ScanNet, pose that is not a rigid transform",
         changed(scannet(), "pose/3.txt", lambda content: 4 * b"1 2 3 4\n"),
         Says(
-            "{root}/take/pose/3.txt: is not the motion of a camera, a rotation and a place; copy it again"
-            " (the results are in {out})",
+            "{root}/take/pose/3.txt: is not a valid rigid transform; copy it again (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "ScanNet, the camera breaks off",
+        "ScanNet, truncated camera",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", half),
-        Says(
-            "{root}/take/intrinsic/intrinsic_depth.txt: is no matrix of 3 or 4 lines with as many numbers"
-            " each; copy it again"
-        ),
+        Says("{root}/take/intrinsic/intrinsic_depth.txt: is not a 3x3 or 4x4 matrix; copy it again"),
     ),
     Case(
-        "ScanNet, a camera of NaN",
+        "ScanNet, camera of NaN",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", lambda content: 4 * b"nan nan nan nan\n"),
         Says(
-            "{root}/take/intrinsic/intrinsic_depth.txt: is no camera matrix, with focal lengths on its"
-            " diagonal; copy it again"
+            "{root}/take/intrinsic/intrinsic_depth.txt: is not a camera matrix with focal lengths of at least 1"
+            " pixel on its diagonal; copy it again"
         ),
     ),
     Case(
-        "ScanNet, a colour camera of zeros",
+        "ScanNet, colour camera of zeros",
         changed(larger_colour(scannet()), "intrinsic/intrinsic_color.txt", lambda content: 4 * b"0 0 0 0\n"),
         Says(
-            "{root}/take/intrinsic/intrinsic_color.txt: is no camera matrix, with focal lengths on its"
-            " diagonal; copy it again"
+            "{root}/take/intrinsic/intrinsic_color.txt: is not a camera matrix with focal lengths of at least 1"
+            " pixel on its diagonal; copy it again"
         ),
     ),
     Case(
         "ScanNet, no depth",
         take(without(scannet(), "depth") | {"depth/x.txt": b""}),
-        Says("{root}/take: no colour image has the number of a depth image; do they belong together?"),
+        Says(
+            "{root}/take: no colour image has the same frame number as a depth image; check that both belong to"
+            " the same recording"
+        ),
     ),
     Case("7-Scenes", take(seven_scenes()), Right()),
     Case(
-        "7-Scenes, a pose of words",
+        "7-Scenes, pose of words",
         changed(seven_scenes(), "frame-000003.pose.txt", lambda content: b"lost\n"),
         Says(
-            "{root}/take/frame-000003.pose.txt: is no matrix of 3 or 4 lines with as many numbers each;"
-            " copy it again (the results are in {out})",
+            "{root}/take/frame-000003.pose.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "7-Scenes, an image breaks off",
+        "7-Scenes, truncated image",
         changed(seven_scenes(), "frame-000003.depth.png", half),
         Says(
-            "{root}/take/frame-000003.depth.png: is truncated or broken; copy or download it again (the"
+            "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again (the"
             " results of the 3 frames before are in {out}; go on with --resume {out})",
             kept=3,
         ),
@@ -168,65 +168,68 @@ CASES = [
         Right(1, ate=None),
     ),
     Case(
-        "ICL-NUIM, the truth breaks off",
+        "ICL-NUIM, truncated ground truth",
         icl_nuim("1 2 3\n"),
         Says(
-            "{seq}/traj0.gt.freiburg: line 1 is '1 2 3' where stamp tx ty tz qx qy qz qw is expected;"
-            " repair it (the results are in {out})",
+            "{seq}/traj0.gt.freiburg: line 1 is '1 2 3', expected timestamp tx ty tz qx qy qz qw; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "OpenLORIS, a broken camera",
+        "OpenLORIS, invalid camera file",
         openloris("%YAML:1.0\nd400_color_optical_frame: [\n"),
-        Says("{seq}/sensors.yaml: is no YAML as OpenCV writes it (...); copy it again"),
+        Says("{seq}/sensors.yaml: is not valid OpenCV YAML (...); copy it again"),
     ),
     Case(
         "OpenLORIS, no camera",
         openloris("%YAML:1.0\nt265_fisheye1_optical_frame:\n   width: 848\n"),
         Says(
-            "{seq}/sensors.yaml: holds no d400_color_optical_frame with width, height, intrinsics; copy it"
-            " again, or give --camera"
+            "{seq}/sensors.yaml: has no d400_color_optical_frame with width, height and intrinsics; copy it"
+            " again, or pass --camera"
         ),
     ),
     Case(
-        "OpenLORIS, a matrix that OpenCV falls over",
+        "OpenLORIS, matrix that crashes OpenCV",
         openloris(
             "%YAML:1.0\nd400_color_optical_frame:\n   intrinsics: !!opencv-matrix\n      rows: 1\n      col: 4\n"
             "      dt: d\n      data: [ 1., 2. ]\n"
         ),
         Says(
-            "{seq}/sensors.yaml: holds no d400_color_optical_frame with width, height, intrinsics; copy it"
-            " again, or give --camera"
+            "{seq}/sensors.yaml: has no d400_color_optical_frame with width, height and intrinsics; copy it"
+            " again, or pass --camera"
         ),
     ),
     Case(
-        "OpenLORIS, a camera of noise",
+        "OpenLORIS, camera file of random bytes",
         openloris(NOISE),
-        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it is YAML as OpenCV writes it"),
+        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it contains YAML written by OpenCV"),
     ),
     Case(
-        "images without times",
+        "images without timestamps",
         take(images()),
-        Says("{root}/take: names such as 0.png are no times; give the frames a second with --fps"),
+        Says("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
     ),
-    Case("images without times, --fps", all_of(take(images()), options("--fps", "10")), Right(ate=None)),
+    Case("images without timestamps, with --fps", all_of(take(images()), options("--fps", "10")), Right(ate=None)),
     Case(
         "images, one without depth",
         all_of(take(without(images(), "depth/7")), options("--fps", "10")),
         Right(7, ate=None),
     ),
     Case(
-        "images whose names have nothing in common",
+        "images that cannot be paired",
         all_of(take(without(images(), "depth") | {"depth/a.png": png(depth())}), options("--fps", "10")),
         Says(
-            "{root}/take: has 8 colour and 1 depth images whose names have nothing in common; name those"
-            " that belong together alike"
+            "{root}/take: has 8 colour and 1 depth images that cannot be paired by name; give the two images of"
+            " a frame the same name"
         ),
     ),
     Case(
         "images in too many folders",
         all_of(take(images() | {"rgb_right/0.png": png(colour(0))}), options("--fps", "10")),
-        Says("{root}/take: holds rgb, rgb_right, depth; leave one folder of colour and one of depth images there"),
+        Says(
+            "{root}/take: has too many image folders (rgb, rgb_right, depth); keep one folder of colour and one"
+            " of depth images"
+        ),
     ),
 ]

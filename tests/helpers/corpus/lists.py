@@ -1,4 +1,4 @@
-"""Lists of images."""
+"""Damaged lists of images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, edit, re
 def stamps_as(
     form: Callable[[float], str], files: tuple[str, ...] = ("rgb.txt", "depth.txt", "groundtruth.txt")
 ) -> Make:
-    """Write the stamps of these files in another way."""
+    """Write the timestamps of these files in another form."""
 
     def make(place: Place) -> None:
         for file in files:
@@ -23,7 +23,7 @@ def stamps_as(
 
 
 def renamed(change: Callable[[str, str], str], *, absolute: bool = False) -> Make:
-    """Rename the images, by kind and stamp, in the lists too."""
+    """Rename the images by kind and timestamp, also in the lists."""
 
     def make(place: Place) -> None:
         for kind in ("rgb", "depth"):
@@ -39,7 +39,7 @@ def renamed(change: Callable[[str, str], str], *, absolute: bool = False) -> Mak
 
 
 def lines(file: str, change: Callable[[list[str]], list[str]]) -> Make:
-    """Change the lines of a file."""
+    """Change the lines of a file of the sequence."""
 
     def make(place: Place) -> None:
         path = place.folder / file
@@ -49,7 +49,7 @@ def lines(file: str, change: Callable[[list[str]], list[str]]) -> Make:
 
 
 def associated(form: str) -> Make:
-    """One list instead of two, with lines of a form in which C and D are the images."""
+    """Write ``associations.txt`` by a line format in which T, C and D are timestamp, colour and depth image."""
 
     def make(place: Place) -> None:
         text = "".join(
@@ -61,6 +61,8 @@ def associated(form: str) -> Make:
 
 
 def frames(keep: list[int]) -> Make:
+    """Keep only these frames in the lists."""
+
     def pick(listed: list[str]) -> list[str]:
         return [listed[i] for i in keep]
 
@@ -68,6 +70,8 @@ def frames(keep: list[int]) -> Make:
 
 
 def loop(file: str) -> Make:
+    """Replace a file by a symlink to itself."""
+
     def make(place: Place) -> None:
         path = place.folder / file
         path.unlink()
@@ -77,6 +81,8 @@ def loop(file: str) -> Make:
 
 
 def folder_at(file: str) -> Make:
+    """Replace a file by a folder."""
+
     def make(place: Place) -> None:
         path = place.folder / file
         path.unlink()
@@ -88,8 +94,8 @@ def folder_at(file: str) -> Make:
 FIRST = f"rgb/{STAMPS[0]}.png"
 
 CASES = [
-    Case("Windows line ends", edit("rgb.txt", replaced("\n", "\r\n")), Right()),
-    Case("line ends of old Macs", edit("rgb.txt", replaced("\n", "\r")), Right()),
+    Case("Windows line endings", edit("rgb.txt", replaced("\n", "\r\n")), Right()),
+    Case("classic Mac line endings", edit("rgb.txt", replaced("\n", "\r")), Right()),
     Case("byte order mark", edit("rgb.txt", lambda content: b"\xef\xbb\xbf" + content), Right()),
     Case(
         "comments and blank lines",
@@ -98,187 +104,210 @@ CASES = [
     ),
     Case("tabs", edit("rgb.txt", replaced(" ", "\t")), Right()),
     Case("commas", edit("rgb.txt", replaced(" ", ", ")), Right()),
-    Case("spaces in names", renamed(lambda kind, stamp: f"{kind}/my take {stamp}.png"), Right()),
-    Case("names that are no ASCII", renamed(lambda kind, stamp: f"bilder für {kind}/{stamp} 深度.png"), Right()),
+    Case("spaces in file names", renamed(lambda kind, stamp: f"{kind}/my take {stamp}.png"), Right()),
+    Case("non-ASCII file names", renamed(lambda kind, stamp: f"bilder für {kind}/{stamp} 深度.png"), Right()),
     Case("absolute paths", renamed(lambda kind, stamp: f"{kind}/{stamp}.png", absolute=True), Right()),
-    Case("paths through the parent", edit("rgb.txt", replaced("rgb/", "../seq/rgb/")), Right()),
-    Case("a stamp twice", lines("rgb.txt", lambda listed: [*listed, listed[3].split()[0] + f" {FIRST}"]), Right()),
-    Case("lines in any order", lines("rgb.txt", lambda listed: [listed[i] for i in (3, 0, 7, 1, 6, 2, 5, 4)]), Right()),
-    Case("stamps in nanoseconds", stamps_as(lambda s: f"{s * 1e9:.0f}"), Right()),
-    Case("stamps in microseconds", stamps_as(lambda s: f"{s * 1e6:.0f}"), Right()),
-    Case("stamps in milliseconds", stamps_as(lambda s: f"{s * 1e3:.0f}"), Right()),
+    Case("paths through the parent folder", edit("rgb.txt", replaced("rgb/", "../seq/rgb/")), Right()),
     Case(
-        "milliseconds since the start",
+        "duplicate timestamp", lines("rgb.txt", lambda listed: [*listed, listed[3].split()[0] + f" {FIRST}"]), Right()
+    ),
+    Case("lines out of order", lines("rgb.txt", lambda listed: [listed[i] for i in (3, 0, 7, 1, 6, 2, 5, 4)]), Right()),
+    Case("timestamps in nanoseconds", stamps_as(lambda s: f"{s * 1e9:.0f}"), Right()),
+    Case("timestamps in microseconds", stamps_as(lambda s: f"{s * 1e6:.0f}"), Right()),
+    Case("timestamps in milliseconds", stamps_as(lambda s: f"{s * 1e3:.0f}"), Right()),
+    Case(
+        "milliseconds since the first frame",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e3:.0f}"),
         Says(
-            "{seq}: by their stamps its images lie 100 s apart; stamps are seconds, divide them in the"
-            " lists if they are milli- or nanoseconds"
+            "{seq}: the images are 100 s apart according to their timestamps; convert the timestamps in the"
+            " lists to seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
     Case(
-        "nanoseconds since the start",
+        "nanoseconds since the first frame",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e9:.0f}"),
         Says(
-            "{seq}: by their stamps its images lie 9.99999e+07 s apart; stamps are seconds, divide them in"
-            " the lists if they are milli- or nanoseconds"
+            "{seq}: the images are 9.99999e+07 s apart according to their timestamps; convert the timestamps in"
+            " the lists to seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
-    Case("negative stamps", stamps_as(lambda s: f"{s - 1305031102.35:.6f}"), Right()),
+    Case("negative timestamps", stamps_as(lambda s: f"{s - 1305031102.35:.6f}"), Right()),
     Case(
-        "stamps that are words",
+        "words instead of timestamps",
         lines("rgb.txt", lambda listed: [f"frame{i} {line.split()[1]}" for i, line in enumerate(listed)]),
-        Says("{seq}/rgb.txt: line 1 has 'frame0' where a stamp in seconds is expected; repair or remove the line"),
+        Says("{seq}/rgb.txt: line 1 has 'frame0', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
-        "a stamp that is not a number",
+        "timestamp NaN",
         lines("rgb.txt", lambda listed: [*listed[:3], f"nan {FIRST}", *listed[3:]]),
-        Says("{seq}/rgb.txt: line 4 has 'nan' where a stamp in seconds is expected; repair or remove the line"),
+        Says("{seq}/rgb.txt: line 4 has 'nan', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
-        "an infinite stamp",
+        "infinite timestamp",
         lines("depth.txt", lambda listed: [f"inf {FIRST}", *listed]),
-        Says("{seq}/depth.txt: line 1 has 'inf' where a stamp in seconds is expected; repair or remove the line"),
+        Says("{seq}/depth.txt: line 1 has 'inf', expected a timestamp in seconds; correct or remove the line"),
     ),
     Case(
-        "lists of two clocks",
+        "lists with different clocks",
         stamps_as(lambda s: f"{s + 10:.6f}", ("depth.txt",)),
         Says(
-            "{seq}: no stamp in rgb.txt lies within 0.02 s of one in depth.txt; do both lists belong to this sequence?"
+            "{seq}: no timestamp in rgb.txt is within 0.02 s of one in depth.txt; check that both lists belong"
+            " to the same recording"
         ),
     ),
     Case(
         "empty list",
         write("rgb.txt", ""),
-        Says("{seq}/rgb.txt: lists no images; a list has lines of a stamp and a file, copy it again"),
+        Says("{seq}/rgb.txt: lists no images; a list has a timestamp and a file name on each line, copy it again"),
     ),
     Case(
-        "list of comments only",
+        "list with comments only",
         write("depth.txt", "# depth maps\n"),
-        Says("{seq}/depth.txt: lists no images; a list has lines of a stamp and a file, copy it again"),
+        Says("{seq}/depth.txt: lists no images; a list has a timestamp and a file name on each line, copy it again"),
     ),
     Case(
-        "no list of colour",
+        "missing colour list",
         remove("rgb.txt"),
-        Says("{seq}: has no rgb.txt; the sequence's images are listed in rgb.txt and depth.txt"),
+        Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
     Case(
-        "no list of depth",
+        "missing depth list",
         remove("depth.txt"),
-        Says("{seq}: has no depth.txt; the sequence's images are listed in rgb.txt and depth.txt"),
+        Says("{seq}: has no depth.txt; list the images of the sequence in rgb.txt and depth.txt"),
     ),
-    Case("no lists at all", remove("rgb.txt", "depth.txt"), Right(ate=None)),
+    Case("missing lists", remove("rgb.txt", "depth.txt"), Right(ate=None)),
     Case(
-        "a listed image is not there",
+        "missing listed image",
         remove(FIRST),
-        Says("{seq}/rgb/1305031102.000000.png: is listed but not there (1 such files); copy the whole sequence again"),
-    ),
-    Case(
-        "a line breaks off",
-        edit("rgb.txt", lambda content: content[:-5]),
-        Says("{seq}/rgb/1305031102.700000: is listed but not there (1 such files); copy the whole sequence again"),
-    ),
-    Case(
-        "a line without a name",
-        lines("rgb.txt", lambda listed: [*listed[:3], STAMPS[3], *listed[4:]]),
-        Says("{seq}/rgb.txt: line 4 is '1305031102.300000' where a stamp and a file are expected; repair or remove it"),
-    ),
-    Case(
-        "a listed image is a folder",
-        folder_at(FIRST),
-        Says("{seq}/rgb/1305031102.000000.png: is listed but not there (1 such files); copy the whole sequence again"),
-    ),
-    Case(
-        "a listed image is a loop of links",
-        loop(FIRST),
-        Says("{seq}/rgb/1305031102.000000.png: is listed but not there (1 such files); copy the whole sequence again"),
-    ),
-    Case(
-        "the list is a loop of links",
-        loop("rgb.txt"),
-        Says("{seq}: has no rgb.txt; the sequence's images are listed in rgb.txt and depth.txt"),
-    ),
-    Case(
-        "the list is a folder",
-        folder_at("rgb.txt"),
-        Says("{seq}: has no rgb.txt; the sequence's images are listed in rgb.txt and depth.txt"),
-    ),
-    Case(
-        "a name with a zero byte",
-        edit("rgb.txt", replaced("rgb/", "rgb/\0")),
         Says(
-            "{seq}/rgb/\\x001305031102.000000.png: is listed but not there (8 such files); copy the whole"
+            "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
             " sequence again"
         ),
     ),
     Case(
-        "a name with control characters",
-        edit("rgb.txt", replaced("rgb/", "rgb/\x1b[31m")),
+        "truncated last line",
+        edit("rgb.txt", lambda content: content[:-5]),
         Says(
-            "{seq}/rgb/\\x1b[31m1305031102.000000.png: is listed but not there (8 such files); copy the"
+            "{seq}/rgb/1305031102.700000: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
+    ),
+    Case(
+        "line without a file name",
+        lines("rgb.txt", lambda listed: [*listed[:3], STAMPS[3], *listed[4:]]),
+        Says(
+            "{seq}/rgb.txt: line 4 is '1305031102.300000', expected a timestamp and a file name; correct or remove it"
+        ),
+    ),
+    Case(
+        "listed image is a folder",
+        folder_at(FIRST),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
+    ),
+    Case(
+        "listed image is a symlink loop",
+        loop(FIRST),
+        Says(
+            "{seq}/rgb/1305031102.000000.png: is listed but does not exist (1 missing in total); copy the whole"
+            " sequence again"
+        ),
+    ),
+    Case(
+        "list is a symlink loop",
+        loop("rgb.txt"),
+        Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
+    ),
+    Case(
+        "list is a folder",
+        folder_at("rgb.txt"),
+        Says("{seq}: has no rgb.txt; list the images of the sequence in rgb.txt and depth.txt"),
+    ),
+    Case(
+        "file name with a zero byte",
+        edit("rgb.txt", replaced("rgb/", "rgb/\0")),
+        Says(
+            "{seq}/rgb/\\x001305031102.000000.png: is listed but does not exist (8 missing in total); copy the"
             " whole sequence again"
         ),
     ),
     Case(
-        "a name of 5000 letters",
-        edit("rgb.txt", replaced("rgb/", "rgb/" + 5000 * "x")),
+        "file name with control characters",
+        edit("rgb.txt", replaced("rgb/", "rgb/\x1b[31m")),
         Says(
-            "{seq}/rgb/...1305031102.000000.png: cannot be read (File name too long); check its name and"
-            " who may read it"
+            "{seq}/rgb/\\x1b[31m1305031102.000000.png: is listed but does not exist (8 missing in total); copy"
+            " the whole sequence again"
         ),
     ),
     Case(
-        "a list in Latin-1",
+        "file name with 5000 letters",
+        edit("rgb.txt", replaced("rgb/", "rgb/" + 5000 * "x")),
+        Says("{seq}/rgb/...1305031102.000000.png: cannot be read (File name too long); check its name and permissions"),
+    ),
+    Case(
+        "list in Latin-1",
         edit("rgb.txt", lambda content: b"# Gr\xfc\xdfe\n" + content),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says(
+            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
+            " name on each line"
+        ),
     ),
     Case(
-        "a list in UTF-16",
+        "list in UTF-16",
         edit("rgb.txt", lambda content: content.decode().encode("utf-16")),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says(
+            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
+            " name on each line"
+        ),
     ),
     Case(
-        "an image for a list",
+        "image instead of a list",
         lambda place: (place.folder / FIRST).rename(place.folder / "rgb.txt"),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says(
+            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
+            " name on each line"
+        ),
     ),
     Case("associations", associated("T C T D"), Right()),
     Case("associations, depth first", associated("T D T C"), Right()),
     Case(
-        "associations without the second stamp",
+        "associations without the second timestamp",
         associated("T C D"),
         Says(
             "{seq}/associations.txt: line 1 is '1305031102.000000 rgb/1305031102.000000.png"
-            " depth/1305031102.000000.png' where stamp, file, stamp, file are expected; write it so, or"
-            " leave only rgb.txt and depth.txt there"
+            " depth/1305031102.000000.png', expected timestamp, file, timestamp, file; correct it, or remove"
+            " this list and use rgb.txt and depth.txt"
         ),
     ),
     Case(
-        "associations without names",
+        "associations without file names",
         associated("T T"),
         Says(
-            "{seq}/associations.txt: line 1 is '1305031102.000000 1305031102.000000' where stamp, file,"
-            " stamp, file are expected; write it so, or leave only rgb.txt and depth.txt there"
+            "{seq}/associations.txt: line 1 is '1305031102.000000 1305031102.000000', expected timestamp, file,"
+            " timestamp, file; correct it, or remove this list and use rgb.txt and depth.txt"
         ),
     ),
     Case(
-        "associations with a line of a million blanks",
+        "associations with a million blanks in a line",
         write("associations.txt", "1" + 1_000_000 * " " + "x"),
         Says(
-            "{seq}/associations.txt: line 1 is '1 ...' where stamp, file, stamp, file are expected;"
-            " write it so, or leave only rgb.txt and depth.txt there"
+            "{seq}/associations.txt: line 1 is '1 ...', expected timestamp, file, timestamp, file; correct it,"
+            " or remove this list and use rgb.txt and depth.txt"
         ),
     ),
     Case(
-        "associations of the names only",
+        "associations with file names only",
         associated("C D"),
         Says(
-            "{seq}/associations.txt: line 1 is 'rgb/1305031102.000000.png depth/1305031102.000000.png'"
-            " where stamp, file, stamp, file are expected; write it so, or leave only rgb.txt and depth.txt"
-            " there"
+            "{seq}/associations.txt: line 1 is 'rgb/1305031102.000000.png depth/1305031102.000000.png',"
+            " expected timestamp, file, timestamp, file; correct it, or remove this list and use rgb.txt and"
+            " depth.txt"
         ),
     ),
     Case("one frame", frames([3]), Right(1, ate=None)),
     Case("two frames", frames([3, 4]), Right(2, ate=None)),
-    Case("frames dropped at random", frames([0, 1, 3, 4, 7]), Right(5)),
+    Case("frames dropped irregularly", frames([0, 1, 3, 4, 7]), Right(5)),
     Case("depth for every other frame", lines("depth.txt", lambda listed: listed[::2]), Right(4)),
 ]

@@ -1,4 +1,4 @@
-"""What is given as ``--seq``."""
+"""Invalid values of ``--seq``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from helpers.corpus.recordings import noise
 
 
 def folder(name: str | bytes, *files: str) -> Make:
-    """Another folder with these files of text, given as the sequence."""
+    """Create a folder with these text files and use it as the sequence."""
 
     def make(place: Place) -> None:
         path = place.root / name
@@ -19,8 +19,8 @@ def folder(name: str | bytes, *files: str) -> Make:
     return make
 
 
-def called(name: str) -> Make:
-    """The sequence's folder under another name."""
+def rename(name: str) -> Make:
+    """Rename the sequence's folder."""
 
     def make(place: Place) -> None:
         place.seq = str(place.folder.rename(place.root / name))
@@ -29,99 +29,101 @@ def called(name: str) -> Make:
 
 
 def loop(place: Place) -> None:
+    """Create a symlink to itself."""
     (place.root / "loop").symlink_to("loop")
 
 
 CASES = [
-    Case("a folder with a line break in its name", called("two\nlines"), Right()),
-    Case("a folder with what rich and matplotlib obey in its name", called("[red] $x^{$"), Right()),
-    Case("a folder whose name is no UTF-8", called("caf\udce9"), Right()),
-    Case("nothing", seq(""), Says("the name of the sequence is empty; give a name, a folder or a file")),
+    Case("folder name with a line break", rename("two\nlines"), Right()),
+    Case("folder name with markup of rich and matplotlib", rename("[red] $x^{$"), Right()),
+    Case("folder name that is not UTF-8", rename("caf\udce9"), Right()),
+    Case("empty name", seq(""), Says("the sequence name is empty; pass a name, a folder or a file")),
     Case(
-        "an empty folder",
+        "empty folder",
         folder("none"),
         Says(
-            "{root}/none: is no sequence of a known kind; the README lists them, the simplest is a folder"
-            " with a folder rgb of colour and a folder depth of depth images"
+            "{root}/none: is not a sequence of a supported format; the README lists the formats, the simplest"
+            " is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
         ),
     ),
     Case(
-        "a folder of texts",
+        "folder of text files",
         folder("none", "a.txt", "b.txt"),
         Says(
-            "{root}/none: is no sequence of a known kind; the README lists them, the simplest is a folder"
-            " with a folder rgb of colour and a folder depth of depth images"
+            "{root}/none: is not a sequence of a supported format; the README lists the formats, the simplest"
+            " is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
         ),
     ),
     Case(
-        "a text file",
+        "text file",
         seq("{seq}/rgb.txt"),
         Says(
-            "{seq}/rgb.txt: is no sequence of a known kind; the README lists them, the simplest is a folder"
-            " with a folder rgb of colour and a folder depth of depth images"
+            "{seq}/rgb.txt: is not a sequence of a supported format; the README lists the formats, the simplest"
+            " is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
         ),
     ),
     Case(
-        "an image",
+        "image",
         seq("{seq}/rgb/1305031102.000000.png"),
         Says(
-            "{seq}/rgb/1305031102.000000.png: is no sequence of a known kind; the README lists them, the"
-            " simplest is a folder with a folder rgb of colour and a folder depth of depth images"
+            "{seq}/rgb/1305031102.000000.png: is not a sequence of a supported format; the README lists the"
+            " formats, the simplest is a folder with colour images in a subfolder rgb and depth images in a"
+            " subfolder depth"
         ),
     ),
     Case(
-        "an archive",
+        "archive",
         noise("rgbd_dataset_freiburg3_walking_xyz.tgz"),
-        Says("{root}/rgbd_dataset_freiburg3_walking_xyz.tgz: is an archive; unpack it and give the folder"),
+        Says("{root}/rgbd_dataset_freiburg3_walking_xyz.tgz: is an archive; unpack it and pass the folder"),
     ),
     Case(
-        "a recording of ScanNet's",
+        "ScanNet recording",
         noise("scene0000_00.sens"),
         Says(
-            "{root}/scene0000_00.sens: is a recording of ScanNet's; export it with ScanNet's SensReader and"
-            " give that folder"
+            "{root}/scene0000_00.sens: is a ScanNet recording; export it with ScanNet's SensReader and pass the"
+            " exported folder"
         ),
     ),
     Case(
-        "a loop of links",
+        "symlink loop",
         all_of(loop, seq("{root}/loop")),
-        Says("{root}/loop: is neither a file, a folder nor the name of a sequence; did you mean demo or fr3/w/xyz?"),
+        Says("{root}/loop: is not a file, a folder or the name of a sequence; did you mean demo or fr3/w/xyz?"),
     ),
     Case(
-        "a name that is nearly right",
+        "misspelled name",
         seq("fr3/w/xzy"),
         Says(
-            "fr3/w/xzy: is neither a file, a folder nor the name of a sequence; did you mean fr3/w/xyz or"
-            " fr3/w/rpy or fr3/s/xyz?"
+            "fr3/w/xzy: is not a file, a folder or the name of a sequence; did you mean fr3/w/xyz or fr3/w/rpy"
+            " or fr3/s/xyz?"
         ),
     ),
     Case(
-        "a path that is not there",
+        "missing path",
         seq("{root}/none"),
-        Says("{root}/none: is neither a file, a folder nor the name of a sequence; did you mean demo or fr3/w/xyz?"),
+        Says("{root}/none: is not a file, a folder or the name of a sequence; did you mean demo or fr3/w/xyz?"),
     ),
     Case(
-        "a path of 5000 letters",
+        "path with 5000 letters",
         seq(5000 * "x"),
-        Says("...: cannot be read (File name too long); check its name and who may read it"),
+        Says("...: cannot be read (File name too long); check its name and permissions"),
     ),
     Case(
-        "the home of nobody",
+        "home folder of an unknown user",
         seq("~nobody-of-this-name/take"),
         Says(
-            "~nobody-of-this-name/take: is neither a file, a folder nor the name of a sequence; did you"
-            " mean demo or fr3/w/xyz?"
+            "~nobody-of-this-name/take: is not a file, a folder or the name of a sequence; did you mean demo or"
+            " fr3/w/xyz?"
         ),
     ),
-    Case("a camera that is not plugged in", seq("realsense:"), Says("realsense: ...")),
+    Case("camera that is not connected", seq("realsense:"), Says("realsense: ...")),
     Case(
         "--rgb-topic for a folder",
         options("--rgb-topic", "/rgb"),
-        Says("{seq}: is a folder in TUM layout, --rgb-topic means nothing to it; leave it out"),
+        Says("{seq}: is a folder in TUM layout, which does not support --rgb-topic; remove this option"),
     ),
     Case(
         "--fps for a folder with lists",
         options("--fps", "30"),
-        Says("{seq}: is a folder in TUM layout, --fps means nothing to it; leave it out"),
+        Says("{seq}: is a folder in TUM layout, which does not support --fps; remove this option"),
     ),
 ]

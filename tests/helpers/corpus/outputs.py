@@ -175,7 +175,7 @@ CASES = [
         "the sequence is removed during the run",
         lambda place: None,
         Says(
-            "{seq}/rgb/1305031102.400000.png: is listed but not there; copy the sequence again, whole (the"
+            "{seq}/rgb/1305031102.400000.png: is listed but does not exist; copy the whole sequence again (the"
             " results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
@@ -211,8 +211,8 @@ CASES = [
         "an image that may not be read",
         unreadable(f"rgb/{STAMPS[4]}.png"),
         Says(
-            "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check who may read it"
-            " (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check its permissions (the"
+            " results of the 4 frames before are in {out}; go on with --resume {out})",
             kept=4,
         ),
         lambda place: without_root_rights(),
@@ -220,13 +220,13 @@ CASES = [
     Case(
         "a folder of images that may not be read",
         unreadable("rgb"),
-        Says("{seq}/rgb/1305031102.000000.png: cannot be read (Permission denied); check its name and who may read it"),
+        Says("{seq}/rgb/1305031102.000000.png: cannot be read (Permission denied); check its name and permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
         "a sequence that may not be read",
         unreadable("."),
-        Says("{seq}/metadata.yaml: cannot be read (Permission denied); check its name and who may read it"),
+        Says("{seq}/metadata.yaml: cannot be read (Permission denied); check its name and permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
@@ -249,8 +249,8 @@ CASES = [
         "true masks of another size",
         write(f"masks/{STAMPS[3]}.png", b"\x89PNG\r\n\x1a\n"),
         Says(
-            "{seq}/masks/1305031102.300000.png: is no image, or none of PNG, JPEG or TIFF; copy or export"
-            " it again (the results are in {out})",
+            "{seq}/masks/1305031102.300000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
+            " results are in {out})",
             kept=8,
         ),
     ),

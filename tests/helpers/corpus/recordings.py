@@ -212,8 +212,8 @@ CASES = [
         "depth of another size",
         bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
         Says(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, its colour"
-            " image 80x60; name depth that is registered to colour with --depth-topic"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, but its colour"
+            " image has 80x60; name depth that is registered to colour with --depth-topic"
         ),
     ),
     Case("depth with NaN", bag("mcap", with_all(DEPTH, with_holes)), Right(ate=None)),
@@ -242,14 +242,14 @@ CASES = [
     Case(
         "broken JPEG",
         bag("mcap", with_all(RGB, lambda to, at: to.compressed(at, "jpeg", b"\xff\xd8\xff" + NOISE))),
-        Says("{root}/take/take.mcap: /camera/color/image_raw: is truncated or broken; copy or download it again"),
+        Says("{root}/take/take.mcap: /camera/color/image_raw: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "compressed depth breaks off",
         bag("mcap", with_all(DEPTH, lambda to, at: to.compressed(at, "16UC1; compressedDepth", b"1234"))),
         Says(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is no image, or none of PNG,"
-            " JPEG or TIFF; copy or export it again"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is not a PNG, JPEG or TIFF image;"
+            " copy or export it again"
         ),
     ),
     Case(
@@ -287,6 +287,6 @@ CASES = [
     Case(
         "--fps",
         all_of(bag("mcap"), options("--fps", "30")),
-        Says("{root}/take/take.mcap: is a bag, --fps means nothing to it; leave it out"),
+        Says("{root}/take/take.mcap: is a bag, which does not support --fps; remove this option"),
     ),
 ]

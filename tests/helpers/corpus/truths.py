@@ -1,4 +1,4 @@
-"""Ground truth: it does not touch the run, only the scores."""
+"""Damaged ground truth, which affects only the scores of a run."""
 
 from __future__ import annotations
 
@@ -6,173 +6,179 @@ from helpers.corpus.base import STAMPS
 from helpers.corpus.case import Case, Make, Right, Says, edit, remove, replaced, write
 from helpers.corpus.lists import folder_at, lines, loop, stamps_as
 
-TRUTH = "groundtruth.txt"
+GROUND_TRUTH = "groundtruth.txt"
 
 
 def number(column: int, value: str, row: int = 3) -> Make:
-    """Write another number into a row."""
+    """Replace a number in a row of the ground truth."""
 
     def change(listed: list[str]) -> list[str]:
         words = listed[row].split()
         words[column] = value
         return [*listed[:row], " ".join(words), *listed[row + 1 :]]
 
-    return lines(TRUTH, change)
+    return lines(GROUND_TRUTH, change)
 
 
 def quaternions(change: object) -> Make:
+    """Change all numbers of all quaternions."""
+
     def rows(listed: list[str]) -> list[str]:
         return [" ".join([*line.split()[:4], *(change(word) for word in line.split()[4:])]) for line in listed]
 
-    return lines(TRUTH, rows)
+    return lines(GROUND_TRUTH, rows)
 
-
-X = Says("?", kept=8)
 
 CASES = [
-    Case("no ground truth", remove(TRUTH), Right(ate=None)),
-    Case("Windows line ends", edit(TRUTH, replaced("\n", "\r\n")), Right()),
-    Case("byte order mark", edit(TRUTH, lambda content: b"\xef\xbb\xbf" + content), Right()),
-    Case("comments", edit(TRUTH, lambda content: b"# ground truth trajectory\n" + content), Right()),
-    Case("commas", edit(TRUTH, replaced(" ", ",")), Right()),
-    Case("backwards", lines(TRUTH, lambda listed: listed[::-1]), Right()),
-    Case("a stamp twice", lines(TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()),
-    Case("quaternions twice as long", quaternions(lambda word: str(2 * float(word))), Right()),
-    Case("stamps in nanoseconds as NumPy writes them", stamps_as(lambda s: f"{s * 1e9:.18e}", (TRUTH,)), Right()),
+    Case("no ground truth", remove(GROUND_TRUTH), Right(ate=None)),
+    Case("Windows line endings", edit(GROUND_TRUTH, replaced("\n", "\r\n")), Right()),
+    Case("byte order mark", edit(GROUND_TRUTH, lambda content: b"\xef\xbb\xbf" + content), Right()),
+    Case("comments", edit(GROUND_TRUTH, lambda content: b"# ground truth trajectory\n" + content), Right()),
+    Case("commas", edit(GROUND_TRUTH, replaced(" ", ",")), Right()),
+    Case("lines in reverse order", lines(GROUND_TRUTH, lambda listed: listed[::-1]), Right()),
     Case(
-        "a position that is not a number",
+        "duplicate timestamp", lines(GROUND_TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()
+    ),
+    Case("quaternions of length two", quaternions(lambda word: str(2 * float(word))), Right()),
+    Case(
+        "timestamps in nanoseconds in NumPy's notation",
+        stamps_as(lambda s: f"{s * 1e9:.18e}", (GROUND_TRUTH,)),
+        Right(),
+    ),
+    Case(
+        "position NaN",
         number(1, "nan"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "an infinite position",
+        "infinite position",
         number(2, "-inf"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "a position too large for a number",
+        "position beyond float64",
         number(2, "1e999"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "a position beyond the solar system",
+        "position far beyond the earth's radius",
         number(1, "1e200"),
         Says(
-            "{seq}/groundtruth.txt: line 4 has a position more than 1e+07 m away; remove or repair it (the"
+            "{seq}/groundtruth.txt: line 4 has a position more than 1e+07 m away; correct or remove it (the"
             " results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "a quaternion of NaN",
+        "quaternion of NaN",
         quaternions(lambda word: "nan"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a number that is not finite; remove or repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a number that is not finite; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "a quaternion of zeros",
+        "zero quaternion",
         quaternions(lambda word: "0"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a quaternion of zeros, or far from a unit one;"
-            " remove or repair it (the results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "a quaternion of next to nothing",
+        "quaternion of tiny numbers",
         quaternions(lambda word: "1e-200"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a quaternion of zeros, or far from a unit one;"
-            " remove or repair it (the results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "an endless quaternion",
+        "quaternion of huge numbers",
         quaternions(lambda word: "1e200"),
         Says(
-            "{seq}/groundtruth.txt: line 1 has a quaternion of zeros, or far from a unit one;"
-            " remove or repair it (the results are in {out})",
+            "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
+            " remove it (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
         "seven columns",
-        lines(TRUTH, lambda listed: [line.rsplit(maxsplit=1)[0] for line in listed]),
+        lines(GROUND_TRUTH, lambda listed: [line.rsplit(maxsplit=1)[0] for line in listed]),
         Says(
             "{seq}/groundtruth.txt: line 1 is '1305031102.000000 0.000000000 0.062500000 0.000000000"
-            " 0.000000000 0.000000000 0.' where stamp tx ty tz qx qy qz qw is expected; repair it (the"
+            " 0.000000000 0.000000000 0.', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the"
             " results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "words",
+        "word instead of a number",
         number(3, "unknown"),
         Says(
-            "{seq}/groundtruth.txt: line 4 is '1305031102.300000 0.093750000 0.156250000 unknown"
-            " 0.000001500 0.000000000 0.0000' where stamp tx ty tz qx qy qz qw is expected; repair it (the"
-            " results are in {out})",
+            "{seq}/groundtruth.txt: line 4 is '1305031102.300000 0.093750000 0.156250000 unknown 0.000001500"
+            " 0.000000000 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "empty",
-        write(TRUTH, ""),
+        "empty file",
+        write(GROUND_TRUTH, ""),
         Says(
-            "{seq}/groundtruth.txt: holds no pose; lines of stamp tx ty tz qx qy qz qw are expected, copy"
-            " it again (the results are in {out})",
+            "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
+            " qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
         "comments only",
-        write(TRUTH, "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"),
+        write(GROUND_TRUTH, "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"),
         Says(
-            "{seq}/groundtruth.txt: holds no pose; lines of stamp tx ty tz qx qy qz qw are expected, copy"
-            " it again (the results are in {out})",
+            "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
+            " qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "breaks off",
-        edit(TRUTH, lambda content: content[:-30]),
+        "truncated file",
+        edit(GROUND_TRUTH, lambda content: content[:-30]),
         Says(
             "{seq}/groundtruth.txt: line 8 is '1305031102.700000 0.218750000 0.156250000 0.000000000"
-            " 0.000003500 0.0000' where stamp tx ty tz qx qy qz qw is expected; repair it (the results are"
-            " in {out})",
+            " 0.000003500 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
+            " are in {out})",
             kept=8,
         ),
     ),
     Case(
-        "binary",
-        write(TRUTH, bytes(range(256))),
+        "binary file",
+        write(GROUND_TRUTH, bytes(range(256))),
         Says(
-            "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines"
-            " of stamp tx ty tz qx qy qz qw (the results are in {out})",
+            "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines of"
+            " timestamp tx ty tz qx qy qz qw (the results are in {out})",
             kept=8,
         ),
     ),
-    Case("a folder", folder_at(TRUTH), Right(ate=None)),
-    Case("a loop of links", loop(TRUTH), Right(ate=None)),
+    Case("folder instead of a file", folder_at(GROUND_TRUTH), Right(ate=None)),
+    Case("symlink loop", loop(GROUND_TRUTH), Right(ate=None)),
     Case(
-        "another clock",
-        stamps_as(lambda s: f"{s + 3600:.6f}", (TRUTH,)),
+        "different clock",
+        stamps_as(lambda s: f"{s + 3600:.6f}", (GROUND_TRUTH,)),
         Says(
             "seq: has no scores, only 0 poses of the estimate (1305031102.00 to 1305031102.70 s) are within"
             " 0.02 s of the ground truth (1305034702.00 to 1305034702.70 s), at least 3 are needed; check that"
@@ -182,7 +188,7 @@ CASES = [
     ),
     Case(
         "two poses",
-        lines(TRUTH, lambda listed: listed[:2]),
+        lines(GROUND_TRUTH, lambda listed: listed[:2]),
         Says(
             "seq: has no scores, only 2 poses of the estimate (1305031102.00 to 1305031102.70 s) are within"
             " 0.02 s of the ground truth (1305031102.00 to 1305031102.10 s), at least 3 are needed; check that"
@@ -190,6 +196,6 @@ CASES = [
             kept=8,
         ),
     ),
-    Case("the camera never moves", number(0, STAMPS[3]), Right()),
-    Case("every orientation the same", quaternions(lambda word: word[:3]), Right()),
+    Case("camera at rest", number(0, STAMPS[3]), Right()),
+    Case("constant orientation", quaternions(lambda word: word[:3]), Right()),
 ]

@@ -96,8 +96,8 @@ CASES = [
         "depth of another size",
         with_video("depth.mkv", depth()[::2, ::2].copy()),
         Says(
-            "{root}/take/depth.mkv: has 40x30 pixels, its colour image 80x60; export the depth that is"
-            " registered to colour, pixel by pixel"
+            "{root}/take/depth.mkv: has 40x30 pixels, but its colour image has 80x60; export depth that is"
+            " registered to the colour image"
         ),
     ),
     Case(
@@ -112,21 +112,23 @@ CASES = [
         "no camera",
         all_of(videos, lambda place: (place.root / "take" / "camera.yaml").unlink()),
         Says(
-            "{root}/take: says nothing about its camera; put a camera.yaml there (fx, fy, cx, cy, width,"
-            " height, depth_scale) or give --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
+            "{root}/take: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height,"
+            " depth_scale) or pass --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
         ),
     ),
     Case(
-        "--fps 0", all_of(videos, options("--fps", "0")), Says("--fps 0: give frames a second, between 0.01 and 10000")
+        "--fps 0",
+        all_of(videos, options("--fps", "0")),
+        Says("--fps 0: is out of range; pass between 0.01 and 10000 Hz"),
     ),
     Case(
         "--fps that is no number",
         all_of(videos, options("--fps", "nan")),
-        Says("--fps nan: give frames a second, between 0.01 and 10000"),
+        Says("--fps nan: is out of range; pass between 0.01 and 10000 Hz"),
     ),
     Case(
         "--fps without end",
         all_of(videos, options("--fps", "inf")),
-        Says("--fps inf: give frames a second, between 0.01 and 10000"),
+        Says("--fps inf: is out of range; pass between 0.01 and 10000 Hz"),
     ),
 ]

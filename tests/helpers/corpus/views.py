@@ -1,4 +1,4 @@
-"""Images that are whole and show nothing to go by."""
+"""Intact image files with content that cannot be tracked."""
 
 from __future__ import annotations
 
@@ -11,26 +11,27 @@ from helpers.corpus.lists import lines
 
 
 def plain(value: int) -> bytes:
+    """Colour image with a single grey value."""
     return png(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
 
 
 def still(listed: list[str]) -> list[str]:
-    """Every pose that of the first line."""
+    """Give every line the pose of the first one."""
     return [f"{line.split()[0]} {listed[0].split(maxsplit=1)[1]}" for line in listed]
 
 
 def covered(place: Place) -> None:
-    """30 frames, of which the middle 20 show a hand before the lens."""
+    """Write 30 frames, of which the middle 20 are black and without depth: the camera is covered."""
     for kind in ("rgb", "depth"):
         lines = []
         for i in range(30):
             stamp = f"{1305031102 + i / 10:.6f}"
             x, y = way(min(i, 4)) if i < 25 else way(min(i - 20, 7))
-            seen = {
+            images = {
                 "rgb": plain(0) if 5 <= i < 25 else png(colour(x, y)),
                 "depth": png(depth(0.0 if 5 <= i < 25 else 1.0)),
             }
-            (place.folder / kind / f"{stamp}.png").write_bytes(seen[kind])
+            (place.folder / kind / f"{stamp}.png").write_bytes(images[kind])
             lines.append(f"{stamp} {kind}/{stamp}.png\n")
         (place.folder / f"{kind}.txt").write_text("".join(lines))
     (place.folder / "groundtruth.txt").unlink()
@@ -65,7 +66,7 @@ CASES = [
         ),
     ),
     Case(
-        "depth all 65535",
+        "saturated depth",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 65535, np.uint16))),
         Says(
             "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
@@ -74,7 +75,7 @@ CASES = [
         ),
     ),
     Case(
-        "black, without depth",
+        "black without depth",
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
         Says(
             "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
@@ -86,8 +87,8 @@ CASES = [
         "depth in metres",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1, np.uint16))),
         Says(
-            "{seq}: the depth of its first frame is 0.0002 m in the middle, at 5000 units per metre;"
-            " correct the camera's depth_scale (1000 where depth is in millimetres), or the images"
+            "{seq}: the median depth of the first frame is 0.0002 m at 5000 units per metre; correct the"
+            " camera's depth_scale (1000 if depth is in millimetres) or the depth images"
         ),
     ),
     Case(
@@ -96,20 +97,20 @@ CASES = [
         Right(ate=0.1, note="the ground truth is 5 times as large as the estimate: check depth_scale"),
     ),
     Case(
-        "depth of a camera that counts metres",
+        "depth scale of one unit per metre",
         edit("camera.yaml", replaced("5000", "1")),
         Says(
-            "{seq}: the depth of its first frame is 5e+03 m in the middle, at 1 units per metre; correct"
-            " the camera's depth_scale (1000 where depth is in millimetres), or the images"
+            "{seq}: the median depth of the first frame is 5e+03 m at 1 units per metre; correct the camera's"
+            " depth_scale (1000 if depth is in millimetres) or the depth images"
         ),
     ),
     Case(
-        "the same image all the time",
+        "identical images",
         all_of(every(RGB, lambda i: png(colour(*way(0)))), lines("groundtruth.txt", still)),
         Right(),
     ),
     Case("one black frame", write(RGB[4], plain(0)), Right(lost=1, ate=0.03)),
     Case("one frame without depth", write(DEPTH[4], png(depth(0.0))), Right()),
-    Case("the first frame is black", write(RGB[0], plain(0)), Right(lost=1, ate=0.03)),
-    Case("the camera is covered for two seconds", covered, Right(30, lost=20, ate=None)),
+    Case("first frame black", write(RGB[0], plain(0)), Right(lost=1, ate=0.03)),
+    Case("camera covered for two seconds", covered, Right(30, lost=20, ate=None)),
 ]

@@ -1,4 +1,4 @@
-"""Sequences whose every frame is a colour file and a depth file."""
+"""Sequences with one colour file and one depth file per frame."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from torch import Tensor
 
 from v3d_torch.datasets.images import read_colour, read_depth
 from v3d_torch.datasets.lists import ImagePair
-from v3d_torch.datasets.stored import ReadTruth, StoredSequence
+from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 
 class PairedImages(StoredSequence):
-    """Frames of a folder of images.
+    """Sequence of paired colour and depth image files.
 
     Args:
-        folder: the sequence's folder.
-        pairs: the frames' files, in order of time.
-        camera: that took them.
-        groundtruth: see `StoredSequence`.
-        name: for tables; None takes the folder's name.
+        folder: Folder of the sequence.
+        pairs: Image files of the frames, in temporal order.
+        camera: Camera of all frames.
+        groundtruth: Function that reads the measured poses of the camera.
+        name: Name used in tables; None for the folder's name.
 
     Raises:
-        InputError: a file is missing.
+        InputError: If an image file is missing.
     """
 
     def __init__(
@@ -32,14 +32,14 @@ class PairedImages(StoredSequence):
         folder: Path,
         pairs: list[ImagePair],
         camera: PinholeCamera,
-        groundtruth: ReadTruth | None = None,
+        groundtruth: ReadGroundTruth | None = None,
         *,
         name: str | None = None,
     ) -> None:
         missing = [file for pair in pairs for file in (pair.colour, pair.depth) if not (folder / file).is_file()]
         if missing:
             raise InputError(
-                f"{folder / missing[0]}: is listed but not there ({len(missing)} such files);"
+                f"{folder / missing[0]}: is listed but does not exist ({len(missing)} missing in total);"
                 " copy the whole sequence again"
             )
         stamps, delays = [pair.stamp for pair in pairs], [pair.depth_delay for pair in pairs]
@@ -49,7 +49,10 @@ class PairedImages(StoredSequence):
 
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         colour, depth = (self.folder / file for file in (self._pairs[index].colour, self._pairs[index].depth))
-        return self._registered((colour, self._colour(colour)), (depth, read_depth(depth, self.camera.depth_scale)))
+        return self._registered(
+            (colour, self._read_colour(colour)), (depth, read_depth(depth, self.camera.depth_scale))
+        )
 
-    def _colour(self, path: Path) -> Tensor:
+    def _read_colour(self, path: Path) -> Tensor:
+        """Read the colour image of a frame; a subclass can also warp the image to the depth camera."""
         return read_colour(path)

@@ -1,4 +1,4 @@
-"""Names of the TUM RGB-D sequences: the full one, the short one of the paper's tables, and what people type."""
+"""Names of the TUM RGB-D sequences: full names, the short names of the paper's tables, and other spellings."""
 
 from __future__ import annotations
 
@@ -35,21 +35,22 @@ _WITHOUT_VALIDATION = {
     "freiburg2_pioneer_slam3",
     "freiburg3_teddy",
 }
-_PLAIN = [f"{camera}_{tail}" for camera, tails in _SEQUENCES.items() for tail in tails.split()]
+_BASE_NAMES = [f"{camera}_{tail}" for camera, tails in _SEQUENCES.items() for tail in tails.split()]
 
 SEQUENCES: tuple[str, ...] = tuple(
-    _PREFIX + name for name in _PLAIN + [f"{name}_validation" for name in _PLAIN if name not in _WITHOUT_VALIDATION]
+    _PREFIX + name
+    for name in _BASE_NAMES + [f"{name}_validation" for name in _BASE_NAMES if name not in _WITHOUT_VALIDATION]
 )
-"""Every sequence of the benchmark, by its folder's name."""
+"""Full names of all sequences of the benchmark, which are the names of their folders."""
 
 PAPER_SEQUENCES: tuple[str, ...] = tuple(
     f"{_PREFIX}freiburg3_{people}_{motion}"
     for people in ("sitting", "walking")
     for motion in ("xyz", "halfsphere", "static", "rpy")
 )
-"""The eight sequences of the paper's evaluation (Sec. IV)."""
+"""Full names of the eight sequences of the paper's evaluation (Sec. IV)."""
 
-_WORDS = {
+_ABBREVIATIONS = {
     "s": "sitting",
     "sit": "sitting",
     "w": "walking",
@@ -63,9 +64,9 @@ _WORDS = {
     "ntex": "notexture",
     "val": "validation",
 }
-"""Short words for the parts of a name."""
+"""Full words for the abbreviations in a name."""
 
-_TAILS = {
+_SHORT_TAILS = {
     "office": "long_office_household",
     "long_office": "long_office_household",
     "person": "desk_with_person",
@@ -74,34 +75,34 @@ _TAILS = {
     "nostructure_notexture_near": "nostructure_notexture_near_withloop",
     "nostructure_texture_near": "nostructure_texture_near_withloop",
 }
-"""Short forms of what follows the camera in a name."""
+"""Full forms for the short forms of a tail, the part of a name after the camera."""
 
 
 def canonical_name(name: str) -> str | None:
-    """The full name of a sequence, from any usual way to write it.
+    """Full name of a TUM sequence from any common spelling.
 
     Args:
-        name: such as ``fr3/w/xyz``, ``fr3_walking_xyz``, ``freiburg3-walking-xyz``, ``walking_xyz`` (where only one
-            camera has it) or the full name.
+        name: Name such as ``fr3/w/xyz``, ``fr3_walking_xyz``, ``freiburg3-walking-xyz``, ``walking_xyz`` (if the
+            sequence exists for one camera only) or the full name.
 
     Returns:
-        Such as ``rgbd_dataset_freiburg3_walking_xyz``; None when no sequence is called so.
+        Full name such as ``rgbd_dataset_freiburg3_walking_xyz``; None if no sequence, or more than one, has this name.
     """
     text = re.sub(r"[\s/\\.\-_]+", "_", name.strip().lower()).strip("_").removeprefix("tum_").removeprefix(_PREFIX)
     match = re.fullmatch(r"(?:(?:freiburg|fr)_?([123])_)?(.+)", text)
     if match is None:
         return None
     camera = f"freiburg{match[1]}" if match[1] else r"freiburg\d"
-    words = [_WORDS.get(word, word) for word in match[2].split("_")]
+    words = [_ABBREVIATIONS.get(word, word) for word in match[2].split("_")]
     validation = ["validation"] if words[-1] == "validation" else []
     tail = "_".join(words[: len(words) - len(validation)])
-    tail = "_".join([_TAILS.get(tail, tail), *validation])
+    tail = "_".join([_SHORT_TAILS.get(tail, tail), *validation])
     found = [full for full in SEQUENCES if re.fullmatch(_PREFIX + camera + "_" + re.escape(tail), full)]
     return found[0] if len(found) == 1 else None
 
 
 def short_name(name: str) -> str:
-    """The name for tables: ``fr3/w/xyz`` as in the paper, ``fr1/desk``; a name that is no TUM sequence stays itself."""
+    """Short name of a TUM sequence, such as ``fr3/w/xyz`` or ``fr1/desk``. Any other name is returned unchanged."""
     full = canonical_name(name)
     if full is None:
         return name
@@ -111,17 +112,17 @@ def short_name(name: str) -> str:
 
 
 def download_url(full_name: str) -> str:
-    """Where the benchmark keeps a sequence's archive."""
+    """URL of a sequence's archive on the benchmark's server."""
     camera = full_name.removeprefix(_PREFIX).split("_")[0]
     return f"https://cvg.cit.tum.de/rgbd/dataset/{camera}/{full_name}.tgz"
 
 
-def unknown_name(name: str) -> InputError:
-    """The error for a name that is neither a path nor a sequence; it offers the nearest names."""
+def unknown_name_error(name: str) -> InputError:
+    """Create the error for a name that is not a path or a sequence; it suggests similar names."""
     choices = {short_name(full): full for full in SEQUENCES}
     spellings = {spelling: short for short, full in choices.items() for spelling in (short, full)} | {"demo": "demo"}
-    near = difflib.get_close_matches(name.strip().lower(), spellings, n=3, cutoff=0.5)
-    offers = list(dict.fromkeys(spellings[spelling] for spelling in near)) or ["demo", "fr3/w/xyz"]
+    similar = difflib.get_close_matches(name.strip().lower(), spellings, n=3, cutoff=0.5)
+    suggestions = list(dict.fromkeys(spellings[spelling] for spelling in similar)) or ["demo", "fr3/w/xyz"]
     return InputError(
-        f"{name}: is neither a file, a folder nor the name of a sequence; did you mean {' or '.join(offers)}?"
+        f"{name}: is not a file, a folder or the name of a sequence; did you mean {' or '.join(suggestions)}?"
     )

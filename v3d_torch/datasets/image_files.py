@@ -1,4 +1,4 @@
-"""What the names of image files say of their frames: order, number, time."""
+"""Image files of a folder: order, frame numbers and timestamps from their names."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", "
 _PARTS = re.compile(r"(\D*)(\d*)")
 
 
-def images_in(folder: Path) -> list[Path]:
-    """The images of a folder in the order of their names, numbers compared as numbers: 9.png before 10.png."""
+def list_images(folder: Path) -> list[Path]:
+    """Return the images of a folder sorted by name. Numbers are compared as numbers: 9.png comes before 10.png."""
     files = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith("."))
     return sorted(files, key=lambda path: [(text, int(digits or 0)) for text, digits in _PARTS.findall(path.stem)])
 
 
 def frame_number(path: Path) -> int | None:
-    """The last number in a name, 120 for ``frame-000120.color.jpg``; None where there is none."""
+    """Last number in a file name, such as 120 for ``frame-000120.color.jpg``; None if there is no number."""
     numbers = re.findall(r"\d+", path.stem)
     return int(numbers[-1]) if numbers else None
 
 
-def stamp(path: Path) -> float | None:
-    """Seconds, where the name is a time: ``1305031102.175304.png``, ``1403636579763555584.png``; else None."""
+def stamp_in_name(path: Path) -> float | None:
+    """Timestamp in a file name such as ``1305031102.175304.png`` or ``1403636579763555584.png``, seconds; else None."""
     if match := re.search(r"(?<!\d)(\d+\.\d+)$", path.stem):
         return parse_timestamp(match[1])
     if match := re.search(r"(?<!\d)(\d{13}|\d{16}|\d{19})$", path.stem):  # milli-, micro-, nanoseconds since 1970
@@ -36,22 +36,28 @@ def stamp(path: Path) -> float | None:
     return None
 
 
-def numbered_pairs(folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float) -> list[ImagePair]:
-    """Join the images of equal frame numbers.
+def pair_by_number(folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float) -> list[ImagePair]:
+    """Pair colour and depth images with equal frame numbers.
 
     Args:
-        folder: that the pairs' files are relative to.
-        colour: files with numbers in their names.
-        depth: likewise.
-        rate: numbers a second, for the stamps.
+        folder: Folder of the sequence; the files of the pairs are relative to it.
+        colour: Colour images with numbers in their names.
+        depth: Depth images with numbers in their names.
+        rate: Frame rate, Hz: converts frame numbers to timestamps.
+
+    Returns:
+        Pairs in the order of their frame numbers.
 
     Raises:
-        InputError: no number has both.
+        InputError: If no frame number has both images.
     """
     by_number = [{frame_number(path): path for path in files} for files in (colour, depth)]
     numbers = sorted(number for number in by_number[0].keys() & by_number[1].keys() if number is not None)
     if not numbers:
-        raise InputError(f"{folder}: no colour image has the number of a depth image; do they belong together?")
+        raise InputError(
+            f"{folder}: no colour image has the same frame number as a depth image; check that both belong to the same"
+            " recording"
+        )
     return [
         ImagePair(number / rate, *(str(files[number].relative_to(folder)) for files in by_number)) for number in numbers
     ]

@@ -1,4 +1,4 @@
-"""Names of the TUM sequences, in every way that they are written."""
+"""Names of the TUM sequences in all spellings."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3d_torch.datasets.names import PAPER_SEQUENCES, SEQUENCES, canonical_name, download_url, short_name
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, canonical_name, download_url, short_name
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
-def test_every_sequence_is_known_by_all_its_names(name: str) -> None:
+def test_every_sequence_is_found_by_all_its_names(name: str) -> None:
     plain = name.removeprefix("rgbd_dataset_")
     short = plain.replace("freiburg", "fr")
     camera, tail = short.split("_", 1)
@@ -35,30 +35,30 @@ def test_every_sequence_is_known_by_all_its_names(name: str) -> None:
         ("fr3/w/rpy_val", "freiburg3_walking_rpy_validation"),
     ],
 )
-def test_short_ways_to_write_a_name(alias: str, expected: str) -> None:
+def test_abbreviated_name_gives_full_name(alias: str, expected: str) -> None:
     assert canonical_name(alias) == f"rgbd_dataset_{expected}"
 
 
 @pytest.mark.parametrize(
     "name", ["", "fr3", "xyz", "desk", "fr4/xyz", "fr3/desk", "fr1/floor_validation", "val", "/", "."]
 )
-def test_what_is_no_or_not_one_name(name: str) -> None:
+def test_unknown_or_ambiguous_name_gives_none(name: str) -> None:
     assert canonical_name(name) is None
 
 
 @given(st.text(max_size=30))
-def test_any_text_is_a_name_or_none(text: str) -> None:
+def test_any_text_gives_a_full_name_or_none(text: str) -> None:
     assert canonical_name(text) in (None, *SEQUENCES)
 
 
-def test_names_of_the_paper() -> None:
+def test_paper_sequences_have_the_short_names_of_its_tables() -> None:
     short = [short_name(name) for name in PAPER_SEQUENCES]
     assert short == [f"fr3/{p}/{m}" for p in "sw" for m in ("xyz", "half", "static", "rpy")]
     assert short_name("walkers_desk") == "walkers_desk"
     assert len(set(SEQUENCES)) == len(SEQUENCES) == 80
 
 
-def test_download_url() -> None:
+def test_download_url_is_that_of_the_benchmark() -> None:
     base = "https://cvg.cit.tum.de/rgbd/dataset"
     assert (
         download_url("rgbd_dataset_freiburg3_walking_xyz") == f"{base}/freiburg3/rgbd_dataset_freiburg3_walking_xyz.tgz"

@@ -1,0 +1,114 @@
+"""Matrices in files: plain text (ScanNet, 7-Scenes) and OpenCV's YAML (OpenLORIS-Scene)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from v3d_torch.errors import InputError
+from v3d_torch.io.files import numbered_lines, read_text
+from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.types import Trajectory
+
+_ROTATION_TOLERANCE = 0.01
+"""Maximum deviation of an element of R R^T from the identity: files with few digits round their rotations."""
+
+_MAX_DISTANCE = 1e7
+"""Maximum coordinate of a position, metres: the order of the earth's radius, for poses in a geocentric frame."""
+
+_OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
+"""First line and matrix tag of OpenCV's files. Neither is valid YAML, so both are removed before parsing."""
+
+
+def read_matrix(path: Path) -> NDArray[np.float64]:
+    """Read a square matrix from a text file with one line per row.
+
+    Args:
+        path: Path of the text file.
+
+    Returns:
+        Matrix, float64, shape (3, 3) or (4, 4); it can contain ``inf`` and ``nan``.
+
+    Raises:
+        InputError: If the file cannot be read or does not contain such a matrix.
+    """
+    rows = [line.replace(",", " ").split() for _, line in numbered_lines(path, "a matrix has a line per row")]
+    try:
+        matrix = np.array(rows, dtype=np.float64)
+    except ValueError:
+        matrix = np.empty(0)
+    if matrix.shape not in ((3, 3), (4, 4)):
+        raise InputError(f"{path}: is not a 3x3 or 4x4 matrix; copy it again")
+    return matrix
+
+
+def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
+    """Read camera poses from text files with one 4x4 matrix each.
+
+    Args:
+        files: Pose files by timestamp (seconds), in temporal order.
+
+    Returns:
+        Camera-to-world poses. Poses that are not finite mark lost tracking and are skipped; None if no pose is left.
+
+    Raises:
+        InputError: If a file does not contain a 4x4 matrix, or the matrix is not a rigid transform.
+    """
+    poses = {}
+    for stamp, path in files.items():
+        T_wc = read_matrix(path)
+        if T_wc.shape != (4, 4):
+            raise InputError(f"{path}: is not a 4x4 pose matrix; copy it again")
+        if not np.isfinite(T_wc).all():
+            continue
+        R = T_wc[:3, :3]
+        if (
+            np.abs(T_wc).max() > _MAX_DISTANCE
+            or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE
+            or np.linalg.det(R) < 0
+        ):
+            raise InputError(f"{path}: is not a valid rigid transform; copy it again")
+        poses[stamp] = T_wc
+    if not poses:
+        return None
+    return Trajectory(torch.tensor(list(poses), dtype=torch.float64), torch.from_numpy(np.stack(list(poses.values()))))
+
+
+def read_opencv_yaml(path: Path) -> Any:
+    """Read a YAML file written by OpenCV.
+
+    Standard YAML parsers reject OpenCV's dialect, and OpenCV's own parser is not robust against damaged files.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        Content of the file. Matrices are mappings, see `opencv_matrix`.
+
+    Raises:
+        InputError: If the file cannot be read or is not valid.
+    """
+    text = read_text(path, "it contains YAML written by OpenCV")
+    try:
+        return parse_yaml(text.removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, ""))
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid OpenCV YAML ({error}); copy it again") from error
+
+
+def opencv_matrix(node: Any, *shape: int) -> NDArray[np.float64]:
+    """Convert a matrix node of `read_opencv_yaml` to an array of the given shape (row-major).
+
+    Raises:
+        ValueError: If the node is not a matrix with this number of elements.
+    """
+    data = node.get("data") if isinstance(node, dict) else None
+    if not isinstance(data, list) or len(data) != prod(shape):
+        raise ValueError(f"not a matrix of {prod(shape)} numbers")
+    # YAML parses numbers such as 1e-05, which have no decimal point, as strings.
+    return np.array([float(number) for number in data], dtype=np.float64).reshape(shape)
