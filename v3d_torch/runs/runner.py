@@ -12,7 +12,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from v3d_torch.cli.console import ProgressBar, progress_bars, result_folder, track
-from v3d_torch.cli.stage_table import stage_table
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, changed, find_config, load_config
 from v3d_torch.datasets import RGBDStream, open_source
@@ -26,6 +25,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.stage_table import stage_table
 from v3d_torch.runs.state import empty_map
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.viz.viewer import make_viewer
