@@ -21,8 +21,8 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def table(name: str) -> str:
-    """Rows of the parameters of ``v3d_torch.<name>``, as its ``--help`` has them."""
-    command = get_command(import_module(f"v3d_torch.{name}").app)
+    """Rows of the parameters of the command ``<name>``, as its ``--help`` has them."""
+    command = get_command(import_module(f"v3d_torch.cli.{name}").app)
     context: Any = command.make_context(name, [], resilient_parsing=True)
     rows = ["| | |", "|---|---|"]
     for parameter in command.params:
