@@ -49,8 +49,8 @@ def speed_table(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield a line per contender: speed on each sequence, then its ratio to ORB-SLAM3."""
     rows = {(cells["contender"], cells["sequence"]): cells for cells in rows_of(measurements)}
     sequences = unique(sequence for _, sequence in rows)
-    frames = {sequence: cells["frames"] for (_, sequence), cells in rows.items()}
-    headings = [f"{sequence} ({kind(sequence)}), {frames[sequence]} frames" for sequence in sequences]
+    frames = {sequence: cells["frames"] for (_, sequence), cells in rows.items() if cells["frames"] != "-"}
+    headings = [f"{sequence} ({kind(sequence)}), {frames.get(sequence, '-')} frames" for sequence in sequences]
     ratios = [f"relative to ORB-SLAM3, {sequence}" for sequence in sequences]
     yield row(["frames per second (CPU ms per frame)", *headings, *ratios])
     yield row(["---", *["---:"] * (2 * len(sequences))])
