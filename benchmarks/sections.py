@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
-from described import PEERS, kind, sequence_notes
+from descriptions import PEERS, kind, sequence_notes
 from storage import Measurement
 from tables import accuracy_table, bullets, flat, notes, pivot, provenance, rows_of, speed_table, unique
 
@@ -59,8 +59,8 @@ def speed_section(measurements: Sequence[Measurement], stages: Sequence[Measurem
         yield ""
         yield (
             "Time of each stage, ms per frame. Stages run in parallel with those of the next frame, so that the sum"
-            " can exceed the time of a frame. `background` is the free-space check, `motion` the odometry, `bundle` local"
-            " bundle adjustment. `v3d-torch run --profile` prints such a table for any run."
+            " can exceed the time of a frame. `background` is the free-space check, `motion` the odometry, `bundle`"
+            " local bundle adjustment. `v3d-torch run --profile` prints such a table for any run."
         )
         yield ""
         yield from pivot(rows_of(stages), "stage", "sequence", "ms")

@@ -156,7 +156,7 @@ def main() -> None:
         lines += ["", f"## {sequence}", "", *speed_table(turns), "", *stage_table(turns), "", *failures(turns)]
         cells = {"sequence": Path(sequence).name}
         speed_rows += [cells | measured for measured in contender_rows(turns)]
-        stage_rows += [cells | measured for measured in stage_times(turns)]
+        stage_rows += [cells | measured for measured in stage_times(turns) if measured["contender"] == OURS[0]]
     measurements = {"speed": Measurement(heading, speed_rows), "stages": Measurement(heading, stage_rows)}
     publish(lines, options, parser, measurements)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from described import describe, kind, published
+from descriptions import describe, kind, published
 from storage import Measurement, Row
 
 from v3d_torch.evaluation.cells import row
@@ -130,7 +130,7 @@ def provenance(measurements: Sequence[Measurement], key: str | None = None) -> I
 
     Args:
         measurements: Measurements of a table.
-        key: Cell that tells the rows of several measurements apart.
+        key: Cell that distinguishes the rows of several measurements.
     """
     for measurement in measurements:
         heading = measurement.heading

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from described import sequence_list
+from descriptions import sequence_list
 from sections import SECTIONS
 from storage import RESULTS, load
 from tables import accuracy_table, commits, speed_table

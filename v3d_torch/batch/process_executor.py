@@ -20,7 +20,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 
 _STOP_LATENCY = 0.2
-"""Longest delay until a stop request is noticed, seconds: short for a user who waits, long beside a check."""
+"""Longest delay until a stop request is noticed, seconds: hardly noticeable, and the checks cost nothing."""
 
 _SPAWN = get_context("spawn")
 """New interpreters instead of forks: a fork would copy threads and locks of the libraries in use."""
