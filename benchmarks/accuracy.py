@@ -1,8 +1,8 @@
-"""Accuracy of the whole system on sequences in TUM layout, beside other systems' figures, as Markdown.
+"""Accuracy of the whole system on sequences in TUM layout, beside other systems, as Markdown.
 
 ``python benchmarks/accuracy.py`` runs ``python -m v3d_torch.run`` for each sequence, configuration and seed, one after
-the other, so that no run slows another. A run that fails is shown with its sentence. ``--peers`` runs other systems on
-the same frames. The figures of those that are not rerun come from ``peers.yaml`` and, on the paper's sequences, from
+the other, so that no run slows another. A failed run is listed with its error message. ``--peers`` runs other systems
+on the same frames. The figures of systems that are not run come from ``peers.yaml`` and, on the paper's sequences, from
 its tables.
 """
 
@@ -20,11 +20,12 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import yaml
-from command import command_line, publish, takes_vocabulary
+from command import add_vocabulary_option, make_parser, publish
 from contenders import PEERS
 from contenders.process import ContenderError, failure, measure
-from heading import heading
-from sequences import listed, located, trained_vocabulary
+from heading import make_heading
+from sequences import list_sequences, locate_sequence, trained_vocabulary
+from storage import Measurement, Row
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import InputError, V3DError
@@ -45,7 +46,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run gave: the figures of its ``metrics.json``, or the sentence it failed with."""
+    """Outcome of one run.
+
+    Attributes:
+        sequence: Name of the sequence.
+        configuration: Configuration or peer.
+        seed: Seed of the run.
+        metrics: Values of its ``metrics.json``; None if it failed.
+        failure: Error message, if it failed.
+    """
 
     sequence: str
     configuration: str
@@ -55,38 +64,40 @@ class Outcome:
 
     @property
     def ate(self) -> float | None:
-        """RMSE in metres; None where the run failed or could not be scored."""
+        """ATE RMSE, metres; None if the run failed or has no score."""
         score = self.metrics.get("ate") if self.metrics else None
         return score["rmse"] if score else None
 
     def __str__(self) -> str:
-        """One line for whoever waits."""
+        """Return a one-line description for the screen."""
         result = f"failed: {self.failure}"
         if self.metrics is not None:
-            score = "no score (no true poses, or too few that match)" if self.ate is None else f"ATE {self.ate:.4f} m"
-            result = f"{score}, {self.metrics['fps']:.1f} frames a second"
+            ate = (
+                "no score (no ground truth, or too few matching poses)" if self.ate is None else f"ATE {self.ate:.4f} m"
+            )
+            result = f"{ate}, {self.metrics['fps']:.1f} frames per second"
         return f"{self.sequence}, {self.configuration}, seed {self.seed}: {result}"
 
 
 def run(sequence: str, configuration: str, seed: int, data_root: Path) -> Outcome:
-    """Run the system once, in a process and a temporary folder of its own."""
-    source = ["--seq", located(sequence, data_root), "--data-root", str(data_root)]
+    """Run the system once in a new process with a temporary folder."""
+    source = ["--seq", locate_sequence(sequence, data_root), "--data-root", str(data_root)]
     with TemporaryDirectory() as out:
-        # -P: the package imported here, whose commit heads the table, not one that the working folder may hold.
+        # -P: the package imported here, whose commit is in the heading, not one in the working folder.
         command = [sys.executable, "-P", "-m", "v3d_torch.run", *source, "--seed", str(seed), "--out", out]
         done = subprocess.run(command + CONFIGURATIONS[configuration], capture_output=True, text=True)  # noqa: S603
         if done.returncode:
-            sentence = failure(done).replace(out, "its temporary folder")
-            return Outcome(sequence, configuration, seed, None, sentence)
+            message = failure(done).replace(out, "its temporary folder")
+            return Outcome(sequence, configuration, seed, None, message)
         metrics = json.loads((Path(out) / "metrics.json").read_text(encoding="utf-8"))
     return Outcome(sequence, configuration, seed, metrics)
 
 
 def run_peer(sequence: str, peer: str, turn: int, data_root: Path, vocabulary: Path | None) -> Outcome:
-    """Run another system once on the same frames, and score it as ours is."""
+    """Run another system once on the same frames and score it in the same way."""
     try:
-        measured = measure(peer, located(sequence, data_root), data_root, vocabulary=vocabulary)
-        truth = load_sequence(located(sequence, data_root), data_root=data_root).groundtruth
+        measured = measure(peer, locate_sequence(sequence, data_root), data_root, vocabulary=vocabulary)
+        truth = load_sequence(locate_sequence(sequence, data_root), data_root=data_root).groundtruth
     except (ContenderError, V3DError) as error:
         return Outcome(sequence, peer, turn, None, str(error))
     poses = 0 if measured.trajectory is None else len(measured.trajectory)
@@ -102,7 +113,7 @@ def run_peer(sequence: str, peer: str, turn: int, data_root: Path, vocabulary: P
 
 
 def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root: Path) -> Iterator[str]:
-    """A row per sequence: ATE of each configuration and peer that ran, then the known figures of those that did not."""
+    """Yield a row per sequence: ATE of each configuration and peer that ran, then published ATE of other systems."""
     sequences = unique(outcome.sequence for outcome in outcomes)
     configurations = unique(outcome.configuration for outcome in outcomes)
     peers = {sequence: known_scores(sequence, known) for sequence in sequences}
@@ -118,8 +129,8 @@ def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root
 
 
 def runs_table(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """A row per sequence and configuration: how many frames were found and how, and how fast."""
-    yield row(["sequence", "configuration", "runs failed", *TrackingStatus, "coverage", "frames a second"])
+    """Yield a row per sequence and configuration: frames by tracking status, coverage and speed."""
+    yield row(["sequence", "configuration", "runs failed", *TrackingStatus, "coverage", "frames per second"])
     yield row(["---"] * 2 + ["---:"] * (3 + len(TrackingStatus)))
     for sequence, configuration in unique((outcome.sequence, outcome.configuration) for outcome in outcomes):
         runs = [o for o in outcomes if (o.sequence, o.configuration) == (sequence, configuration)]
@@ -131,22 +142,35 @@ def runs_table(outcomes: Sequence[Outcome]) -> Iterator[str]:
         yield row([sequence, configuration, failed, *statuses, coverage, fps])
 
 
+def accuracy_rows(outcomes: Sequence[Outcome]) -> Iterator[Row]:
+    """Yield a row per sequence and system, for `storage`."""
+    for sequence, system in unique((outcome.sequence, outcome.configuration) for outcome in outcomes):
+        runs = [o for o in outcomes if (o.sequence, o.configuration) == (sequence, system)]
+        metrics = [outcome.metrics for outcome in runs if outcome.metrics is not None]
+        cells = {"sequence": Path(sequence).name, "system": system, "ate": ate_cell(runs)}
+        if metrics:
+            cells |= {"frames": str(metrics[0]["frames"]), "fps": spread([m["fps"] for m in metrics], ".1f")}
+            if any(m.get("coverage", 1) < 1 for m in metrics):
+                cells["poses"] = spread([m["coverage"] for m in metrics], ".0%") + " of the frames"
+        yield cells
+
+
 def notes(outcomes: Sequence[Outcome], known: dict[str, Any]) -> Iterator[str]:
-    """What the tables cannot say: each failure, and what is to be known of the sequences and the peers."""
+    """Yield remarks: every failure, and notes on the sequences and the peers."""
     yield from (f"- {outcome}" for outcome in outcomes if outcome.ate is None)
-    spoken: dict[str, list[str]] = {}
+    notes_of: dict[str, list[str]] = {}
     for outcome in outcomes:
-        of_sequence = known["sequences"].get(Path(outcome.sequence).name, {}).get("notes", [])
-        of_scores = outcome.metrics.get("notes", []) if outcome.metrics else []
-        for note in [*of_sequence, *of_scores]:
-            spoken.setdefault(note, []).append(outcome.sequence)
-    yield from (f"- {', '.join(unique(sequences))}: {note}" for note, sequences in spoken.items())
+        sequence_notes = known["sequences"].get(Path(outcome.sequence).name, {}).get("notes", [])
+        score_notes = outcome.metrics.get("notes", []) if outcome.metrics else []
+        for note in [*sequence_notes, *score_notes]:
+            notes_of.setdefault(note, []).append(outcome.sequence)
+    yield from (f"- {', '.join(unique(sequences))}: {note}" for note, sequences in notes_of.items())
     if any(Path(outcome.sequence).name in known["sequences"] for outcome in outcomes):
         yield f"- {known['about']}"
 
 
 def known_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
-    """ATE RMSE in metres by system, as it was measured elsewhere."""
+    """Return the ATE RMSE in metres of systems that were measured elsewhere, by system."""
     if (paper := paper_sequence(sequence)) is not None:
         scores = paper_scores()["ate"][paper]
         return {f"{name} (paper)": f"{score.rmse:.4f}" for name, score in scores.items() if score.rmse is not None}
@@ -155,7 +179,7 @@ def known_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
 
 
 def description(sequence: str, known: dict[str, Any], data_root: Path) -> str:
-    """What the sequence is: as ``peers.yaml`` has it, else the first line of its README."""
+    """Return the description of a sequence in ``peers.yaml``, else the first line of its README."""
     name = Path(sequence).name
     if name in known["sequences"]:
         return known["sequences"][name]["what"]
@@ -165,7 +189,7 @@ def description(sequence: str, known: dict[str, Any], data_root: Path) -> str:
 
 
 def ate_cell(runs: Sequence[Outcome]) -> str:
-    """Median and range over the seeds, with the failures among them."""
+    """Format median and range of the ATE over the seeds, and the number of failed runs."""
     failed = sum(outcome.metrics is None for outcome in runs)
     if failed == len(runs):
         return "failed"
@@ -173,34 +197,36 @@ def ate_cell(runs: Sequence[Outcome]) -> str:
 
 
 def unique(items: Iterable[T]) -> list[T]:
-    """Each item once, in the order of the first."""
+    """Return the distinct items in the order of their first occurrence."""
     return list(dict.fromkeys(items))
 
 
 def arguments() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = command_line("Accuracy on sequences in TUM layout, beside other systems, as Markdown.")
-    parser.add_argument("--seqs", nargs="+", help="names of sequences [every folder in --data-root that holds one]")
-    parser.add_argument("--seeds", type=int, default=3, help="runs of each, with seeds from 0 [3]")
+    """Return the parser of the command line."""
+    parser = make_parser("Accuracy on sequences in TUM layout, beside other systems, as Markdown.")
+    parser.add_argument("--seqs", nargs="+", help="names of sequences [all in --data-root]")
+    parser.add_argument("--seeds", type=int, default=3, help="number of runs of each, with seeds from 0 [3]")
     parser.add_argument("--configs", nargs="+", choices=CONFIGURATIONS, default=["full", "baseline"])
-    parser.add_argument("--peers", nargs="+", choices=PEERS, default=[], help="other systems to run, too [none]")
-    takes_vocabulary(parser)
+    parser.add_argument("--peers", nargs="+", choices=PEERS, default=[], help="other systems to run [none]")
+    add_vocabulary_option(parser)
     return parser
 
 
 def main() -> None:
-    """Run everything that the command line asks for, and print the tables."""
+    """Run the requested configurations and peers and print the tables."""
     parser = arguments()
     options = parser.parse_args()
-    sequences = unique(options.seqs or listed(options.data_root))
+    sequences = unique(options.seqs or list_sequences(options.data_root))
     if options.seeds < 1:
-        parser.error("--seeds: at least one run is needed")
+        parser.error("--seeds: must be at least 1")
     if not sequences:
         parser.error(
-            f"{options.data_root}: holds no sequence (a folder with rgb.txt or associations.txt); see --data-root"
+            f"{options.data_root}: contains no sequence (folder with rgb.txt or associations.txt); choose another"
+            " --data-root"
         )
 
-    lines = [*heading(options.peers), ""]
+    heading = make_heading(options.peers)
+    lines = [*heading.lines(), ""]
     vocabulary = options.vocabulary
     if vocabulary is None and "pyorbslam3" in options.peers:
         try:
@@ -226,7 +252,7 @@ def main() -> None:
         "",
         *notes(outcomes, known),
     ]
-    publish(lines, options, parser)
+    publish(lines, options, parser, {"accuracy": Measurement(heading, list(accuracy_rows(outcomes)))})
 
 
 if __name__ == "__main__":

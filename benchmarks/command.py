@@ -1,40 +1,60 @@
-"""What the command lines of the benchmarks that print Markdown have in common."""
+"""Command-line options and output that the benchmarks share."""
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+
+from storage import Measurement, save
 
 from v3d_torch.errors import OutputError
 from v3d_torch.io.files import write_text
 
 
-def command_line(description: str) -> argparse.ArgumentParser:
-    """A parser with the options of all."""
+def make_parser(description: str) -> argparse.ArgumentParser:
+    """Return a parser with the options that all benchmarks have."""
     parser = argparse.ArgumentParser(description=description)
     data_root = Path(os.environ.get("V3D_DATA", "../shared/data"))
     parser.add_argument(
         "--data-root", type=Path, default=data_root, help="folder of sequences [$V3D_DATA, else ../shared/data]"
     )
-    parser.add_argument("--out", type=Path, help="Markdown file to write, too")
+    parser.add_argument("--out", type=Path, help="Markdown file to write in addition")
+    parser.add_argument(
+        "--save", action="store_true", help="store the rows in benchmarks/results, for docs/benchmarks.md"
+    )
     return parser
 
 
-def takes_vocabulary(parser: argparse.ArgumentParser) -> None:
-    """Add the option of those that run ORB-SLAM3."""
+def add_vocabulary_option(parser: argparse.ArgumentParser) -> None:
+    """Add the option of the benchmarks that run ORB-SLAM3."""
     parser.add_argument(
-        "--vocabulary", type=Path, help="of pyorbslam3, in DBoW2's text format [trained on the sequences]"
+        "--vocabulary", type=Path, help="vocabulary of pyorbslam3, in DBoW2's text format [trained on the sequences]"
     )
 
 
-def publish(lines: Iterable[str], options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Print the page, and write it where the options say so."""
+def publish(
+    lines: Iterable[str],
+    options: argparse.Namespace,
+    parser: argparse.ArgumentParser,
+    measurements: Mapping[str, Measurement],
+) -> None:
+    """Print a page, write it to the file of ``--out``, and store the measurements if ``--save`` is given.
+
+    Args:
+        lines: Lines of the page.
+        options: Parsed options.
+        parser: Reports a file that cannot be written.
+        measurements: Measurements by the name of their file.
+    """
     text = "\n".join(lines).rstrip() + "\n"
     print(text, end="")
-    if options.out is not None:
-        try:
+    try:
+        if options.out is not None:
             write_text(options.out, text)
-        except OutputError as error:
-            parser.error(str(error))
+        if options.save:
+            for name, measurement in measurements.items():
+                save(name, measurement)
+    except OutputError as error:
+        parser.error(str(error))

@@ -1,14 +1,14 @@
-"""What a long run costs: time and memory as frames and keyframes grow in number, as Markdown.
+"""Time and memory of long runs and large maps, as Markdown.
 
-``python benchmarks/growth.py --seq fr1_rpy --frames 5000`` plays a sequence forth and back. Below: place recognition
-and pose graph alone, on keyframes that are made up, since no sequence at hand has thousands.
+``python benchmarks/growth.py --seq fr1_rpy --frames 5000`` plays a sequence forth and back. A second table has place
+recognition and pose graph alone, on thousands of synthetic keyframes.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from statistics import fmean, median
@@ -16,11 +16,12 @@ from typing import TypeVar
 
 import psutil
 import torch
-from command import command_line, publish
+from command import make_parser, publish
 from contenders.ours import Ours
-from heading import heading
+from heading import make_heading
 from replay import Replay, forth_and_back
-from sequences import located
+from sequences import locate_sequence
+from storage import Measurement, Row
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
@@ -32,99 +33,153 @@ from v3d_torch.evaluation.tables import row
 from v3d_torch.geometry.se3 import invert, se3_exp
 
 BLOCKS = 10
-SHARES = (0.1, 0.25, 0.5, 1.0)
-"""Of the most keyframes, at which places and pose graph are timed."""
-LOOKS = 10
-"""Timings of which the median counts."""
+"""Number of equal parts of a run, with one row each."""
 
-Made = TypeVar("Made")
+FRACTIONS = (0.1, 0.25, 0.5, 1.0)
+"""Fractions of the largest number of keyframes at which place recognition and pose graph are timed."""
+
+QUERIES = 10
+"""Number of timings, of which the median is reported."""
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Mark:
-    """How things stand after a frame."""
+class Snapshot:
+    """State after a frame: wall and CPU time in seconds, memory, size of the map."""
 
-    clock: float
+    wall: float
     cpu: float
     resident_mb: float
     keyframes: int
     loops: int
 
 
-def long_run(sequence: RGBDSequence, frames: int) -> Iterator[str]:
-    """A row per block of frames: what a frame takes, and what there is at the end of the block."""
+@dataclass(frozen=True)
+class LongRun:
+    """A long run.
+
+    Attributes:
+        lines: Table with a row per block of frames: time per frame, and memory and map at the end of the block.
+        row: Summary of the run, for `storage`.
+    """
+
+    lines: list[str]
+    row: Row
+
+
+def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
+    """Play a sequence forth and back, and measure every block of frames."""
     system = Ours(Replay(sequence, forth_and_back(len(sequence), frames)), "v3d_torch", seed=0)
     slam = system.slam
 
-    def mark() -> Mark:
+    def take_snapshot() -> Snapshot:
         keyframes = len(slam.mapper.map.active_keyframes)
-        return Mark(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loop_closer.loop_count)
+        return Snapshot(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loop_closer.loop_count)
 
-    marks = [mark()]
-    system(lambda *_: marks.append(mark()))
+    snapshots = [take_snapshot()]
+    system(lambda *_: snapshots.append(take_snapshot()))
     stages = list(slam.timer.seconds)
-    columns = ["frames", "ms a frame", "slowest", "CPU ms a frame", "resident MB", "keyframes", "loops"]
-    yield row([*columns, *(f"{stage} ms" for stage in stages)])
-    yield row(["---:"] * (len(columns) + len(stages)))
+    columns = ["frames", "ms per frame", "slowest", "CPU ms per frame", "resident MB", "keyframes", "loops"]
+    lines = [row([*columns, *(f"{stage} ms" for stage in stages)]), row(["---:"] * (len(columns) + len(stages)))]
+    cpu_ms: list[str] = []
+    ends: list[Snapshot] = []
     for block in range(BLOCKS):
         first, end = frames * block // BLOCKS, frames * (block + 1) // BLOCKS
         if first == end:
             continue
-        then, now = marks[first], marks[end]
-        slowest = max(marks[i + 1].clock - marks[i].clock for i in range(first, end))
+        start, stop = snapshots[first], snapshots[end]
+        slowest = max(snapshots[i + 1].wall - snapshots[i].wall for i in range(first, end))
+        cpu_ms.append(f"{1e3 * (stop.cpu - start.cpu) / (end - first):.1f}")
+        ends.append(stop)
         rows = system.pipeline.record.frames[first:end]
-        yield row(
-            [
-                f"{first + 1}-{end}",
-                f"{1e3 * (now.clock - then.clock) / (end - first):.1f}",
-                f"{1e3 * slowest:.0f}",
-                f"{1e3 * (now.cpu - then.cpu) / (end - first):.1f}",
-                f"{now.resident_mb:.0f}",
-                str(now.keyframes),
-                str(now.loops),
-                *(f"{1e3 * fmean(frame.get(stage, 0.0) for frame in rows):.1f}" for stage in stages),
-            ]
-        )
+        cells = [
+            f"{first + 1}-{end}",
+            f"{1e3 * (stop.wall - start.wall) / (end - first):.1f}",
+            f"{1e3 * slowest:.0f}",
+            cpu_ms[-1],
+            f"{stop.resident_mb:.0f}",
+            str(stop.keyframes),
+            str(stop.loops),
+            *(f"{1e3 * fmean(frame.get(stage, 0.0) for frame in rows):.1f}" for stage in stages),
+        ]
+        lines.append(row(cells))
+    early, late = ends[0], ends[-1]
+    later = frames - frames // BLOCKS
+    summary = {
+        "sequence": sequence.name,
+        "frames": str(frames),
+        "cpu_ms": ", ".join(cpu_ms),
+        "memory_mb": f"{early.resident_mb:.0f} to {late.resident_mb:.0f}",
+        "memory_kb_per_frame": f"{1024 * (late.resident_mb - early.resident_mb) / later:.0f}",
+        "keyframes": f"{min(end.keyframes for end in ends)} to {max(end.keyframes for end in ends)}",
+        "loops": str(late.loops),
+    }
+    return LongRun(lines, summary)
 
 
 def resident_mb() -> float:
-    """Memory of this process."""
+    """Return the memory of this process, MiB."""
     return psutil.Process().memory_info().rss / 2**20
 
 
-def many_keyframes(most: int) -> Iterator[str]:
-    """A row per number of keyframes: what it takes to remember one, to look a view up, and to close a loop over all."""
-    columns = ["to remember one, ms", "to look a view up, ms", "pose graph, s", "steps", "error before, m", "after, m"]
-    yield row(["keyframes", *columns])
-    yield row(["---:"] * (1 + len(columns)))
+def measure_keyframes(max_count: int) -> Iterator[Row]:
+    """Yield a row per number of keyframes: times to add one, to query the database, and to close a loop over all."""
     generator = torch.Generator().manual_seed(0)
-    ring(LOOKS, generator)  # the first is slow
-    places, candidates = KeyframeDatabase(), Config().loop.candidates
+    close_ring(QUERIES, generator)  # warm up
+    database, candidates = KeyframeDatabase(), Config().loop.candidates
     adding: list[float] = []
-    for count in sorted({max(round(share * most), LOOKS) for share in SHARES}):
-        while len(places) < count:
-            seen = descriptors(generator)
-            adding.append(clocked(partial(places.add, len(places), seen))[0])
-        looks = (partial(places.query, nearly(seen, generator), candidates) for _ in range(LOOKS))
-        asking = [clocked(look)[0] for look in looks]
-        yield row([str(count), *(f"{1e3 * median(s[-LOOKS:]):.1f}" for s in (adding, asking)), *ring(count, generator)])
+    for count in sorted({max(round(fraction * max_count), QUERIES) for fraction in FRACTIONS}):
+        while len(database) < count:
+            descriptors = random_descriptors(generator)
+            adding.append(timed(partial(database.add, len(database), descriptors))[0])
+        queries = (partial(database.query, flip_bits(descriptors, generator), candidates) for _ in range(QUERIES))
+        querying = [timed(query)[0] for query in queries]
+        add_ms, query_ms = (f"{1e3 * median(seconds[-QUERIES:]):.1f}" for seconds in (adding, querying))
+        yield {"keyframes": str(count), "add_ms": add_ms, "query_ms": query_ms, **close_ring(count, generator)}
 
 
-def descriptors(generator: torch.Generator) -> Tensor:
-    """Of a keyframe, uint8, shape (N, 32): each bit a coin, which spreads them better than images do."""
+KEYFRAME_COLUMNS = {
+    "keyframes": "keyframes",
+    "add_ms": "add one, ms",
+    "query_ms": "query, ms",
+    "pose_graph_s": "pose graph, s",
+    "iterations": "iterations",
+    "error_before": "error before, m",
+    "error_after": "error after, m",
+}
+"""Headings of the second table by the cell of a row."""
+
+
+def keyframe_table(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield a line per number of keyframes."""
+    yield row(list(KEYFRAME_COLUMNS.values()))
+    yield row(["---:"] * len(KEYFRAME_COLUMNS))
+    yield from (row([cells[name] for name in KEYFRAME_COLUMNS]) for cells in rows)
+
+
+def random_descriptors(generator: torch.Generator) -> Tensor:
+    """Return random descriptors of a keyframe, uint8, shape (N, 32); they differ more than those of images."""
     return torch.randint(256, (Config().features.count, 32), generator=generator, dtype=torch.uint8)
 
 
-def nearly(seen: Tensor, generator: torch.Generator) -> Tensor:
-    """The descriptors seen again: one bit in 16 is another."""
-    flips = [torch.randint(256, seen.shape, generator=generator, dtype=torch.uint8) for _ in range(4)]
-    return seen ^ reduce(torch.bitwise_and, flips)
+def flip_bits(descriptors: Tensor, generator: torch.Generator) -> Tensor:
+    """Return descriptors with one bit in 16 flipped, as if the features were observed again."""
+    flips = [torch.randint(256, descriptors.shape, generator=generator, dtype=torch.uint8) for _ in range(4)]
+    return descriptors ^ reduce(torch.bitwise_and, flips)
 
 
-def ring(count: int, generator: torch.Generator) -> tuple[str, str, str, str]:
-    """Close a loop over cameras on a circle of 5 m that look outwards and drift, each tied to the next three."""
+def close_ring(count: int, generator: torch.Generator) -> Row:
+    """Close a loop over drifting cameras on a circle of radius 5 m, each connected to the next three.
+
+    Returns:
+        Cells: time of the pose graph, number of iterations, mean position error before and after.
+    """
     turn = torch.zeros(6, dtype=torch.float64)
-    turn[0], turn[4] = 2 * torch.pi * 5 / count, 2 * torch.pi / count  # along the circle, about the vertical
+    turn[0], turn[4] = (
+        2 * torch.pi * 5 / count,
+        2 * torch.pi / count,
+    )  # along the circle, about the vertical axis
     step = se3_exp(turn)
     noise = se3_exp(1e-3 * torch.randn(count, 6, generator=generator, dtype=torch.float64))
     true, drifted = [torch.eye(4, dtype=torch.float64)], [torch.eye(4, dtype=torch.float64)]
@@ -136,41 +191,49 @@ def ring(count: int, generator: torch.Generator) -> tuple[str, str, str, str]:
     measured = invert(T_wc[edges[:, 0]]) @ T_wc[edges[:, 1]]
     loop = (invert(T_true[0]) @ T_true[-1])[None]
     closed = torch.cat([edges, torch.tensor([[0, count - 1]])]), torch.cat([measured, loop])
-    seconds, found = clocked(partial(optimise_pose_graph, T_wc, *closed))
-    before, after = ((T - T_true)[:, :3, 3].norm(dim=1).mean() for T in (T_wc, found.T_wc))
-    return f"{seconds:.2f}", str(found.iterations), f"{before:.3f}", f"{after:.3f}"
+    seconds, solution = timed(partial(optimise_pose_graph, T_wc, *closed))
+    before, after = ((T - T_true)[:, :3, 3].norm(dim=1).mean() for T in (T_wc, solution.T_wc))
+    return {
+        "pose_graph_s": f"{seconds:.2f}",
+        "iterations": str(solution.iterations),
+        "error_before": f"{before:.3f}",
+        "error_after": f"{after:.3f}",
+    }
 
 
-def clocked(make: Callable[[], Made]) -> tuple[float, Made]:
-    """Seconds that something takes, and the thing."""
+def timed(call: Callable[[], Result]) -> tuple[float, Result]:
+    """Return the wall time of a call, seconds, and its result."""
     start = time.perf_counter()
-    made = make()
-    return time.perf_counter() - start, made
+    result = call()
+    return time.perf_counter() - start, result
 
 
 def arguments() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = command_line("Time and memory of a long run and of many keyframes, as Markdown.")
+    """Return the parser of the command line."""
+    parser = make_parser("Time and memory of a long run and of many keyframes, as Markdown.")
     parser.add_argument("--seq", default="demo", help="sequence to play forth and back [demo]")
-    parser.add_argument("--frames", type=int, default=5000, help="frames of the run [5000]")
-    parser.add_argument("--keyframes", type=int, default=5000, help="most keyframes that are made up [5000]")
+    parser.add_argument("--frames", type=int, default=5000, help="number of frames of the run [5000]")
+    parser.add_argument("--keyframes", type=int, default=5000, help="largest number of synthetic keyframes [5000]")
     return parser
 
 
 def main() -> None:
-    """Print both tables."""
+    """Run both measurements and print their tables."""
     parser = arguments()
     options = parser.parse_args()
-    if options.frames < BLOCKS or options.keyframes < LOOKS:
-        parser.error(f"give at least --frames {BLOCKS} and --keyframes {LOOKS}")
-    lines = [*heading(), "", f"## {options.seq}, forth and back", ""]
+    if options.frames < BLOCKS or options.keyframes < QUERIES:
+        parser.error(f"give at least --frames {BLOCKS} and --keyframes {QUERIES}")
+    heading = make_heading()
     try:
-        sequence = load_sequence(located(options.seq, options.data_root), data_root=options.data_root)
-        lines += long_run(sequence, options.frames)
+        sequence = load_sequence(locate_sequence(options.seq, options.data_root), data_root=options.data_root)
+        run = measure_long_run(sequence, options.frames)
     except V3DError as error:
         parser.error(str(error))
-    lines += ["", "## Keyframes that are made up", "", *many_keyframes(options.keyframes)]
-    publish(lines, options, parser)
+    rows = list(measure_keyframes(options.keyframes))
+    lines = [*heading.lines(), "", f"## {options.seq}, forth and back", "", *run.lines]
+    lines += ["", "## Synthetic keyframes", "", *keyframe_table(rows)]
+    measurements = {"growth": Measurement(heading, [run.row]), "keyframes": Measurement(heading, rows)}
+    publish(lines, options, parser, measurements)
 
 
 if __name__ == "__main__":

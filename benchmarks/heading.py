@@ -1,4 +1,4 @@
-"""What stands above every table: what was run, of which commit, when and on what."""
+"""Heading of a measurement: command, commit, date, hardware and versions."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,30 +19,61 @@ import v3d_torch
 LIBRARIES = ("torch", "kornia", "onnxruntime")
 
 
-def heading(peers: tuple[str, ...] = ()) -> Iterator[str]:
-    """Lines of Markdown; to be asked for before the first run, whose load is in it.
+@dataclass(frozen=True)
+class Heading:
+    """Circumstances of a measurement.
+
+    Attributes:
+        command: Command line that measured; empty if it is not recorded.
+        commit: Commit of the package.
+        date: Date of the measurement, ISO 8601.
+        hardware: Processor, number of cores and load.
+        versions: Versions of Python and the libraries; empty if they are not recorded.
+    """
+
+    command: str
+    commit: str
+    date: str
+    hardware: str
+    versions: str = ""
+
+    def lines(self) -> Iterator[str]:
+        """Yield the heading as lines of Markdown."""
+        if self.command:
+            yield f"`{self.command}`"
+            yield ""
+        yield f"- commit {self.commit}, {self.date}"
+        yield f"- {self.hardware}"
+        if self.versions:
+            yield f"- {self.versions}"
+
+
+def make_heading(peers: tuple[str, ...] = ()) -> Heading:
+    """Describe this process. Call it before the first run, so that the load is that of other programs.
 
     Args:
-        peers: packages whose versions are told, too.
+        peers: Further packages whose versions to record.
     """
-    yield f"`{shlex.join(['python', f'benchmarks/{Path(sys.argv[0]).name}', *sys.argv[1:]])}`"
-    yield ""
-    yield f"- commit {commit()}, {datetime.now().astimezone():%Y-%m-%d}"
-    yield f"- {processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the first run"
-    yield f"- Python {platform.python_version()}, " + ", ".join(map(installed, (*LIBRARIES, *peers)))
+    return Heading(
+        command=shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+        commit=current_commit(),
+        date=f"{datetime.now().astimezone():%Y-%m-%d}",
+        hardware=f"{processor()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before the first run",
+        versions=", ".join([f"Python {platform.python_version()}", *map(installed, (*LIBRARIES, *peers))]),
+    )
 
 
 def installed(name: str) -> str:
-    """Name and version of a package."""
+    """Return name and version of a package."""
     try:
         return f"{name} {version(name)}"
     except PackageNotFoundError:
         return f"{name} not installed"
 
 
-def commit() -> str:
-    """Of the package's checkout, with ``-dirty`` when tracked files differ from it."""
-    # --exclude: no tag instead of the hash. No optional locks: someone may be about to commit.
+def current_commit() -> str:
+    """Return the commit of the package's checkout, with ``-dirty`` if tracked files differ from it."""
+    # --exclude: the hash even if there is a tag. No optional locks: another process may be committing.
     command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--exclude", "*"]
     try:
         folder = Path(v3d_torch.__file__).parent
@@ -51,7 +83,7 @@ def commit() -> str:
 
 
 def processor() -> str:
-    """Model of the processor."""
+    """Return the model of the processor."""
     cpuinfo = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.is_file() else None
-    return found[1] if found else platform.processor() or platform.machine()
+    match = re.search(r"^model name\s*: (.+)$", cpuinfo.read_text(), re.MULTILINE) if cpuinfo.is_file() else None
+    return match[1] if match else platform.processor() or platform.machine()

@@ -1,7 +1,7 @@
-"""How much of the maps is people, with and without the look through free space; how long maps take, and their files.
+"""People in the coloured map, with and without the free-space check, and time and size of maps, as Markdown.
 
-``python benchmarks/maps.py crowd_rpy walkers_room`` runs each sequence once with the default configuration and
-prints Markdown. Sequences need ``masks/`` with the true people.
+``python benchmarks/maps.py --seqs crowd_rpy walkers_room`` runs each sequence once with the default configuration.
+Sequences need ``masks/`` with the true people.
 """
 
 from __future__ import annotations
@@ -9,18 +9,23 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 import torch
-import typer
+from command import make_parser, publish
+from heading import make_heading
+from sequences import locate_sequence
+from storage import Measurement, Row
 from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.base import HasMotionMasks
+from v3d_torch.errors import InputError, V3DError
+from v3d_torch.evaluation.tables import row
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction.mesh import fuse_mesh
@@ -28,86 +33,121 @@ from v3d_torch.reconstruction.point_map import fuse_points
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
 
-TRUSTING = load_config(overrides=["objects.free_space.min_tolerance=1000"])
-"""Nothing is ever looked through."""
+NO_CHECK = load_config(overrides=["objects.free_space.min_tolerance=1000"])
+"""Configuration in which no point counts as free space."""
 
-Made = TypeVar("Made")
+COLUMNS = {
+    "pixels": "pixels in the map",
+    "points_before": "points without free-space check",
+    "people_before": "people",
+    "points_after": "points with it",
+    "people_after": "people",
+    "static_lost": "static points lost",
+}
+"""Headings of the table by the cell of a row."""
 
-
-def main(
-    seqs: Annotated[list[str], typer.Argument(help="Sequences with masks.")],
-    data_root: Annotated[Path | None, typer.Option(envvar="V3D_DATA", help="Where they are.")] = None,
-) -> None:
-    """Print a table per sequence."""
-    torch.set_num_threads(1)
-    for name in seqs:
-        sequence = load_sequence(name, data_root=data_root)
-        slam, views, people = run(sequence)
-        print(f"\n{name}: {len(sequence)} frames, {len(views)} keyframes\n")
-        print("| pixels in the map | points | people | looked through taken out: points | people | static lost |")
-        print("|---|---:|---:|---:|---:|---:|")
-        for what, truth in people.items():
-            print(f"| {what} | {shares(truth)} |")
-        print(f"\n{times(sequence, slam, views)}")
+Result = TypeVar("Result")
 
 
 def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticViews]]:
-    """The system over a sequence.
+    """Run the system over a sequence.
 
     Returns:
-        The system, its views, and views whose colour is the true mask: white where a person is.
+        The system, its views, and views whose colour is the true mask: white for people.
+
+    Raises:
+        InputError: If a frame has no true mask.
     """
     config = Config()
     slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
-    views, masked, every = (StaticViews(sequence.camera, config.dense_map.stride) for _ in range(3))
+    views, masked, unmasked = (StaticViews(sequence.camera, config.dense_map.stride) for _ in range(3))
     for frame in sequence:
-        scene = slam(frame)
+        objects = slam(frame)
         keyframes = slam.mapper.map.keyframes
         if not keyframes or keyframes[-1].frame != frame.index:
             continue
         truth = sequence.motion_mask(frame.index) if isinstance(sequence, HasMotionMasks) else None
         if truth is None:
-            raise typer.BadParameter(f"{sequence.name} has no mask for frame {frame.index}")
+            raise InputError(f"{sequence.name}: frame {frame.index} has no true mask; choose another sequence")
         white = ((truth > 0) & (truth < 255)).to(torch.uint8).mul(255).expand(3, -1, -1)
-        views.add(keyframes[-1], frame.image, frame.depth, scene.static_without_people)
-        masked.add(keyframes[-1], white, frame.depth, scene.static_without_people)
-        every.add(keyframes[-1], white, frame.depth, torch.ones_like(scene.static_without_people))
-    return slam, views, {"what the system takes for static": masked, "all": every}
+        views.add(keyframes[-1], frame.image, frame.depth, objects.static_without_people)
+        masked.add(keyframes[-1], white, frame.depth, objects.static_without_people)
+        unmasked.add(keyframes[-1], white, frame.depth, torch.ones_like(objects.static_without_people))
+    return slam, views, {"classified as static": masked, "all": unmasked}
 
 
-def shares(truth: StaticViews) -> str:
-    """Cells of a row: points and people among them, before and after, and what is static and went."""
+def count_people(sequence: str, people: dict[str, StaticViews]) -> Iterator[Row]:
+    """Yield a row per selection of pixels: points and people among them, without and with the free-space check."""
+    for pixels, views in people.items():
+        before, after = is_person(views, NO_CHECK), is_person(views, Config())
+        lost = 1 - int((~after).sum()) / max(int((~before).sum()), 1)
+        yield {
+            "sequence": sequence,
+            "pixels": pixels,
+            "points_before": str(len(before)),
+            "people_before": f"{int(before.sum())} ({float(before.double().mean()):.2%})",
+            "points_after": str(len(after)),
+            "people_after": f"{int(after.sum())} ({float(after.double().mean()):.2%})",
+            "static_lost": f"{lost:.2%}",
+        }
 
-    def people(config: Config) -> Tensor:
-        return fuse_points(truth, config).colours[:, 0] > 127
 
-    before, after = people(TRUSTING), people(Config())
-    lost = 1 - int((~after).sum()) / max(int((~before).sum()), 1)
-    cells = [f"{len(found)} | {int(found.sum())} ({float(found.double().mean()):.2%})" for found in (before, after)]
-    return " | ".join([*cells, f"{lost:.2%}"])
+def is_person(views: StaticViews, config: Config) -> Tensor:
+    """Fuse views whose colour is the true mask, and return which points belong to people, bool, shape (N,)."""
+    return fuse_points(views, config).colours[:, 0] > 127
 
 
-def times(sequence: RGBDSequence, slam: V3DSLAM, views: StaticViews) -> str:
-    """Seconds of this process for each product."""
+def measure_costs(sequence: RGBDSequence, slam: V3DSLAM, views: StaticViews) -> Row:
+    """Measure CPU time and size of each product."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "room.map"
-        points, cloud = clocked(lambda: fuse_points(views, slam.config))
-        faces, mesh = clocked(lambda: fuse_mesh(views, slam.config.dense_map))
-        saving, _ = clocked(lambda: save_map(path, slam.mapper.map, views))
-        loading, _ = clocked(lambda: load_map(path, sequence.camera, slam.config))
-        return (
-            f"map.ply {points:.1f} s ({len(cloud)} points), mesh.ply {faces:.1f} s ({len(mesh.faces)} triangles),"
-            f" saving the map {saving:.1f} s ({path.stat().st_size / 1e6:.0f} MB), loading it {loading:.1f} s;"
-            f" CPU time, {os.cpu_count()} cores"
-        )
+        points, cloud = timed(lambda: fuse_points(views, slam.config))
+        faces, mesh = timed(lambda: fuse_mesh(views, slam.config.dense_map))
+        saving, _ = timed(lambda: save_map(path, slam.mapper.map, views))
+        loading, _ = timed(lambda: load_map(path, sequence.camera, slam.config))
+        return {
+            "sequence": sequence.name,
+            "keyframes": str(len(views)),
+            "points": f"{len(cloud)} in {points:.1f} s",
+            "triangles": f"{len(mesh.faces)} in {faces:.1f} s",
+            "saving": f"{saving:.1f} s, {path.stat().st_size / 1e6:.0f} MB",
+            "loading": f"{loading:.1f} s",
+        }
 
 
-def clocked(make: Callable[[], Made]) -> tuple[float, Made]:
-    """CPU seconds that something takes, and the thing."""
+def timed(call: Callable[[], Result]) -> tuple[float, Result]:
+    """Return the CPU time of a call, seconds, and its result."""
     start = time.process_time()
-    made = make()
-    return time.process_time() - start, made
+    result = call()
+    return time.process_time() - start, result
+
+
+def main() -> None:
+    """Run every sequence and print its tables."""
+    parser = make_parser("People in the coloured map, and time and size of maps, as Markdown.")
+    parser.add_argument("--seqs", nargs="+", default=["crowd_rpy", "walkers_room"], help="sequences with true masks")
+    options = parser.parse_args()
+    heading = make_heading()
+    lines = list(heading.lines())
+    people_rows: list[Row] = []
+    cost_rows: list[Row] = []
+    torch.set_num_threads(1)
+    try:
+        for name in options.seqs:
+            sequence = load_sequence(locate_sequence(name, options.data_root), data_root=options.data_root)
+            slam, views, people = run(sequence)
+            rows = list(count_people(sequence.name, people))
+            costs = measure_costs(sequence, slam, views)
+            lines += ["", f"## {name}", "", row(list(COLUMNS.values())), row(["---"] + ["---:"] * (len(COLUMNS) - 1))]
+            lines += [row([cells[column] for column in COLUMNS]) for cells in rows]
+            lines += ["", f"CPU time on {os.cpu_count()} cores: " + "; ".join(f"{k} {v}" for k, v in costs.items())]
+            people_rows += rows
+            cost_rows.append(costs)
+    except V3DError as error:
+        parser.error(str(error))
+    measurements = {"maps": Measurement(heading, people_rows), "map_costs": Measurement(heading, cost_rows)}
+    publish(lines, options, parser, measurements)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -1,4 +1,4 @@
-"""Frames of a sequence in an order of choice: its beginning, or forth and back for as long as one likes."""
+"""Frames of a sequence in a given order: its beginning, or forth and back for any number of frames."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from v3d_torch.datasets.stored import StoredSequence
 class Replay(StoredSequence):
     """Frames of another sequence, without its ground truth and masks.
 
-    Time goes on by as much as lies between two frames in the other, in whichever direction.
+    Time advances by the interval between the two frames in the other sequence, in either direction.
 
     Args:
-        sequence: that has the frames.
-        indices: of the frames, no two neighbours equal, at least one.
+        sequence: Sequence to take the frames from.
+        indices: Indices of the frames, at least one; no two neighbours are equal.
     """
 
     def __init__(self, sequence: RGBDSequence, indices: Sequence[int]) -> None:
@@ -34,6 +34,6 @@ class Replay(StoredSequence):
 
 
 def forth_and_back(count: int, frames: int) -> list[int]:
-    """Indices that go through ``count`` frames forth, back, and so on, until there are ``frames`` of them."""
+    """Return ``frames`` indices that run through ``count`` frames forth, back, forth and so on."""
     period = max(2 * (count - 1), 1)
     return [min(index % period, period - index % period) for index in range(frames)]

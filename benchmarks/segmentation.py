@@ -1,21 +1,21 @@
-"""What the network may cost less by, and what that loses, as Markdown.
+"""Cost and accuracy of smaller, faster and rarer segmentation networks, as Markdown.
 
 ``python benchmarks/segmentation.py --seqs walkers_desk crowd_rpy`` runs each sequence with the network in other
-precisions, sizes and models, and with the network on every second or third frame only; in between, what was seen is
-predicted as a missed object is. Where a sequence has true masks, the whole system is scored by them.
+precisions, sizes and models, and with the network on every second or third frame only; in between, objects are
+predicted as missed objects are. If a sequence has true masks, the whole system is scored with them.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
-from command import command_line, publish
-from heading import heading
-from sequences import located
+from command import make_parser, publish
+from heading import make_heading
+from sequences import locate_sequence
+from storage import Measurement, Row
 from torch import Tensor
 
 from v3d_torch.config.loading import load_config
@@ -38,7 +38,12 @@ FULL = ("segmentation.width=640", "segmentation.height=480")
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to segment: values over the defaults, and the network on every n-th frame."""
+    """Segmentation variant.
+
+    Attributes:
+        overrides: Configuration values over the defaults.
+        every: Interval between frames with the network, frames.
+    """
 
     overrides: tuple[str, ...] = ()
     every: int = 1
@@ -58,8 +63,15 @@ VARIANTS: Mapping[str, Variant] = {
 
 
 @dataclass
-class Watched:
-    """A segmenter that works on every n-th frame, is timed, and remembers where it saw people."""
+class MeasuredSegmenter:
+    """Segmenter that runs on every n-th frame and stores its times and the masks of people.
+
+    Attributes:
+        segment: Segmenter to run.
+        every: Interval between its frames, frames.
+        seconds: Time of each of its runs, seconds.
+        people: Union of the masks of people by frame index, bool, shape :math:`(H, W)`.
+    """
 
     segment: Segmenter
     every: int
@@ -81,70 +93,83 @@ class Watched:
         return instances
 
 
-def compare(sequence: RGBDSequence) -> Iterator[str]:
-    """A row per variant."""
-    columns = ["network", "ms a frame", "people's pixels found", "moving left out", "static left out", "ids", "ATE, m"]
-    yield row(columns)
-    yield row(["---"] + ["---:"] * (len(columns) - 1))
+def compare(sequence: RGBDSequence) -> Iterator[Row]:
+    """Yield a row per variant."""
     reference: dict[int, Tensor] = {}
     for name, variant in VARIANTS.items():
         config = load_config(overrides=[*SERIAL, *variant.overrides])
         set_num_threads(config.threads)
-        watched = Watched(make_segmenter(config.segmentation), variant.every)
-        pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, watched, config))
+        segmenter = MeasuredSegmenter(make_segmenter(config.segmentation), variant.every)
+        pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segmenter, config))
         run = pipeline()
         if run.failure is not None:
             raise RuntimeError(run.failure)
-        reference = reference or watched.people
-        found = sum(int((seen & reference[index]).sum()) for index, seen in watched.people.items())
-        there = sum(int(reference[index].sum()) for index in watched.people)
+        reference = reference or segmenter.people
+        found = sum(int((people & reference[index]).sum()) for index, people in segmenter.people.items())
+        expected = sum(int(reference[index].sum()) for index in segmenter.people)
         scores = run.mask_evaluation.scores()
         truth = sequence.groundtruth
-        yield row(
-            [
-                name,
-                f"{1e3 * median(watched.seconds) / variant.every:.0f}",
-                told(found / there if there else None, ".1%"),
-                told(scores and scores.moving_left_out, ".1%"),
-                told(scores and scores.static_left_out, ".1%"),
-                told(scores and scores.id_changes_per_60_frames, ".2f"),
-                told(truth and evaluate(truth, pipeline.slam.poses.trajectory(), frames=len(sequence)).ate.rmse, ".4f"),
-            ]
-        )
+        ate = truth and evaluate(truth, pipeline.slam.poses.trajectory(), frames=len(sequence)).ate.rmse
+        yield {
+            "sequence": sequence.name,
+            "network": name,
+            "ms": f"{1e3 * median(segmenter.seconds) / variant.every:.0f}",
+            "people_found": format_value(found / expected if expected else None, ".1%"),
+            "moving_left_out": format_value(scores and scores.moving_left_out, ".1%"),
+            "static_left_out": format_value(scores and scores.static_left_out, ".1%"),
+            "id_changes": format_value(scores and scores.id_changes_per_60_frames, ".2f"),
+            "ate": format_value(ate, ".4f"),
+        }
 
 
-def told(value: float | None, form: str) -> str:
-    """A figure as text, where there is one."""
+def format_value(value: float | None, form: str) -> str:
+    """Format a value; a dash if there is none."""
     return "-" if value is None else format(value, form)
 
 
-def page(options: argparse.Namespace) -> Iterator[str]:
-    """The whole document."""
-    yield "# What the network costs and finds"
-    yield ""
-    yield from heading()
-    for name in options.seqs:
-        yield ""
-        yield f"## {name}"
-        yield ""
-        yield from compare(load_sequence(located(name, options.data_root)))
-    yield ""
-    yield (
-        f"ms a frame: of one core, with turning, decoding and, at first, looks at all four turns. People's pixels: of"
-        f" those that {REFERENCE}, finds on the same frames. Left out: of the true moving and static pixels with depth,"
-        f" by the whole system. ids: changes of a person's id in 60 frames."
-    )
+COLUMNS = {
+    "network": "network",
+    "ms": "ms per frame",
+    "people_found": "people's pixels found",
+    "moving_left_out": "moving left out",
+    "static_left_out": "static left out",
+    "id_changes": "id changes",
+    "ate": "ATE, m",
+}
+"""Headings of the table by the cell of a row."""
+
+
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield a line per variant."""
+    yield row(list(COLUMNS.values()))
+    yield row(["---"] + ["---:"] * (len(COLUMNS) - 1))
+    yield from (row([cells[name] for name in COLUMNS]) for cells in rows)
+
+
+ABOUT = (
+    "ms per frame: wall time of one core, including rotation, decoding and, at first, the network on all four"
+    f" rotations. People's pixels: fraction of those that {REFERENCE}, finds on the same frames. Left out: fraction of"
+    " the true moving and static pixels with depth that the whole system leaves out. Id changes: of a person, in 60"
+    " frames."
+)
 
 
 def main() -> None:
-    """Run the command line."""
-    parser = command_line("What the network costs and finds, in other precisions, sizes and rates")
+    """Run all variants and print the tables."""
+    parser = make_parser("Cost and accuracy of segmentation networks, as Markdown")
     parser.add_argument("--seqs", nargs="+", default=["walkers_desk", "crowd_rpy"], help="sequences with true masks")
     options = parser.parse_args()
+    heading = make_heading()
+    lines = ["# Segmentation networks", "", *heading.lines()]
+    rows: list[Row] = []
     try:
-        publish(page(options), options, parser)
+        for name in options.seqs:
+            sequence_rows = list(compare(load_sequence(locate_sequence(name, options.data_root))))
+            lines += ["", f"## {name}", "", *table(sequence_rows)]
+            rows += sequence_rows
     except V3DError as error:
         parser.error(str(error))
+    publish([*lines, "", ABOUT], options, parser, {"segmentation": Measurement(heading, rows)})
 
 
 if __name__ == "__main__":

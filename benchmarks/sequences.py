@@ -1,4 +1,4 @@
-"""The sequences that a benchmark runs on."""
+"""Sequences that a benchmark runs on."""
 
 from __future__ import annotations
 
@@ -9,25 +9,30 @@ from contenders.vocabulary import vocabulary
 from v3d_torch.datasets import load_sequence
 
 
-def listed(data_root: Path) -> list[str]:
-    """Names of the folders in TUM layout."""
+def list_sequences(data_root: Path) -> list[str]:
+    """Return the names of the folders in TUM layout."""
     return sorted(
         {path.parent.name for name in ("rgb.txt", "associations.txt") for path in data_root.glob(f"*/{name}")}
     )
 
 
-def located(name: str, data_root: Path) -> str:
-    """The folder of that name, else the name, which ``--seq`` and ``load_sequence`` know what to do with."""
+def locate_sequence(name: str, data_root: Path) -> str:
+    """Return the folder of a sequence in the data root, else its name, as `load_sequence` takes it."""
     folder = data_root / name
     return str(folder) if folder.is_dir() else name
 
 
 def trained_vocabulary(names: list[str], data_root: Path) -> Path:
-    """A vocabulary from all sequences of the folder, so that all benchmarks have the same; if none, from those named.
+    """Return a vocabulary trained on all sequences of the folder, so that all benchmarks use the same one.
+
+    Args:
+        names: Sequences to train on if the folder has none.
+        data_root: Folder of sequences.
 
     Raises:
-        InputError: a sequence is not there, or something in it is wrong.
+        InputError: If a sequence is missing or damaged.
     """
     return vocabulary(
-        load_sequence(located(name, data_root), data_root=data_root) for name in listed(data_root) or names
+        load_sequence(locate_sequence(name, data_root), data_root=data_root)
+        for name in list_sequences(data_root) or names
     )

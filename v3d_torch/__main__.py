@@ -1,4 +1,4 @@
-"""``v3d-torch COMMAND`` or ``python -m v3d_torch COMMAND``: all commands of the package under one name."""
+"""Program ``v3d-torch``, also ``python -m v3d_torch``: all commands of the package."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from v3d_torch.cli import ablate, batch, evaluate, record, report, reproduce, run
 
 COMMANDS: tuple[ModuleType, ...] = (run, batch, evaluate, ablate, reproduce, record, report)
-"""Modules with one command each, which ``python -m v3d_torch.run`` and so on call as well."""
+"""Modules that define one command each; the command has the name of its module."""
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, no_args_is_help=True)
 for _module in COMMANDS:
@@ -19,8 +19,8 @@ for _module in COMMANDS:
     app.command(_module.__name__.rpartition(".")[2], cls=_command.cls)(_command.callback)
 
 
-def _tell_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"v3d-torch {version('v3d-torch')}")
         raise typer.Exit
 
@@ -28,10 +28,10 @@ def _tell_version(wanted: bool) -> None:
 @app.callback()
 def main(
     version: Annotated[
-        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Say which version this is.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """V3D-SLAM: track an RGB-D camera in a room where people move, and map what stands still."""
+    """V3D-SLAM: RGB-D SLAM for dynamic indoor scenes."""
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What every contender offers."""
+"""Interface of a contender."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from v3d_torch.types import Trajectory
 
 
 class Contender(Protocol):
-    """A system that is ready to run: all that a user would load once, however many frames follow, is loaded."""
+    """System that is ready to run: everything that a user loads once is loaded."""
 
     @property
     def stages(self) -> Mapping[str, float]:
-        """Seconds by stage, where the system tells them."""
+        """Seconds by stage; empty if the system does not measure them."""
 
     def __call__(self) -> None:
-        """Read and take in all frames of the sequence, until the last has a pose. This is what is timed."""
+        """Read and track all frames of the sequence. This call is timed."""
 
     def trajectory(self) -> Trajectory:
-        """The poses it found, as they are after the last frame; frames that it lost may be left out."""
+        """Return the poses after the last frame; lost frames may be missing."""

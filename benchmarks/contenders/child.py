@@ -1,4 +1,4 @@
-"""One contender on one sequence: ``python -m contenders.child pyorbslam3 --seq ... --out FOLDER``, see `process`."""
+"""Process of a contender: ``python -m contenders.child pyorbslam3 --seq ... --out FOLDER``; see `process`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from v3d_torch.errors import V3DError
 
 
 def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> Contender:
-    """Load a contender; only its own libraries are imported."""
+    """Load a contender and only its own libraries."""
     if name in OURS:
         from contenders.ours import Ours
 
@@ -35,15 +35,15 @@ def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | Non
 
 
 def cpu_time() -> float:
-    """Seconds of all threads of this process, and of those that it began, ended or not."""
+    """Return the CPU time of all threads of this process and its child processes, seconds."""
     times = os.times()
-    mine = times.user + times.system + times.children_user + times.children_system
+    ended = times.user + times.system + times.children_user + times.children_system
     running = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
-    return mine + sum(child.user + child.system for child in running)
+    return ended + sum(child.user + child.system for child in running)
 
 
 def main() -> None:
-    """Run it, and write its trajectory and its times."""
+    """Run the contender; write its trajectory and times."""
     parser = argparse.ArgumentParser()
     parser.add_argument("contender", choices=[*OURS, *PEERS])
     parser.add_argument("--seq", required=True)
@@ -69,7 +69,7 @@ def main() -> None:
         "stages": dict(contender.stages),
     }
     (options.out / "measured.json").write_text(json.dumps(figures), encoding="utf-8")
-    os._exit(0)  # without destructors: ORB-SLAM3's may crash, when all is done
+    os._exit(0)  # without destructors, because those of ORB-SLAM3 can crash
 
 
 if __name__ == "__main__":

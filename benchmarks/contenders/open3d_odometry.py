@@ -1,6 +1,6 @@
 """RGB-D odometry of Open3D (Zhou et al., 2018), from each frame to the next, by colour and depth ("hybrid").
 
-Open3D has no system that tracks, maps and closes loops on a CPU; this is the part of one that it has.
+Open3D has no complete SLAM system on a CPU, only this odometry.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 
 class Open3DOdometry:
-    """A contender.
+    """Contender with the RGB-D odometry of Open3D.
 
     Args:
-        sequence: to run on.
+        sequence: Sequence to run on.
     """
 
     stages: Mapping[str, float] = {}
@@ -32,37 +32,36 @@ class Open3DOdometry:
         camera = sequence.camera
         self._K = o3d.core.Tensor(camera.K.numpy())
         self._lens = None
-        if camera.is_distorted:  # Open3D knows none
+        if camera.is_distorted:  # Open3D has no lens model
             K, size = camera.K.numpy(), (camera.width, camera.height)
             self._lens = cv2.initUndistortRectifyMap(K, np.array(camera.distortion), None, K, size, cv2.CV_32FC1)
         self._T_wc = [torch.eye(4, dtype=torch.float64)]
 
     def __call__(self) -> None:
-        """Add up the motions of all frames. Where none is found the camera is taken to stand still."""
-        before = None
+        """Chain the motions between frames. If no motion is found, the camera is assumed to stand still."""
+        previous = None
         for frame in self._sequence:
-            now = self._seen(frame)
-            if before is not None:
-                self._T_wc.append(self._T_wc[-1] @ self._motion(now, before))
-            before = now
+            current = self._convert(frame)
+            if previous is not None:
+                self._T_wc.append(self._T_wc[-1] @ self._motion(current, previous))
+            previous = current
 
     def trajectory(self) -> Trajectory:
-        """A pose for every frame."""
+        """Return a pose for every frame."""
         return Trajectory(self._sequence.stamps, torch.stack(self._T_wc))
 
     def _motion(self, source: RGBDImage, target: RGBDImage) -> torch.Tensor:
-        """From the source's camera to the target's, as Open3D does by default, which starts from rest.
+        """Return the transform from the source camera to the target camera, with the initial value of Open3D: identity.
 
-        Starting from the motion before was tried: it halves the error on the first 100 frames of fr1_rpy and of
-        walkers_room, and makes it nine times as large on crowd_static, where it runs away. So the default stays.
+        The previous motion as initial value is more accurate for a moving camera, but can diverge for one at rest.
         """
         try:
-            found = rgbd_odometry_multi_scale(source, target, self._K, depth_scale=1.0, method=Method.Hybrid)
-        except RuntimeError:  # too little depth, or none that fits
+            result = rgbd_odometry_multi_scale(source, target, self._K, depth_scale=1.0, method=Method.Hybrid)
+        except RuntimeError:  # too little depth, or no overlap
             return torch.eye(4, dtype=torch.float64)
-        return torch.from_numpy(found.transformation.numpy().copy())
+        return torch.from_numpy(result.transformation.numpy().copy())
 
-    def _seen(self, frame: RGBDFrame) -> RGBDImage:
+    def _convert(self, frame: RGBDFrame) -> RGBDImage:
         image, depth = frame.image.permute(1, 2, 0).numpy(), frame.depth[0].numpy()
         if self._lens is not None:
             image = cv2.remap(image, *self._lens, cv2.INTER_LINEAR)

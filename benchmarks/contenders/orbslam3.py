@@ -1,6 +1,6 @@
 """ORB-SLAM3 (Campos et al., T-RO 2021) with RGB-D images, as the PyPI package pyorbslam3 builds it.
 
-It runs as fast as it goes, without a window. Its threads make it give another trajectory every time.
+It runs at full speed, without a window. It is not deterministic, because of its threads.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ VIEWER = (
     *("KeyFrameSize", "KeyFrameLineWidth", "GraphLineWidth", "PointSize", "CameraSize", "CameraLineWidth"),
     *("ViewpointX", "ViewpointY", "ViewpointZ", "ViewpointF"),
 )
-"""Settings of the window, which must be there though there is none."""
+"""Settings of the window, which are required even without a window."""
 
 
 class OrbSlam3:
-    """A contender.
+    """Contender with ORB-SLAM3.
 
     Args:
-        sequence: to run on.
-        vocabulary: in DBoW2's text format.
+        sequence: Sequence to run on.
+        vocabulary: Vocabulary in DBoW2's text format.
     """
 
     stages: Mapping[str, float] = {}
@@ -40,19 +40,19 @@ class OrbSlam3:
         self._sequence = sequence
         with TemporaryDirectory() as folder:
             path = Path(folder) / "settings.yaml"
-            path.write_text(settings(sequence.camera, frames_a_second(sequence)))
+            path.write_text(settings(sequence.camera, frame_rate(sequence)))
             self._slam = pyorbslam3.Slam(vocabulary, path, pyorbslam3.Sensor.RGBD)
 
     def __call__(self) -> None:
-        """Track all frames. What its threads still map then is not waited for."""
+        """Track all frames. The call does not wait for the mapping threads."""
         for frame in self._sequence:
             self._slam.track_rgbd(frame.image.permute(1, 2, 0).numpy(), frame.depth[0].numpy(), frame.stamp)
 
     def trajectory(self) -> Trajectory:
-        """Poses of the frames in its largest map, after all its corrections.
+        """Return the poses of the frames in its largest map, after all corrections.
 
-        Where it loses the camera it begins a map with a world of its own. EuRoC's format leaves out all maps but the
-        largest, TUM's mixes the worlds. No map makes no poses.
+        When it loses the camera, it starts a new map with a new world frame. EuRoC's format contains only the largest
+        map; TUM's format mixes the world frames. Without a map there are no poses.
         """
         self._slam.shutdown()
         wait_for_threads()
@@ -61,7 +61,7 @@ class OrbSlam3:
             self._slam.save_trajectory_euroc(str(path))
             if not path.is_file() or not path.read_text().strip():
                 return Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
-            # Nanoseconds of any origin: read as they are, they would be taken for those of a clock.
+            # Nanoseconds since the start, which `read_trajectory` would interpret as Unix time.
             poses = np.loadtxt(path, ndmin=2)
             poses[:, 0] /= 1e9
             np.savetxt(path, poses, fmt="%.9f")
@@ -69,23 +69,23 @@ class OrbSlam3:
 
 
 def wait_for_threads(pause: float = 0.5) -> None:
-    """Return when this process no longer computes: ``shutdown`` only asks the threads to end."""
+    """Wait until this process is idle: ``shutdown`` only asks the threads to end."""
     busy = True
     while busy:
-        before = time.process_time()
+        start = time.process_time()
         time.sleep(pause)
-        busy = time.process_time() - before > 0.02 * pause
+        busy = time.process_time() - start > 0.02 * pause
 
 
-def frames_a_second(sequence: RGBDSequence) -> int:
-    """The rate of the camera, after which ORB-SLAM3 makes a keyframe at the latest after a second."""
+def frame_rate(sequence: RGBDSequence) -> int:
+    """Return the frame rate in Hz; ORB-SLAM3 inserts a keyframe at the latest after one second of frames."""
     return max(round(1 / float(sequence.stamps.diff().median())), 1)
 
 
 def settings(camera: PinholeCamera, fps: int) -> str:
-    """The settings file: the camera's own, the rest as in ORB-SLAM3's example for TUM's sequences.
+    """Return the settings file: the given camera, the rest as in ORB-SLAM3's example for TUM sequences.
 
-    Depth is handed over in metres, hence a factor of 1.
+    The depth factor is 1 because depth is passed in metres.
     """
     k1, k2, p1, p2, k3 = camera.distortion
     lens = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3} if camera.is_distorted else {}

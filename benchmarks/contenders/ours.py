@@ -1,4 +1,4 @@
-"""This package, as ``python -m v3d_torch.run`` runs it, without what it writes."""
+"""Contender with this package: the same as ``python -m v3d_torch.run``, without writing results."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ OVERRIDES = {
 
 
 class Ours:
-    """A contender.
+    """Contender with this package.
 
     Args:
-        sequence: to run on.
-        name: one of `OVERRIDES`.
-        seed: of every random choice.
+        sequence: Sequence to run on.
+        name: Key of `OVERRIDES`.
+        seed: Seed of all random choices.
 
     Attributes:
-        slam: the system.
-        pipeline: that runs it.
+        slam: System.
+        pipeline: Pipeline that runs the system.
     """
 
     def __init__(self, sequence: RGBDSequence, name: str, seed: int) -> None:
@@ -39,22 +39,22 @@ class Ours:
         set_num_threads(config.threads)
         torch.manual_seed(seed)
         self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
-        self.pipeline = Pipeline(sequence, self.slam, score=False)  # comparing true masks takes time of its own
+        self.pipeline = Pipeline(sequence, self.slam, score=False)  # scoring the masks is not part of tracking
         self.pipeline.get_ready()
 
     @property
     def stages(self) -> Mapping[str, float]:
-        """Seconds by stage; of two that run side by side, each has its own."""
+        """Seconds by stage. The times of stages that run in parallel overlap."""
         return self.slam.timer.seconds
 
     def __call__(self, on_frame: FrameCallback | None = None) -> None:
-        """Take in all frames.
+        """Track all frames.
 
         Args:
-            on_frame: called after each.
+            on_frame: Called after each frame.
 
         Raises:
-            RuntimeError: the run ended before the sequence did.
+            RuntimeError: If the run ended before the sequence.
         """
         failure = self.pipeline(on_frame).failure
         if failure is not None:
@@ -62,5 +62,5 @@ class Ours:
         self.pipeline.flush()
 
     def trajectory(self) -> Trajectory:
-        """A pose for every frame."""
+        """Return a pose for every frame."""
         return self.slam.poses.trajectory()

@@ -1,4 +1,4 @@
-"""A contender in a process of its own: its threads, memory, output and crashes are no one else's."""
+"""Runs of contenders, each in a new process, so that its threads, memory, output and crashes affect nothing else."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from tempfile import TemporaryDirectory
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.types import Trajectory
 
-LONGEST = 3600
-"""Seconds after which a process is taken to hang."""
+TIMEOUT = 3600
+"""Longest run time of a process, seconds; a longer one is considered to hang."""
 
 
 class ContenderError(Exception):
-    """A contender failed; the message is the sentence that it ended with."""
+    """Failure of a contender; the message is its last line of error output."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What one run gave.
+    """Result of one run.
 
     Attributes:
-        trajectory: None where it found no pose.
-        frames: of the sequence that were given to it.
-        seconds: from before the first frame is read until the last has a pose.
-        cpu_seconds: of all threads of its processes in that time, user and system.
-        stages: seconds by stage, where it tells them.
+        trajectory: Poses; None if there is no pose.
+        frames: Number of frames that the contender tracked or tried to track.
+        seconds: Wall time from before the first frame is read until the last one has a pose.
+        cpu_seconds: User and system time of all threads of its processes in that time.
+        stages: Seconds by stage; empty if the contender does not measure them.
     """
 
     trajectory: Trajectory | None
@@ -53,29 +53,29 @@ def measure(
     """Run a contender on the first frames of a sequence.
 
     Args:
-        contender: one of `contenders.OURS` and `contenders.PEERS`.
-        sequence: as ``load_sequence`` takes it.
-        data_root: where sequences are.
-        frames: how many; None for all.
-        seed: for those who take one.
-        vocabulary: for ORB-SLAM3.
+        contender: One of `contenders.OURS` and `contenders.PEERS`.
+        sequence: Sequence, as `load_sequence` takes it.
+        data_root: Folder of sequences.
+        frames: Number of frames; None for all.
+        seed: Seed, for contenders that have one.
+        vocabulary: Vocabulary of ORB-SLAM3.
 
     Raises:
-        ContenderError: it failed, crashed or hung.
+        ContenderError: If the contender failed, crashed or hung.
     """
     options = {"--frames": frames, "--vocabulary": vocabulary, "--seed": seed, "--data-root": data_root}
     given = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     here = str(Path(__file__).parent.parent)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
     with TemporaryDirectory() as out:
-        # -P: the package that is installed, not one that the working folder may hold.
+        # -P: the installed package, not one in the working folder.
         command = [sys.executable, "-P", "-m", "contenders.child", contender, "--seq", sequence, "--out", out, *given]
         try:
             done = subprocess.run(  # noqa: S603
-                command, capture_output=True, text=True, errors="replace", env=environment, timeout=LONGEST
+                command, capture_output=True, text=True, errors="replace", env=environment, timeout=TIMEOUT
             )
         except subprocess.TimeoutExpired as error:
-            raise ContenderError(f"gave nothing in {LONGEST} s") from error
+            raise ContenderError(f"not finished after {TIMEOUT} s") from error
         if done.returncode:
             raise ContenderError(failure(done).replace(out, "its temporary folder"))
         figures = json.loads((Path(out) / "measured.json").read_text(encoding="utf-8"))
@@ -84,8 +84,8 @@ def measure(
 
 
 def failure(done: subprocess.CompletedProcess[str]) -> str:
-    """The sentence that a failed run ended with."""
+    """Return the error message of a failed run."""
     if done.returncode < 0:
         return f"killed by {signal.Signals(-done.returncode).name}"
     lines = done.stderr.strip().splitlines()
-    return lines[-1].removeprefix("error: ") if lines else f"exit code {done.returncode} without a word"
+    return lines[-1].removeprefix("error: ") if lines else f"exit code {done.returncode} without a message"

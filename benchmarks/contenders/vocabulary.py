@@ -1,4 +1,4 @@
-"""A vocabulary of ORB descriptors for ORB-SLAM3, in DBoW2's text format, trained on the sequences at hand.
+"""Vocabulary of ORB descriptors for ORB-SLAM3, in DBoW2's text format, trained on given sequences.
 
 The tree of Galvez-Lopez and Tardos (Bags of Binary Words for Fast Place Recognition in Image Sequences, T-RO 2012): the
 descriptors under a node are split by k-majority into up to ten children. All nodes of a level are split at once.
@@ -21,21 +21,23 @@ from v3d_torch.io.download import cache_dir
 from v3d_torch.io.files import file_lock, write_text
 
 BRANCHES, DEPTH = 10, 6
-"""As in ORB-SLAM3's own vocabulary: it compares features within the nodes four levels above the leaves of a tree that
-is so deep, and with a lower tree it would compare them all."""
+"""Shape of the tree, as in ORB-SLAM3's own vocabulary.
+
+ORB-SLAM3 compares features within nodes four levels above the leaves; with a lower tree it would compare all of them.
+"""
 
 Descriptors = NDArray[np.uint8]  # (N, 32)
 
 
 @dataclass(frozen=True)
 class Level:
-    """Nodes at one distance from the root.
+    """Nodes of one level of the tree.
 
     Attributes:
-        parent: index of the node above among those of its level, int64, shape (M,).
-        centre: descriptors, uint8, shape (M, 32).
-        leaf: whether a node is a word, bool, shape (M,).
-        weight: inverse document frequency of the words, 0 for other nodes, float64, shape (M,).
+        parent: Index of the parent among the nodes of the level above, int64, shape (M,).
+        centre: Descriptors, uint8, shape (M, 32).
+        leaf: True for words, bool, shape (M,).
+        weight: Inverse document frequency of the words, 0 for other nodes, float64, shape (M,).
     """
 
     parent: NDArray[np.int64]
@@ -45,16 +47,16 @@ class Level:
 
 
 def vocabulary(sequences: Iterable[RGBDSequence], images: int = 200, features: int = 1000) -> Path:
-    """The file of a vocabulary trained on sequences; made where the cache does not hold it.
+    """Return the file of a vocabulary trained on sequences; train it if it is not in the cache.
 
     Args:
-        sequences: whose images to take, evenly over all of them.
-        images: how many, at most about.
-        features: ORB features of each.
+        sequences: Sequences whose images to use, evenly spread over all of them.
+        images: Approximate number of images.
+        features: Number of ORB features per image.
 
     Raises:
-        InputError: an image cannot be read.
-        OutputError: the cache cannot be written.
+        InputError: If an image cannot be read.
+        OutputError: If the cache is not writable.
     """
     sequences = list(sequences)
     contents = [(s.name, len(s), float(s.stamps[0])) for s in sequences]
@@ -67,7 +69,7 @@ def vocabulary(sequences: Iterable[RGBDSequence], images: int = 200, features: i
 
 
 def collect(sequences: list[RGBDSequence], images: int, features: int) -> tuple[Descriptors, NDArray[np.int64]]:
-    """Descriptors, shape (N, 32), and the number of the image that each is from, shape (N,)."""
+    """Return descriptors, shape (N, 32), and the index of the image of each, shape (N,)."""
     orb = cv2.ORB_create(features)
     step = -(-sum(map(len, sequences)) // images)
     found = []
@@ -84,25 +86,25 @@ def train(descriptors: Descriptors, image: NDArray[np.int64], smallest: int = 20
     """Grow the tree from the root down.
 
     Args:
-        descriptors: uint8, shape (N, 32).
-        image: that each is from, shape (N,).
-        smallest: nodes with fewer descriptors are not split any more.
-        seed: of the centres that the clusterings begin with.
+        descriptors: Descriptors, uint8, shape (N, 32).
+        image: Index of the image of each descriptor, shape (N,).
+        smallest: Nodes with fewer descriptors are not split.
+        seed: Seed of the initial centres.
 
     Returns:
-        The levels, without the root.
+        Levels of the tree, without the root.
     """
     order = np.random.default_rng(seed).permutation(len(descriptors))
     descriptors, image = descriptors[order], image[order]
     images = len(np.unique(image))
     levels: list[Level] = []
-    node = np.zeros(len(descriptors), dtype=np.int64)  # that each descriptor lies under, among those of its level
+    node = np.zeros(len(descriptors), dtype=np.int64)  # node of each descriptor among those of its level
     for depth in range(1, DEPTH + 1):
         split, family = np.unique(node, return_inverse=True)
         cluster, centre = k_majority(descriptors, family)
-        used, node = np.unique(cluster, return_inverse=True)  # clusters without members are no nodes
+        used, node = np.unique(cluster, return_inverse=True)  # empty clusters are not nodes
         leaf = (np.bincount(node) < smallest) | (depth == DEPTH)
-        shown = np.bincount(np.unique(np.stack([node, image]), axis=1)[0])  # images that show each node
+        shown = np.bincount(np.unique(np.stack([node, image]), axis=1)[0])  # number of images that show each node
         levels.append(Level(split[used // BRANCHES], centre[used], leaf, np.where(leaf, np.log(images / shown), 0.0)))
         left = ~leaf[node]
         descriptors, image, node = descriptors[left], image[left], node[left]
@@ -117,15 +119,15 @@ def k_majority(
     """Split each of several families of descriptors by Hamming distance (Grana et al., VISAPP 2013).
 
     Args:
-        descriptors: in random order, uint8, shape (N, 32).
-        family: that each belongs to, from 0, none empty, shape (N,).
-        rounds: most assignments.
+        descriptors: Descriptors in random order, uint8, shape (N, 32).
+        family: Family of each descriptor, counted from 0, none empty, shape (N,).
+        rounds: Largest number of assignments.
 
     Returns:
-        cluster of each descriptor, ``BRANCHES * family`` and up, shape (N,), and the centres of all clusters.
+        Cluster of each descriptor, ``BRANCHES * family`` and up, shape (N,), and the centres of all clusters.
     """
     sizes = np.bincount(family)
-    member = np.minimum(np.arange(BRANCHES), sizes[:, None] - 1)  # one taken twice: the second centre gets no members
+    member = np.minimum(np.arange(BRANCHES), sizes[:, None] - 1)  # of two equal centres, the second one gets no members
     start = np.cumsum(sizes) - sizes
     centre = descriptors[np.argsort(family, kind="stable")[start[:, None] + member]].reshape(-1, 32)
     cluster = np.full(len(family), -1)
@@ -138,7 +140,7 @@ def k_majority(
 
 
 def nearest(descriptors: Descriptors, centre: Descriptors, family: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cluster of each descriptor's family whose centre differs in the fewest bits."""
+    """Return the cluster in the family of each descriptor whose centre differs in the fewest bits."""
     words, centres = descriptors.view(np.uint64), centre.view(np.uint64).reshape(-1, BRANCHES, 4)
     found = [
         np.bitwise_count(words[part, None] ^ centres[family[part]]).sum(axis=-1, dtype=np.int64).argmin(axis=1)
@@ -148,7 +150,7 @@ def nearest(descriptors: Descriptors, centre: Descriptors, family: NDArray[np.in
 
 
 def majority(descriptors: Descriptors, cluster: NDArray[np.int64], centre: Descriptors) -> Descriptors:
-    """Centres whose every bit is that of most members; those without members stay."""
+    """Return centres with the most frequent value of each bit; centres without members stay."""
     ones = torch.zeros(len(centre), 256, dtype=torch.int32)
     for part in parts(len(descriptors)):
         bits = torch.from_numpy(np.unpackbits(descriptors[part], axis=1).astype(np.int32))
@@ -158,19 +160,19 @@ def majority(descriptors: Descriptors, cluster: NDArray[np.int64], centre: Descr
 
 
 def parts(count: int, size: int = 1 << 15) -> Iterator[slice]:
-    """Slices that bound the memory of what is computed for each of ``count`` descriptors."""
+    """Return slices of ``count`` descriptors that bound the memory of a computation."""
     return (slice(start, start + size) for start in range(0, count, size))
 
 
 def text(levels: list[Level]) -> str:
-    """The tree as DBoW2's ``loadFromTextFile`` reads it.
+    """Return the tree in the format of DBoW2's ``loadFromTextFile``.
 
-    Branches, depth, scoring (0 = L1) and weighting (0 = TF-IDF); then a line per node, which gets the next number: its
-    parent's number (0 = the root), whether it is a word, the bytes of its descriptor and its weight. No line break
-    ends the file, since the reader would take what follows for one more node.
+    The first line has branches, depth, scoring (0 = L1) and weighting (0 = TF-IDF). Each further line is a node; nodes
+    are numbered by line. It has the number of its parent (0 = the root), whether it is a word, the bytes of its
+    descriptor and its weight. The file ends without a line break, which the reader would parse as another node.
     """
     lines = [f"{BRANCHES} {DEPTH} 0 0"]
-    above, below = 0, 1  # numbers of the first node of the level above and of this one
+    above, below = 0, 1  # number of the first node of the level above and of this level
     for level in levels:
         lines += [
             f"{above + parent} {int(leaf)} {' '.join(map(str, centre))} {weight:.6g}"

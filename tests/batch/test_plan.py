@@ -1,91 +1,17 @@
-"""Which sequences a batch's patterns speak of: paths, what is in --data-root, names of the benchmark."""
+"""Planning of a batch."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-from helpers.corpus.base import write_base
-from rich.console import Console
-
-from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, short_name
-from v3d_torch.datasets.sequence_patterns import matching_sequences
-from v3d_torch.errors import InputError
-from v3d_torch.runs.console import open_sequences
+from v3d_torch.batch.plan import load_configs
+from v3d_torch.config.loading import load_config
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
-    """A folder of sequences, and of what is none."""
-    for name in ("walk_a", "walk_b", "sit", "rgbd_dataset_freiburg1_rpy", "fr1_xyz"):
-        (tmp_path / "data" / name).mkdir(parents=True)
-        (tmp_path / "data" / name / "rgb.txt").write_text("")
-    (tmp_path / "data" / "walk_notes").mkdir()
-    (tmp_path / "data" / "README.md").write_text("")
-    return tmp_path / "data"
-
-
-def test_what_has_no_wildcard_is_taken_as_it_is(root: Path) -> None:
-    assert matching_sequences(["demo", "nowhere", "fr3/w/xyz", "demo"], root) == ["demo", "nowhere", "fr3/w/xyz"]
-
-
-def test_a_folder_with_brackets_in_its_name_is_no_pattern(root: Path) -> None:
-    (root / "take [1]").mkdir()
-    assert matching_sequences([str(root / "take [1]")], root) == [str(root / "take [1]")]
-
-
-def test_a_pattern_finds_the_sequences_in_the_data_root_and_nothing_else(root: Path) -> None:
-    assert matching_sequences(["walk_*"], root) == ["walk_a", "walk_b"]
-    assert matching_sequences(["*"], root) == ["fr1_xyz", "rgbd_dataset_freiburg1_rpy", "sit", "walk_a", "walk_b"]
-    assert matching_sequences(["walk_[!a]", "s?t"], root) == ["walk_b", "sit"]
-
-
-def test_a_pattern_finds_paths(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert matching_sequences([str(root / "walk*")]) == [str(root / "walk_a"), str(root / "walk_b")]
-    monkeypatch.chdir(root.parent)
-    assert matching_sequences(["data/s*"], Path("elsewhere")) == ["data/sit"]
-
-
-def test_a_pattern_finds_names_of_the_benchmark(root: Path) -> None:
-    walking = ["fr3/w/xyz", "fr3/w/half", "fr3/w/static", "fr3/w/rpy"]
-    for pattern in ("fr3/w/*", "fr3_walking_*", "freiburg3_walking*", "rgbd_dataset_freiburg3_walking_*", "FR3/W/*"):
-        assert matching_sequences([pattern], root) == walking
-    third = matching_sequences(["fr3/*"], root)
-    assert third[:8] == [short_name(name) for name in PAPER_SEQUENCES]  # first, in the order of its tables
-    here = [short_name(n) for n in SEQUENCES if "freiburg3" in n and not n.endswith("validation")]
-    assert sorted(third) == sorted(here)
-
-
-def test_validation_sequences_are_meant_where_it_is_said(root: Path) -> None:
-    found = matching_sequences(["fr1/*_validation"], root)
-    assert found and all(name.endswith("validation") for name in found)
-
-
-def test_each_sequence_once_whatever_it_is_called(root: Path) -> None:
-    found = matching_sequences(["fr1/rpy", "fr1/*", "freiburg1-rpy"], root)
-    assert found[0] == "fr1/rpy" and found.count("fr1/rpy") == 1
-    assert (
-        len(set(found)) == len(found) == len([n for n in SEQUENCES if n.startswith("rgbd_dataset_freiburg1")]) / 2 + 1
-    )
-    assert matching_sequences(["fr?_xyz"], root) == ["fr1_xyz", "fr2/xyz"]  # the first of them as the folder
-
-
-def test_a_pattern_that_matches_nothing(root: Path) -> None:
-    for pattern in ("walks_*", "fr4/*", "walk_note*", str(root / "none*")):
-        with pytest.raises(InputError, match="matches no sequence") as raised:
-            matching_sequences(["sit", pattern], root)
-        assert str(raised.value).startswith(pattern) and str(root) in str(raised.value)
-
-
-@pytest.mark.parametrize("pattern", [5000 * "x" + "/*", "~nobody-of-this-name/*", "a**b/*", "[" + 3 * "*" + "]"])
-def test_a_pattern_that_can_match_nothing(pattern: str, root: Path) -> None:
-    with pytest.raises(InputError, match="match"):
-        matching_sequences([pattern], root)
-
-
-def test_runs_that_are_compared_need_a_whole_ground_truth(tmp_path: Path) -> None:
-    write_base(tmp_path / "seq")
-    assert list(open_sequences([str(tmp_path / "seq")], None, Console())) == ["seq"]
-    (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
-    with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
-        open_sequences([str(tmp_path / "seq")], None, Console())
+def test_load_configs_merges_full_with_default_and_limits_threads(tmp_path: Path) -> None:
+    mine = str(tmp_path / "mine.yaml")
+    Path(mine).write_text("seed: 7\nthreads: 2\nsegmentation: {threads: 2}\n")
+    configs = load_configs(["default", "full", mine], one_thread=False)
+    assert list(configs) == ["full", "mine"] and configs["full"] == load_config()
+    one, two = load_configs([mine], one_thread=True)["mine"], configs["mine"]
+    assert [(config.threads, config.segmentation.threads) for config in (one, two)] == [(1, 1), (2, 2)]

@@ -1,4 +1,4 @@
-"""``python -m v3d_torch record`` as a user calls it, and the folders that it writes."""
+"""Command ``v3d-torch record`` and the folders that it writes."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=100)  # noqa: S603
 
 
-def call_here(*arguments: str | Path) -> Result:
-    """In this process, which has loaded everything already."""
+def call_in_process(*arguments: str | Path) -> Result:
+    """Call the command in this process, which is faster."""
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
-def assert_one_sentence(done: Result, *words: str) -> None:
+def assert_error_line(done: Result, *words: str) -> None:
     assert done.exit_code == 2, done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
     assert all(word in done.stderr for word in words), done.stderr
@@ -55,7 +55,7 @@ def assert_equal(saved: RGBDSequence, source: RGBDSequence) -> None:
         assert frame.depth_delay == pytest.approx(original.depth_delay, abs=2e-6)
 
 
-def test_a_bag_becomes_a_folder(tmp_path: Path) -> None:
+def test_bag_is_saved_as_folder(tmp_path: Path) -> None:
     make = Messages("bag")
     info = make.info(WIDTH, HEIGHT, K, [0.1, -0.2, 0.003, 0.004, 0.05], K[:3] * 4)
     messages = [(INFO, 10.0, info)]
@@ -70,14 +70,14 @@ def test_a_bag_becomes_a_folder(tmp_path: Path) -> None:
     assert load_sequence(str(bag))[1].depth_delay == pytest.approx(-0.0125, abs=1e-6)
 
 
-def test_ground_truth_is_saved_and_not_transformed_twice(tmp_path: Path) -> None:
+def test_ground_truth_of_bonn_is_transformed_once(tmp_path: Path) -> None:
     folder = tmp_path / "rgbd_bonn_tiny"
     save(folder / "rgb" / "0.png", colour_of(0, 640, 480))
     save(folder / "depth" / "0.png", depth_of(0, 640, 480))
     (folder / "rgb.txt").write_text("10.0 rgb/0.png\n")
     (folder / "depth.txt").write_text("10.0 depth/0.png\n")
     (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0.6 0.8\n")
-    done = call_here("--seq", folder, "--out", tmp_path / "rgbd_bonn_copy")
+    done = call_in_process("--seq", folder, "--out", tmp_path / "rgbd_bonn_copy")
     assert (done.exit_code, done.stderr) == (0, "")
     source, saved = load_sequence(str(folder)), load_sequence(str(tmp_path / "rgbd_bonn_copy"))
     assert_equal(saved, source)
@@ -85,7 +85,7 @@ def test_ground_truth_is_saved_and_not_transformed_twice(tmp_path: Path) -> None
     torch.testing.assert_close(saved.groundtruth.T_wc, source.groundtruth.T_wc, atol=1e-8, rtol=0)
 
 
-def test_a_broken_ground_truth_costs_no_frame(tmp_path: Path) -> None:
+def test_damaged_ground_truth_keeps_all_frames(tmp_path: Path) -> None:
     folder = tmp_path / "take"
     save(folder / "rgb" / "0.png", colour_of(0))
     save(folder / "depth" / "0.png", depth_of(0))
@@ -93,13 +93,13 @@ def test_a_broken_ground_truth_costs_no_frame(tmp_path: Path) -> None:
         (folder / f"{kind}.txt").write_text(f"10.0 {kind}/0.png\n")
     (folder / "camera.yaml").write_text(CAMERA_YAML)
     (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0 nan\n")
-    done = call_here("--seq", folder, "--out", tmp_path / "out")
-    assert_one_sentence(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite", "frames")
+    done = call_in_process("--seq", folder, "--out", tmp_path / "out")
+    assert_error_line(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite", "frames")
     assert len(load_sequence(str(tmp_path / "out"))) == 1
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
-def test_ctrl_c_ends_it_well(tmp_path: Path) -> None:
+def test_ctrl_c_leaves_complete_folder(tmp_path: Path) -> None:
     folder, out = tmp_path / "long", tmp_path / "out"
     save(folder / "rgb.png", colour_of(0, 640, 480))
     save(folder / "depth.png", depth_of(0, 640, 480))
@@ -120,19 +120,19 @@ def test_ctrl_c_ends_it_well(tmp_path: Path) -> None:
     assert files == LISTS | {f"{kind}/{stamp}" for kind in ("rgb", "depth") for stamp in stamps}
 
 
-def test_what_users_get_wrong(tmp_path: Path) -> None:
+def test_nonempty_folder_and_missing_camera_are_errors(tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "diary.txt").write_text("")
     save(tmp_path / "rgb" / "1.png", colour_of(0))
     save(tmp_path / "depth" / "1.png", depth_of(0))
     (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
-    done = call_here("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
-    assert_one_sentence(done, str(tmp_path / "full"), "already exists and is not an empty folder; choose another")
-    assert_one_sentence(call_here("--out", tmp_path / "new"), "realsense: ")
+    done = call_in_process("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
+    assert_error_line(done, str(tmp_path / "full"), "holds something already; choose another")
+    assert_error_line(call_in_process("--out", tmp_path / "new"), "realsense: ")
     assert not (tmp_path / "new").exists()
 
 
-def test_what_is_written_stays_when_the_source_breaks(tmp_path: Path) -> None:
+def test_failure_of_source_keeps_saved_frames(tmp_path: Path) -> None:
     camera = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=1000)
     frame = RGBDFrame(0, 12.5, torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.ones(1, HEIGHT, WIDTH))
     with pytest.raises(RuntimeError, match="broke"), TUMWriter(tmp_path / "out", camera) as writer:
@@ -141,7 +141,7 @@ def test_what_is_written_stays_when_the_source_breaks(tmp_path: Path) -> None:
     assert load_sequence(str(tmp_path / "out")).stamps.tolist() == [12.5]
 
 
-def test_depth_is_exact_and_what_does_not_fit_is_none(tmp_path: Path) -> None:
+def test_depth_is_exact_and_out_of_range_is_zero(tmp_path: Path) -> None:
     camera = PinholeCamera(1, 2, 3, 4, 256, 256, depth_scale=1000)
     units = torch.arange(256 * 256, dtype=torch.float32).reshape(1, 256, 256)
     image = torch.from_numpy(colour_of(0, 256, 256)).permute(2, 0, 1)
@@ -155,14 +155,14 @@ def test_depth_is_exact_and_what_does_not_fit_is_none(tmp_path: Path) -> None:
     assert torch.equal(far == 0, units >= 35535)
 
 
-def test_a_file_where_the_folder_belongs(tmp_path: Path) -> None:
+def test_file_in_place_of_folder_is_error(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     for folder in (tmp_path / "taken", tmp_path / "taken" / "below"):
         with pytest.raises(OutputError, match="taken"):
             TUMWriter(folder, PinholeCamera(1, 2, 3, 4))
 
 
-def test_help_is_instant_and_names_every_option() -> None:
+def test_help_lists_options_and_does_not_import_torch() -> None:
     done = subprocess.run(command("--help"), capture_output=True, text=True, check=True)  # noqa: S603
     for option in ("seq", "out", "data-root", "camera", "rgb-topic", "depth-topic", "info-topic", "fps"):
         assert f"--{option}" in done.stdout

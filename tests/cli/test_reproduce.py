@@ -1,4 +1,4 @@
-"""``python -m v3d_torch reproduce`` as a user calls it: downloads, gaps, tables, the study, --resume, bad input."""
+"""Command ``v3d-torch reproduce``: downloads, missing sequences, tables, the study, --resume, bad input."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import reproduction
-from v3d_torch.batch.executor import Finished
+from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.cli.reproduce import app
 from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets import PAPER_SEQUENCES, locate, short_name
-from v3d_torch.evaluation.ablation import VARIANTS, overview
+from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.paper_tables import paper_scores
 from v3d_torch.evaluation.summary import csv_text, latex, markdown
+from v3d_torch.evaluation.paper_tables import paper_scores
 
 SHORT = [short_name(name) for name in PAPER_SEQUENCES]
 SERVED = [name for name in PAPER_SEQUENCES if name.endswith(("walking_xyz", "sitting_rpy"))]
-"""What the server has."""
+"""Sequences on the server."""
 
 
 class Handler(SimpleHTTPRequestHandler):
@@ -42,7 +42,7 @@ def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, list(map(str, arguments)), env={"V3D_DATA": "", "NO_COLOR": "1"})
 
 
-def assert_one_sentence(result: Result, *words: str | Path) -> None:
+def assert_error_line(result: Result, *words: str | Path) -> None:
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1, result.stderr
     for word in words:
@@ -50,7 +50,7 @@ def assert_one_sentence(result: Result, *words: str | Path) -> None:
 
 
 def table_in(document: str, heading: str) -> dict[str, dict[str, str]]:
-    """Rows of a section of a Markdown document by their first cell, each by the headings of its columns."""
+    """Table in a section of a Markdown document: rows by their first cell, cells by the heading of their column."""
     section = document.partition(f"## {heading}\n")[2].partition("\n## ")[0]
     lines = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
     return {line[0]: dict(zip(lines[0], line, strict=True)) for line in lines[2:]}
@@ -62,7 +62,7 @@ def plain(cell: str) -> str:
 
 @pytest.fixture(scope="module")
 def archives(moment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Archives as the benchmark has them, of six frames a quarter of a second apart, so that RPE can be taken."""
+    """Archives in the layout of the benchmark; six frames 0.25 s apart, so that there is RPE over 1 s."""
     folder = tmp_path_factory.mktemp("server")
     pairs = [line.split() for line in (moment / "associations.txt").read_text().splitlines()]
     truth = [line.split() for line in (moment / "groundtruth.txt").read_text().splitlines() if line[0] != "#"]
@@ -75,7 +75,7 @@ def archives(moment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         lists["groundtruth"].append(" ".join([f"{k / 4:.6f}", *poses[nearest]]))
     for name in SERVED:
         for kind, lines in lists.items():
-            (folder / f"{kind}.txt").write_text("# as the benchmark has it\n" + "\n".join(lines) + "\n")
+            (folder / f"{kind}.txt").write_text("# comment line\n" + "\n".join(lines) + "\n")
         with tarfile.open(folder / f"{name}.tgz", "w:gz", compresslevel=1) as archive:
             for kind in lists:
                 archive.add(folder / f"{kind}.txt", f"{name}/{kind}.txt")
@@ -101,22 +101,24 @@ def server(archives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 @pytest.fixture
-def pretended(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Runs that only say what they would have measured: 1 cm for the first configuration, 2 for the next and so on."""
-    carried_out: list[str] = []
+def fake_runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Descriptions of the jobs that were run. Jobs only write metrics: an ATE of 1 cm for the first variant, 2 cm for
+    the next, and so on.
+    """
+    executed: list[str] = []
 
-    def execute(jobs: Sequence[Job], stop: Event) -> Generator[Finished]:
+    def execute(jobs: Sequence[Job], stop: Event) -> Generator[JobFinished]:
         for job in jobs:
-            carried_out.append(str(job))
+            executed.append(str(job))
             job.folder.mkdir(parents=True, exist_ok=True)
             metrics = metrics_of(0.01 * (1 + VARIANTS.index(job.config_name)), job.frames)
             (job.folder / "metrics.json").write_text(json.dumps(metrics))
             (job.folder / "config.yaml").write_text(job.config.model_dump_json())
-            yield Finished(job, None)
+            yield JobFinished(job, None)
 
-    monkeypatch.setattr(reproduction, "Processes", lambda workers: execute)
-    monkeypatch.setattr(reproduction, "make_sure_of_networks", lambda configs: None)
-    return carried_out
+    monkeypatch.setattr(reproduction, "ProcessExecutor", lambda workers: execute)
+    monkeypatch.setattr(reproduction, "prepare_networks", lambda configs: None)
+    return executed
 
 
 def metrics_of(ate: float, frames: int = 6) -> dict[str, Any]:
@@ -127,12 +129,12 @@ def metrics_of(ate: float, frames: int = 6) -> dict[str, Any]:
 # --- with real runs
 
 
-def test_what_is_missing_is_downloaded_and_run_and_stands_in_the_papers_tables(server: str, tmp_path: Path) -> None:
+def test_missing_sequences_are_downloaded_run_and_tabulated(server: str, tmp_path: Path) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
     result = call("--data-root", data, "--configs", "baseline", "--out", out)
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in data.iterdir() if path.is_dir()) == sorted(SERVED)
-    (note,) = [line for line in result.stdout.splitlines() if line.startswith("not here: ")]
+    (note,) = [line for line in result.stdout.splitlines() if line.startswith("missing sequences: ")]
     assert all((name in note) == (name not in SERVED) for name in PAPER_SEQUENCES)
     assert "404" in note and str(data) in note
 
@@ -164,28 +166,28 @@ def test_what_is_missing_is_downloaded_and_run_and_stands_in_the_papers_tables(s
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-# --- with runs that are pretended
+# --- with fake runs
 
 
-def test_the_study_has_all_variants_and_the_tables_the_three_that_were_asked_for(
-    server: str, pretended: list[str], tmp_path: Path
+def test_study_has_all_variants_and_tables_have_chosen_configs(
+    server: str, fake_runs: list[str], tmp_path: Path
 ) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
     result = call("--data-root", data, "--ablation", "--seeds", "2", "--out", out)
     assert result.exit_code == 0, result.output
-    assert len(pretended) == 2 * len(VARIANTS) * 2
+    assert len(fake_runs) == 2 * len(VARIANTS) * 2
     ours = [
         method for method in table_in((out / "summary.md").read_text(), "ATE, m")[SHORT[0]] if "paper)" not in method
     ]
     assert ours == ["sequence", "full", "paper", "baseline"]
 
     study = table_in((out / "ablation.md").read_text(), "Ablation: ATE, m")
-    assert list(study) == [*SHORT, "ratio to full", "ratio to full (paper)"]
+    assert list(study) == [*SHORT, "times full", "times full (paper)"]
     assert [method for method in study["fr3/w/xyz"] if method != "sequence"] == list(VARIANTS)
     assert study["fr3/w/xyz"]["no_voting"] == "0.0200" and study["fr3/s/xyz"]["no_voting"] == "not here"
     full = 1 + VARIANTS.index("full")
-    assert study["ratio to full"]["no_voting"] == f"{2 / full:.2f}" and study["ratio to full"]["full"] == "1.00"
-    assert (study["ratio to full (paper)"]["no_voting"], study["ratio to full (paper)"]["not_upright"]) == ("4.00", "-")
+    assert study["times full"]["no_voting"] == f"{2 / full:.2f}" and study["times full"]["full"] == "1.00"
+    assert (study["times full (paper)"]["no_voting"], study["times full (paper)"]["not_upright"]) == ("4.00", "-")
     for name in ("summary.tex", "ablation.tex"):
         text = (out / name).read_text()
         assert text.startswith("% \\usepackage{booktabs}") and "not here" in text
@@ -193,27 +195,27 @@ def test_the_study_has_all_variants_and_the_tables_the_three_that_were_asked_for
         "geometric mean" in (out / "ablation.md").read_text() and "geometric mean" in (out / "ablation.tex").read_text()
     )
     rows = list(csv.DictReader((out / "ablation.csv").open(newline="")))
-    assert len(rows) == len(pretended) and {row["variant"] for row in rows} == set(VARIANTS)
-    assert "ratio to full" in result.stdout
-    assert len(pd.read_parquet(out / "runs.parquet")) == len(pretended)
+    assert len(rows) == len(fake_runs) and {row["variant"] for row in rows} == set(VARIANTS)
+    assert "times full" in result.stdout
+    assert len(pd.read_parquet(out / "runs.parquet")) == len(fake_runs)
 
 
-def test_resume_runs_what_has_come_meanwhile(server: str, pretended: list[str], tmp_path: Path) -> None:
+def test_resume_runs_sequences_added_since(server: str, fake_runs: list[str], tmp_path: Path) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
     arguments = ("--data-root", data, "--out", out)
     assert call(*arguments).exit_code == 0
-    first = list(pretended)
+    first = list(fake_runs)
     (data / SERVED[0]).rename(data / "rgbd_dataset_freiburg3_walking_static")
     refused = call(*arguments, "--no-download")
-    assert_one_sentence(refused, out, "--resume")
+    assert_error_line(refused, out, "--resume")
     result = call(*arguments, "--no-download", "--resume")
     assert result.exit_code == 0, result.output
-    assert pretended == [*first, *(f"fr3/w/static, {config}, seed 0" for config in reproduction.CONFIGS)]
+    assert fake_runs == [*first, *(f"fr3/w/static, {config}, seed 0" for config in reproduction.TABLE_CONFIGS)]
 
 
-def test_the_configurations_are_the_packages(server: str, pretended: list[str], tmp_path: Path) -> None:
+def test_runs_use_configurations_of_the_package(server: str, fake_runs: list[str], tmp_path: Path) -> None:
     assert call("--data-root", tmp_path / "data", "--out", tmp_path / "out").exit_code == 0
-    for config in reproduction.CONFIGS:
+    for config in reproduction.TABLE_CONFIGS:
         folder = tmp_path / "out" / "fr3_w_xyz" / config / "seed0"
         assert load_config(folder / "config.yaml") == load_config(CONFIGS[config])
 
@@ -224,50 +226,31 @@ def test_the_configurations_are_the_packages(server: str, pretended: list[str], 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--no-download",), ("not here: rgbd_dataset_freiburg3_sitting_xyz, ", "freiburg3/, unpack", "data")),
+        (("--no-download",), ("missing sequences: rgbd_dataset_freiburg3_sitting_xyz, ", "freiburg3/, unpack", "data")),
         (("--configs", "papper"), ("papper", "paper")),
         (("--resume",), ("--resume", "--out")),
     ],
 )
-def test_bad_input_is_one_sentence(
+def test_bad_input_is_one_line(
     arguments: tuple[str, ...], words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
-    assert_one_sentence(call("--data-root", tmp_path / "data", *arguments), *words)
+    assert_error_line(call("--data-root", tmp_path / "data", *arguments), *words)
     assert not (tmp_path / "results").exists()
 
 
-def test_a_sequence_that_is_broken_is_no_gap(server: str, pretended: list[str], tmp_path: Path) -> None:
+def test_damaged_sequence_is_an_error(server: str, fake_runs: list[str], tmp_path: Path) -> None:
     folder = tmp_path / "data" / SERVED[0]
     folder.mkdir(parents=True)
-    assert_one_sentence(call("--data-root", tmp_path / "data", "--out", tmp_path / "out"), folder)
-    assert not pretended
+    assert_error_line(call("--data-root", tmp_path / "data", "--out", tmp_path / "out"), folder)
+    assert not fake_runs
 
 
 # --- the tables
 
 
-def test_without_any_run_there_is_no_overview_and_a_variant_without_its_like_has_no_ratio() -> None:
-    assert overview([]) is None
-    runs = [Outcome("fr3/w/xyz", "no_voting", 0, metrics_of(0.04)), Outcome("fr3/s/xyz", "full", 0, metrics_of(0.02))]
-    table = overview(runs)
-    assert table is not None
-    assert [cell.text for cell in table.rows["ratio to full"]] == ["-", "1.00"]
-
-
-def test_the_ratio_is_the_geometric_mean_over_the_sequences() -> None:
-    runs = [
-        Outcome(sequence, config, 0, metrics_of(ate))
-        for sequence, full, times in (("fr3/w/xyz", 0.01, 8.0), ("fr3/s/xyz", 0.3, 2.0))
-        for config, ate in (("no_voting", times * full), ("full", full))
-    ]
-    table = overview(runs)
-    assert table is not None
-    assert [cell.text for cell in table.rows["ratio to full"]] == ["4.00", "1.00"]
-
-
-def test_rows_without_a_sequence_keep_the_papers_order_and_figures() -> None:
+def test_missing_sequences_keep_the_papers_order_and_scores() -> None:
     runs = [Outcome("fr3/w/static", "full", 0, metrics_of(0.006)), Outcome("fr3/s/xyz", "full", 0, metrics_of(0.009))]
     absent = [name for name in SHORT if name not in ("fr3/w/static", "fr3/s/xyz")]
     table = table_in(markdown(runs, absent), "ATE, m")
@@ -275,5 +258,5 @@ def test_rows_without_a_sequence_keep_the_papers_order_and_figures() -> None:
     assert table["fr3/w/rpy"]["full"] == "not here" and table["fr3/w/rpy"]["DynaSLAM (paper)"] == "**0.0354**"
     assert table["fr3/w/static"]["full"] == "**0.0060**"
     assert latex(runs, absent).count("not here") == 3 * 6
-    gaps = [row for row in csv.DictReader(csv_text(runs, absent).splitlines()) if row["method"] == "full"]
-    assert [row["median"] for row in gaps[:8]] == ["0.009", *[""] * 5, "0.006", ""]
+    missing = [row for row in csv.DictReader(csv_text(runs, absent).splitlines()) if row["method"] == "full"]
+    assert [row["median"] for row in missing[:8]] == ["0.009", *[""] * 5, "0.006", ""]

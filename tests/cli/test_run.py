@@ -120,7 +120,7 @@ def test_the_screen_shows_scores_and_where_the_results_are(
 def test_the_profile_shows_what_each_stage_took(shown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     out, done = shown
     frames = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").to_numpy() * 1e3
-    rows = [line.strip("│ ").split() for line in done.stdout.partition("milliseconds of a frame")[2].splitlines()]
+    rows = [line.strip("│ ").split() for line in done.stdout.partition("time per frame, ms")[2].splitlines()]
     shown_rows = {row[0]: row[2::2] for row in rows if len(row) == 9 and row[-1].endswith("%")}
     stages = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").columns.str.removeprefix("seconds_")
     assert list(shown_rows) == [*stages, "all"]

@@ -22,7 +22,7 @@ from helpers.corpus.outputs import at_frame, full_from_frame
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch.job import Job
-from v3d_torch.batch.job_process import run_job
+from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import run
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config

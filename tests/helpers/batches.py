@@ -1,16 +1,22 @@
-"""Sequences and jobs for the tests of batches."""
+"""Sequences and jobs for tests of batches."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from v3d_torch.batch.job import Job
-from v3d_torch.batch.plan import plan, read_configs
+from v3d_torch.batch.plan import load_configs, plan_jobs
 from v3d_torch.datasets import load_sequence
 
 
-def repeated(moment: Path, folder: Path, frames: int) -> Path:
-    """The moment over and over again, for as many frames as wanted; without ground truth."""
+def repeat_sequence(moment: Path, folder: Path, frames: int) -> Path:
+    """Write a sequence that plays the frames of `moment` forth and back, without ground truth.
+
+    Args:
+        moment: Sequence to take the frames from.
+        folder: Folder to write.
+        frames: Number of frames.
+    """
     folder.mkdir(exist_ok=True)
     for name in ("rgb", "depth", "camera.yaml"):
         if not (folder / name).exists():
@@ -23,8 +29,8 @@ def repeated(moment: Path, folder: Path, frames: int) -> Path:
     return folder
 
 
-def jobs(sequence: Path, out: Path, seeds: int) -> list[Job]:
-    """Runs of a sequence without masks."""
+def plan_seeds(sequence: Path, out: Path, seeds: int) -> list[Job]:
+    """Plan jobs of the baseline on a sequence, one per seed."""
     opened = load_sequence(str(sequence))
-    configs = read_configs(["baseline"], one_thread=True)
-    return plan({opened.name: (str(sequence), opened)}, configs, seeds=seeds, data_root=None, folder=out)
+    configs = load_configs(["baseline"], one_thread=True)
+    return plan_jobs({opened.name: (str(sequence), opened)}, configs, seeds=seeds, data_root=None, folder=out)

@@ -1,4 +1,4 @@
-"""Commands as a user calls them."""
+"""The run command in a process of its own, and assertions on what commands print."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typer.testing import Result
 
 
 def command(*arguments: str | Path) -> list[str]:
-    # One thread: two of them spin for each other where cores are shared, and the results are the same (tested below).
+    # One thread: several would wait for each other on shared cores, and results do not depend on their number.
     return [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"]
 
 

@@ -1,4 +1,4 @@
-"""What the benchmarks stand on: replays, the vocabulary, processes of their own and tables."""
+"""Benchmarks: replays, vocabulary, processes, tables, and the page of all figures."""
 
 from __future__ import annotations
 
@@ -23,13 +23,17 @@ import accuracy
 import growth
 import segmentation
 import speed
+import storage
+import tables
+import write_page
 from contenders import OURS, vocabulary
 from contenders.process import ContenderError, Measured, measure
+from heading import Heading
 from replay import Replay, forth_and_back
 
 
 def measured(rate: float, cpu: float, **stages: float) -> Measured:
-    """A run of 100 frames that found no pose, with a rate in frames a second and CPU time in ms a frame."""
+    """Run of 100 frames without a pose, with frames per second and CPU ms per frame."""
     return Measured(None, 100, 100 / rate, cpu / 10, stages)
 
 
@@ -37,7 +41,7 @@ class TestReplay:
     def test_forth_and_back_turns_at_the_ends(self) -> None:
         assert forth_and_back(4, 11) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2]
 
-    def test_time_goes_on_by_what_lies_between_the_frames(self, moment: Path) -> None:
+    def test_time_advances_by_intervals_between_frames(self, moment: Path) -> None:
         sequence = load_sequence(str(moment))
         count = len(sequence)
         replay = Replay(sequence, forth_and_back(count, 2 * count))
@@ -48,7 +52,7 @@ class TestReplay:
         assert frame.index == count and frame.stamp == float(replay.stamps[count])
         assert torch.equal(frame.image, sequence[count - 2].image)
 
-    def test_beginning_is_that_of_the_sequence(self, moment: Path) -> None:
+    def test_replay_of_first_frames_equals_sequence(self, moment: Path) -> None:
         sequence = load_sequence(str(moment))
         replay = Replay(sequence, range(2))
         assert [frame.index for frame in replay] == [0, 1]
@@ -56,26 +60,26 @@ class TestReplay:
 
 
 class TestSegmentation:
-    def test_every_variant_is_a_configuration_of_its_own(self) -> None:
+    def test_all_variants_differ(self) -> None:
         configs = [load_config(overrides=variant.overrides) for variant in segmentation.VARIANTS.values()]
-        alike = list(zip(configs, (variant.every for variant in segmentation.VARIANTS.values()), strict=True))
-        assert all(one != other for i, one in enumerate(alike) for other in alike[:i])
+        variants = list(zip(configs, (variant.every for variant in segmentation.VARIANTS.values()), strict=True))
+        assert all(one != other for i, one in enumerate(variants) for other in variants[:i])
 
-    def test_the_network_works_on_every_nth_frame(self, moment: Path) -> None:
+    def test_network_runs_on_every_nth_frame(self, moment: Path) -> None:
         def segment(frame: RGBDFrame) -> Instances:
             masks = torch.zeros(2, *frame.image.shape[1:], dtype=torch.bool)
             masks[0, : frame.index + 1], masks[1] = True, True
             return Instances(masks, torch.tensor([PERSON, PERSON + 1]), torch.ones(2), torch.zeros(2, 4))
 
-        watched = segmentation.Watched(segment, every=2)
-        assert [len(watched(frame)) for frame, _ in zip(load_sequence(str(moment)), range(3), strict=False)] == [
+        segmenter = segmentation.MeasuredSegmenter(segment, every=2)
+        assert [len(segmenter(frame)) for frame, _ in zip(load_sequence(str(moment)), range(3), strict=False)] == [
             2,
             0,
             2,
         ]
-        width = watched.people[0].shape[1]
-        assert {index: int(seen.sum()) for index, seen in watched.people.items()} == {0: width, 2: 3 * width}
-        assert len(watched.seconds) == 2
+        width = segmenter.people[0].shape[1]
+        assert {index: int(mask.sum()) for index, mask in segmenter.people.items()} == {0: width, 2: 3 * width}
+        assert len(segmenter.seconds) == 2
 
 
 @pytest.fixture(scope="module")
@@ -85,25 +89,25 @@ def patterns() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def levels(patterns: np.ndarray) -> list[vocabulary.Level]:
-    """Of 60 patterns, each seen 30 times with about eight bits in error, the i-th in every (1 + i % 5)-th image."""
+    """Tree trained on 60 patterns, each observed 30 times with about eight wrong bits, the i-th in 1 + i % 5 images."""
     generator = np.random.default_rng(1)
-    seen = np.repeat(patterns, 30, axis=0)
-    flips = np.packbits(generator.random((len(seen), 256)) < 1 / 32, axis=1)
+    observed = np.repeat(patterns, 30, axis=0)
+    flips = np.packbits(generator.random((len(observed), 256)) < 1 / 32, axis=1)
     images = np.concatenate([np.arange(30) % (1 + i % 5) for i in range(60)])
-    return vocabulary.train(seen ^ flips, images)
+    return vocabulary.train(observed ^ flips, images)
 
 
 class TestVocabulary:
-    def test_text_is_a_tree_as_dbow2_reads_it(self, levels: list[vocabulary.Level]) -> None:
+    def test_text_is_a_tree_in_dbow2_format(self, levels: list[vocabulary.Level]) -> None:
         text = vocabulary.text(levels)
-        assert not text.endswith("\n")  # the reader would take an empty line for a node
+        assert not text.endswith("\n")  # DBoW2 would parse an empty line as a node
         head, *lines = text.split("\n")
         assert head == "10 6 0 0"
         depth, children, leaves = [0], [0], [False]
         for line in lines:
             parent, leaf, *numbers, weight = line.split(" ")
             assert len(numbers) == 32 and all(0 <= int(number) < 256 for number in numbers)
-            assert int(parent) < len(depth) and not leaves[int(parent)]  # known to the reader, and no word
+            assert int(parent) < len(depth) and not leaves[int(parent)]  # an earlier node that is not a word
             children[int(parent)] += 1
             depth.append(depth[int(parent)] + 1)
             children.append(0)
@@ -112,8 +116,8 @@ class TestVocabulary:
         assert max(depth) <= 6 and max(children) <= 10
         assert all(leaf == (count == 0) for leaf, count in zip(leaves, children, strict=True))
 
-    def test_a_pattern_finds_its_word(self, levels: list[vocabulary.Level], patterns: np.ndarray) -> None:
-        """Down the tree by the nearest child, as DBoW2 goes, most patterns end in a word that differs in few bits."""
+    def test_pattern_descends_to_similar_word(self, levels: list[vocabulary.Level], patterns: np.ndarray) -> None:
+        """Going to the nearest child at each level, as DBoW2 does, most patterns end in a similar word."""
         errors = []
         for pattern in patterns:
             above = -1
@@ -126,29 +130,29 @@ class TestVocabulary:
             errors.append(distances.min())
         assert np.median(errors) <= 8  # 128 by chance
 
-    def test_weight_is_the_inverse_document_frequency(self) -> None:
-        """Ten descriptors make a word each: those that all of five images show weigh nothing, lone ones log 5."""
+    def test_weight_is_inverse_document_frequency(self) -> None:
+        """Ten descriptors are ten words: those in all five images weigh 0, those in one image weigh log 5."""
         descriptors = np.random.default_rng(0).integers(0, 256, (10, 32), dtype=np.uint8)
-        seen = np.concatenate([np.repeat(descriptors[:5], 5, axis=0), descriptors[5:]])
-        (level,) = vocabulary.train(seen, np.concatenate([np.tile(np.arange(5), 5), np.arange(5)]), smallest=100)
+        observed = np.concatenate([np.repeat(descriptors[:5], 5, axis=0), descriptors[5:]])
+        (level,) = vocabulary.train(observed, np.concatenate([np.tile(np.arange(5), 5), np.arange(5)]), smallest=100)
         weights = {bytes(centre): weight for centre, weight in zip(level.centre, level.weight, strict=True)}
         exact = [weights[bytes(d)] for d in descriptors if bytes(d) in weights]
         assert exact and all(weight in (0.0, pytest.approx(np.log(5))) for weight in exact)
 
 
 class TestProcess:
-    def test_ours_takes_in_the_first_frames(self, moment: Path) -> None:
+    def test_our_contender_tracks_first_frames(self, moment: Path) -> None:
         run = measure("v3d_torch --segmenter none", str(moment), moment.parent, frames=2)
         assert run.frames == 2 and run.trajectory is not None and len(run.trajectory) == 2
         assert run.seconds > 0 and run.cpu_seconds > 0
         assert {"read", "features", "tracking"} <= set(run.stages)
         assert torch.allclose(run.trajectory.T_wc[0], torch.eye(4, dtype=torch.float64))
 
-    def test_a_failure_is_one_sentence(self, tmp_path: Path) -> None:
+    def test_failure_is_one_line(self, tmp_path: Path) -> None:
         with pytest.raises(ContenderError, match=r"^\S*nowhere: "):
             measure("v3d_torch --segmenter none", str(tmp_path / "nowhere"), tmp_path)
 
-    def test_a_peer_that_is_not_installed_fails_with_its_name(
+    def test_missing_peer_fails_with_its_name(
         self, moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         (tmp_path / "pyorbslam3.py").write_text("raise ImportError('no pyorbslam3 here')\n")
@@ -157,7 +161,7 @@ class TestProcess:
             measure("pyorbslam3", str(moment), moment.parent)
 
 
-def test_orbslam3_settings_hold_the_camera() -> None:
+def test_orbslam3_settings_contain_camera() -> None:
     pytest.importorskip("pyorbslam3", reason="ORB-SLAM3 is not installed")
     from contenders.orbslam3 import settings
 
@@ -172,8 +176,8 @@ def test_orbslam3_settings_hold_the_camera() -> None:
 
 
 class TestTables:
-    def test_ratios_are_within_a_turn(self) -> None:
-        """Ours is half as fast as the reference in both turns, though the second turn is twice as slow for all."""
+    def test_ratios_compare_within_a_turn(self) -> None:
+        """Ours is half as fast as the reference in both turns; the second turn is twice as slow for both."""
         turns: list[speed.Turn] = [dict.fromkeys(speed.CONTENDERS, "broke") for _ in range(2)]
         for turn, slow in zip(turns, (1, 2), strict=True):
             turn["pyorbslam3"] = measured(40 / slow, 30 * slow)
@@ -187,7 +191,7 @@ class TestTables:
         assert list(speed.stage_table(turns))[2] == "| read | 7.5 [5.0-10.0] | - | - |"
         assert "- turn 2, open3d: broke" in list(speed.failures(turns))
 
-    def test_peers_stand_between_ours_and_the_known_figures(self, tmp_path: Path) -> None:
+    def test_accuracy_table_has_ours_then_peers_then_published(self, tmp_path: Path) -> None:
         known = {"sequences": {"a": {"what": "a room", "ate": {"ORB-SLAM3": "0.5"}}}, "about": "elsewhere"}
         figures = {"frames": 9, "ate": {"rmse": 0.25}, "fps": 3.0, "coverage": 0.5}
         outcomes = [accuracy.Outcome("a", name, 0, figures) for name in ("full", "pyorbslam3")]
@@ -196,16 +200,84 @@ class TestTables:
         assert line == "| a | a room | 9 | 0.2500 | 0.2500 | 0.5 |"
         assert list(accuracy.runs_table(outcomes))[3] == "| a | pyorbslam3 | 0 of 1 | - | - | - | - | 50.0% | 3.0 |"
 
-    def test_a_run_without_true_poses_has_no_score(self) -> None:
+    def test_run_without_ground_truth_has_no_score(self) -> None:
         assert accuracy.Outcome("a", "full", 0, {"ate": None, "fps": 1.0}).ate is None
 
 
-def test_a_ring_that_drifts_is_closed() -> None:
-    _, steps, before, after = growth.ring(60, torch.Generator().manual_seed(0))
-    assert int(steps) > 0 and float(after) < float(before)
+def test_pose_graph_closes_drifting_ring() -> None:
+    cells = growth.close_ring(60, torch.Generator().manual_seed(0))
+    assert int(cells["iterations"]) > 0 and float(cells["error_after"]) < float(cells["error_before"])
 
 
-def test_contenders_of_ours_are_known() -> None:
+def test_our_contenders_have_overrides() -> None:
     from contenders.ours import OVERRIDES
 
     assert tuple(OVERRIDES) == OURS
+
+
+class TestPage:
+    HEADING = Heading("python benchmarks/speed.py", "abc1234", "2026-01-02", "2 cores")
+
+    def test_page_is_made_of_stored_measurements(self) -> None:
+        assert write_page.PAGE.read_text(encoding="utf-8") == write_page.page()
+
+    def test_readme_tables_are_made_of_stored_measurements(self) -> None:
+        readme = write_page.README.read_text(encoding="utf-8")
+        assert readme == write_page.insert_tables(readme, write_page.main_tables())
+
+    def test_missing_marks_are_an_error(self) -> None:
+        with pytest.raises(ValueError, match=r"benchmarks:main"):
+            write_page.insert_tables(f"text {write_page.BEGIN} text", "table")
+
+    def test_text_around_the_marks_is_kept(self) -> None:
+        readme = f"before\n{write_page.BEGIN}\nold\n{write_page.END}\nafter\n"
+        expected = f"before\n{write_page.BEGIN}\nnew\n{write_page.END}\nafter\n"
+        assert write_page.insert_tables(readme, "new") == expected
+
+    def test_section_without_measurements_is_left_out(self, tmp_path: Path) -> None:
+        rows = [{"keyframes": "500", "query_ms": "1.4"}]
+        storage.save("keyframes", storage.Measurement(self.HEADING, rows), tmp_path)
+        page = write_page.page(tmp_path)
+        assert [line for line in page.splitlines() if line.startswith("## ")] == ["## Growth"]
+        assert "| 500 | 1.4 |" in page
+        assert "`python benchmarks/speed.py`; commit abc1234; 2026-01-02; 2 cores" in page
+
+    def test_newer_row_replaces_older_row_with_same_keys(self, tmp_path: Path) -> None:
+        for commit, rows in (("a", {"500": "1", "900": "2"}), ("b", {"500": "3"}), ("c", {"900": "4"})):
+            heading = Heading("", commit, "2026-01-02", "2 cores")
+            cells = [{"keyframes": count, "query_ms": value} for count, value in rows.items()]
+            storage.save("keyframes", storage.Measurement(heading, cells, [commit]), tmp_path)
+        stored = storage.load("keyframes", tmp_path)
+        assert [(measured.heading.commit, list(measured.rows)) for measured in stored] == [
+            ("b", [{"keyframes": "500", "query_ms": "3"}]),
+            ("c", [{"keyframes": "900", "query_ms": "4"}]),
+        ]
+
+    def test_every_stored_row_has_its_keys_once(self) -> None:
+        for path in storage.RESULTS.glob("*.json"):
+            measurements = storage.load(path.stem)
+            keys = [storage.key_of(path.stem, row) for measured in measurements for row in measured.rows]
+            assert keys and len(set(keys)) == len(keys), path.name
+            assert all(measured.heading.commit and measured.heading.date for measured in measurements), path.name
+
+    def test_lowest_value_is_bold(self) -> None:
+        assert tables.mark_lowest(["0.2 [0.1-0.3]", "0.5", "-", "0.2 (92%)"]) == [
+            "**0.2** [0.1-0.3]",
+            "0.5",
+            "-",
+            "**0.2** (92%)",
+        ]
+
+    def test_saved_rows_of_a_script_fill_its_section(self, tmp_path: Path) -> None:
+        figures = {"frames": 9, "ate": {"rmse": 0.25}, "fps": 3.0, "coverage": 0.5}
+        outcomes = [accuracy.Outcome("walkers_desk", name, 0, figures) for name in ("full", "pyorbslam3")]
+        storage.save("accuracy", storage.Measurement(self.HEADING, list(accuracy.accuracy_rows(outcomes))), tmp_path)
+        turn: speed.Turn = dict.fromkeys(speed.CONTENDERS, "broke")
+        turn |= {"pyorbslam3": measured(40, 30), "v3d_torch": measured(20, 90, read=0.5)}
+        cells = {"sequence": "walkers_desk"}
+        rows = [cells | row for row in speed.contender_rows([turn])]
+        storage.save("speed", storage.Measurement(self.HEADING, rows), tmp_path)
+        page = write_page.page(tmp_path)
+        assert "| walkers_desk (composed; people in fr1_rpy) | 9 | 0.2500 (50% of the frames) |" in page
+        assert "| v3d_torch | 20.0 (90.0) | 0.50 |" in page
+        assert "| **0.017** |" in write_page.main_tables(tmp_path)

@@ -1,4 +1,4 @@
-"""The pages of the documentation: they are built without a warning, hold every public name, and need no network."""
+"""Documentation: it builds without warnings, describes every public name, and needs no network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROOT = Path(v3d_torch.__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The pages; links that lead nowhere and references to names that are not there are warnings, and so errors."""
+    """Built site. Broken links and references to missing names are warnings, which are errors here."""
     folder = tmp_path_factory.mktemp("docs") / "site"
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
@@ -35,20 +35,20 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """Ids, words, and what a browser fetches to show a page."""
+    """Ids and text of a page, and the addresses that a browser loads to show it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.ids: set[str] = set()
-        self.fetched: list[str] = []
+        self.loaded: list[str] = []
         self.words: list[str] = []
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in attrs}
-        self.ids |= {given["id"]} if "id" in given else set()
-        where = given.get("href", "") if tag == "link" else given.get("src", "")
-        self.fetched += [where] if where else []
+        attributes = {name: value or "" for name, value in attrs}
+        self.ids |= {attributes["id"]} if "id" in attributes else set()
+        address = attributes.get("href", "") if tag == "link" else attributes.get("src", "")
+        self.loaded += [address] if address else []
 
     def handle_data(self, data: str) -> None:
         self.words.append(data)
@@ -66,17 +66,17 @@ def pages(site: Path) -> dict[str, Page]:
 def test_every_public_name_is_described(pages: dict[str, Page]) -> None:
     described = set().union(*(page.ids for page in pages.values()))
     for name in v3d_torch.__all__:
-        thing = getattr(v3d_torch, name)
-        assert f"{thing.__module__}.{thing.__qualname__}" in described, name
+        public = getattr(v3d_torch, name)
+        assert f"{public.__module__}.{public.__qualname__}" in described, name
 
 
-def test_nothing_is_fetched_from_elsewhere(pages: dict[str, Page]) -> None:
+def test_pages_load_nothing_from_other_hosts(pages: dict[str, Page]) -> None:
     assert len(pages) > 20
     for name, page in pages.items():
-        assert [where for where in page.fetched if re.match(r"(https?:)?//", where)] == [], name
+        assert [address for address in page.loaded if re.match(r"(https?:)?//", address)] == [], name
 
 
-def test_formulas_are_drawn(site: Path, pages: dict[str, Page]) -> None:
+def test_formulas_are_rendered(site: Path, pages: dict[str, Page]) -> None:
     for name, page in pages.items():
         assert not re.search(r":math:|\.\. math::|\\frac|\\\(|\\\[|\$\$", page.text), name
     for stage in ("depth", "voting", "chamfer", "evaluation"):
@@ -86,7 +86,7 @@ def test_formulas_are_drawn(site: Path, pages: dict[str, Page]) -> None:
 
 
 @pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__.rpartition(".")[2])
-def test_every_command_has_its_page_with_all_options(module: object, pages: dict[str, Page]) -> None:
+def test_page_of_command_lists_all_options(module: object, pages: dict[str, Page]) -> None:
     name = module.__name__.rpartition(".")[2]
     text = pages[f"commands/{name}.html"].text
     for parameter in get_command(module.app).params:
@@ -95,7 +95,7 @@ def test_every_command_has_its_page_with_all_options(module: object, pages: dict
             assert " ".join((parameter.help or "").split()) in text
 
 
-def test_every_stage_of_the_system_is_linked(pages: dict[str, Page]) -> None:
+def test_index_of_stages_links_every_stage(pages: dict[str, Page]) -> None:
     stages = {path.stem for path in (ROOT / "docs" / "stages").glob("*.md")} - {"index"}
     text = (ROOT / "docs" / "stages" / "index.md").read_text(encoding="utf-8")
     assert {match[1] for match in re.finditer(r"\]\((\w+)\.md\)", text)} == stages

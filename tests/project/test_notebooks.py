@@ -1,4 +1,4 @@
-"""Every notebook runs from its first cell to its last, in a kernel of its own."""
+"""Notebooks: each runs from its first cell to its last in a new kernel."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Nothing of the user's Jupyter: neither a kernel of this name from elsewhere nor a start-up file.
+def test_notebook_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Ignore the user's Jupyter settings: kernels of the same name and start-up files.
     monkeypatch.setenv("JUPYTER_DATA_DIR", str(tmp_path / "jupyter"))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
@@ -23,8 +23,8 @@ def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     NotebookClient(notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": tmp_path}}).execute()
 
 
-def test_are_fit_to_be_kept() -> None:
+def test_notebooks_are_small_and_have_no_absolute_paths() -> None:
     assert NOTEBOOKS
     for path in NOTEBOOKS:
         assert path.stat().st_size < 500_000, f"{path.name}: make its figures smaller"
-        assert not re.search(r"/(home|root|tmp|Users)/", path.read_text()), f"{path.name}: holds an absolute path"
+        assert not re.search(r"/(home|root|tmp|Users)/", path.read_text()), f"{path.name}: contains an absolute path"

@@ -1,4 +1,4 @@
-"""The package as a whole: its public names, how quickly it is there, imports that go in one direction."""
+"""The package as a whole: public names, import time, direction of imports, size of its root."""
 
 from __future__ import annotations
 
@@ -15,36 +15,78 @@ import v3d_torch
 
 ROOT = Path(v3d_torch.__file__).parent
 
+LAYERS = (
+    *("errors", "io", "config", "geometry", "types", "runtime", "optim", "features", "datasets", "segmentation"),
+    *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "evaluation", "frame_result"),
+    *("slam", "prefetch", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
+)
+"""Folders and modules of the package's root, from low to high: a layer imports only from itself and lower layers."""
 
-def test_every_public_name_is_there() -> None:
+MAX_ROOT_FILES = 10
+
+
+def test_stub_lists_every_public_name() -> None:
     stub = ast.parse((ROOT / "__init__.pyi").read_text())
-    (promised,) = (ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
-    assert sorted(promised) == sorted(v3d_torch.__all__) == sorted(dir(v3d_torch))
-    for name in promised:
+    (listed,) = (ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
+    assert sorted(listed) == sorted(v3d_torch.__all__) == sorted(dir(v3d_torch))
+    for name in listed:
         assert getattr(v3d_torch, name).__module__.startswith("v3d_torch.")
     with pytest.raises(AttributeError, match="nonsense"):
         v3d_torch.nonsense  # noqa: B018
 
 
-def test_importing_the_package_loads_nothing_heavy() -> None:
-    code = "import sys, v3d_torch, v3d_torch.cli.run, v3d_torch.cli.evaluate; print({'torch', 'cv2', 'scipy'} & set(sys.modules))"
+def test_import_of_package_loads_no_heavy_library() -> None:
+    code = (
+        "import sys, v3d_torch, v3d_torch.cli.run, v3d_torch.cli.evaluate\n"
+        "print({'torch', 'cv2', 'scipy'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "set()"
 
 
-def test_imports_go_in_one_direction() -> None:
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """Modules of the package that each of its modules imports at module level."""
     files = {module_name(path): path for path in ROOT.rglob("*.py")}
-    graph = {name: set(imports(path, files.keys())) for name, path in files.items()}
-    assert sum(map(len, graph.values())) > len(graph)
-    assert len(list(TopologicalSorter(graph).static_order())) == len(files)  # CycleError names a circle
+    return {name: set(imported_modules(path, files.keys())) for name, path in files.items()}
+
+
+def test_imports_have_no_cycle(imports: dict[str, set[str]]) -> None:
+    assert sum(map(len, imports.values())) > len(imports)
+    assert len(list(TopologicalSorter(imports).static_order())) == len(imports)  # CycleError names a cycle
+
+
+def test_modules_import_only_from_their_own_or_lower_layers(imports: dict[str, set[str]]) -> None:
+    levels = {layer: level for level, layer in enumerate(LAYERS)}
+    upward = [
+        f"{name} imports {imported}"
+        for name, modules in sorted(imports.items())
+        for imported in sorted(modules - {"v3d_torch"})
+        if name != "v3d_torch" and levels[layer_of(imported)] > levels[layer_of(name)]
+    ]
+    assert upward == []
+
+
+def test_layers_are_the_folders_and_modules_of_the_root(imports: dict[str, set[str]]) -> None:
+    assert {layer_of(name) for name in imports if name != "v3d_torch"} == set(LAYERS)
+
+
+def test_root_has_few_files() -> None:
+    files = [path.name for path in ROOT.iterdir() if path.is_file()]
+    assert len(files) <= MAX_ROOT_FILES, files
 
 
 def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
 
 
-def imports(path: Path, modules: Set[str]) -> Iterator[str]:
-    """Modules of the package that a file imports when it is imported: not in functions, nor for type checkers."""
+def layer_of(module: str) -> str:
+    """Folder or module of the package's root that a module belongs to."""
+    return module.split(".")[1]
+
+
+def imported_modules(path: Path, modules: Set[str]) -> Iterator[str]:
+    """Modules of the package that a file imports at module level: not in functions, nor for type checkers only."""
     pending: list[ast.AST] = [ast.parse(path.read_text())]
     while pending:
         node = pending.pop()
@@ -53,9 +95,9 @@ def imports(path: Path, modules: Set[str]) -> Iterator[str]:
             yield from {name if name in modules else str(node.module) for name in names} & modules
         elif isinstance(node, ast.Import):
             yield from {alias.name for alias in node.names} & modules
-        elif not isinstance(node, ast.FunctionDef) and not for_type_checkers(node):
+        elif not isinstance(node, ast.FunctionDef) and not is_for_type_checkers(node):
             pending.extend(ast.iter_child_nodes(node))
 
 
-def for_type_checkers(node: ast.AST) -> bool:
+def is_for_type_checkers(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)

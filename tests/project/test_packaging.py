@@ -1,4 +1,4 @@
-"""What a wheel and a source archive of the package hold, and the one command that an installation brings."""
+"""Contents of the wheel and the source archive, the installed command, the citation file."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 import v3d_torch
 from v3d_torch.__main__ import COMMANDS, app
+from v3d_torch.cli import run
 
 PACKAGE = Path(v3d_torch.__file__).parent
 ROOT = PACKAGE.parent
@@ -26,13 +27,13 @@ SOURCES = (
     "mkdocs.yml",
     *("v3d_torch", "tests", "benchmarks", "notebooks", "docs"),
 )
-"""What a source archive is made of: a checkout without what builds and runs have left in it."""
+"""Files and folders of a checkout, without the leftovers of builds and runs."""
 
-RUBBISH = shutil.ignore_patterns("__pycache__", "*.pyc")
+CACHES = shutil.ignore_patterns("__pycache__", "*.pyc")
 
 
-def left_out(folder: Path, names: list[str]) -> set[str]:
-    return set(names) - set(SOURCES) if folder == ROOT else RUBBISH(str(folder), names)
+def ignored(folder: Path, names: list[str]) -> set[str]:
+    return set(names) - set(SOURCES) if folder == ROOT else CACHES(str(folder), names)
 
 
 def files_in(folder: Path) -> dict[str, bytes]:
@@ -49,16 +50,16 @@ def content(wheel: Path) -> dict[str, bytes]:
 
 
 def build(source: Path, out: Path, *options: str) -> None:
-    """With the setuptools that is here, so that nothing is downloaded."""
+    """Build with the installed setuptools, so that nothing is downloaded."""
     command = [sys.executable, "-m", "build", "--no-isolation", *options, "--outdir", str(out), str(source)]
     subprocess.run(command, check=True, capture_output=True, text=True, timeout=100)  # noqa: S603
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """A source archive, the wheel made of that archive, and the wheel made of the checkout."""
+    """Source archive, wheel built from the archive, and wheel built from the checkout."""
     folder = tmp_path_factory.mktemp("package")
-    shutil.copytree(ROOT, folder / "checkout", ignore=lambda at, names: left_out(Path(at), names))
+    shutil.copytree(ROOT, folder / "checkout", ignore=lambda at, names: ignored(Path(at), names))
     build(folder / "checkout", folder / "released")
     build(folder / "checkout", folder / "direct", "--wheel")
     (archive,) = (folder / "released").glob("*.tar.gz")
@@ -66,52 +67,57 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     return archive, released, direct
 
 
-def test_the_wheel_holds_every_file_of_the_package(built: tuple[Path, Path, Path]) -> None:
-    held = {name: data for name, data in content(built[1]).items() if name.startswith("v3d_torch/")}
-    assert held == {f"v3d_torch/{name}": data for name, data in files_in(PACKAGE).items()}
+def test_wheel_contains_every_file_of_the_package(built: tuple[Path, Path, Path]) -> None:
+    contained = {name: data for name, data in content(built[1]).items() if name.startswith("v3d_torch/")}
+    assert contained == {f"v3d_torch/{name}": data for name, data in files_in(PACKAGE).items()}
     for name in (
-        *("py.typed", "__init__.pyi", "configs/paper.yaml", "configs/ablations/baseline.yaml", "viz/page.html"),
+        *("py.typed", "__init__.pyi", "config/yaml/paper.yaml", "config/yaml/ablations/baseline.yaml", "viz/page.html"),
         *("datasets/presets/tum_fr3.yaml", "datasets/assets/astronaut.png", "evaluation/paper_tables.yaml"),
     ):
-        assert f"v3d_torch/{name}" in held
+        assert f"v3d_torch/{name}" in contained
 
 
-def test_the_wheel_is_of_this_package_alone_and_says_what_it_is(built: tuple[Path, Path, Path]) -> None:
-    held = content(built[1])
-    tops = {name.partition("/")[0] for name in held}
+def test_wheel_contains_only_this_package_with_its_metadata(built: tuple[Path, Path, Path]) -> None:
+    contained = content(built[1])
+    tops = {name.partition("/")[0] for name in contained}
     (info,) = tops - {"v3d_torch"}
-    metadata = held[f"{info}/METADATA"].decode()
-    stated = "Name: v3d-torch", "License-Expression: Apache-2.0", "Requires-Python: >=3.11.4", "Provides-Extra: ray"
-    for line in stated:
+    metadata = contained[f"{info}/METADATA"].decode()
+    expected = "Name: v3d-torch", "License-Expression: Apache-2.0", "Requires-Python: >=3.11.4", "Provides-Extra: ray"
+    for line in expected:
         assert f"\n{line}\n" in metadata
     assert (ROOT / "README.md").read_text() in metadata
-    assert b"v3d-torch = v3d_torch.__main__:app" in held[f"{info}/entry_points.txt"]
-    assert held[f"{info}/licenses/LICENSE"] == (ROOT / "LICENSE").read_bytes()
+    assert b"v3d-torch = v3d_torch.__main__:app" in contained[f"{info}/entry_points.txt"]
+    assert contained[f"{info}/licenses/LICENSE"] == (ROOT / "LICENSE").read_bytes()
 
 
-def test_the_source_archive_makes_the_same_wheel(built: tuple[Path, Path, Path]) -> None:
+def test_source_archive_builds_the_same_wheel(built: tuple[Path, Path, Path]) -> None:
     _, released, direct = built
     assert content(released) == content(direct)
 
 
-def test_the_source_archive_can_be_tested(built: tuple[Path, Path, Path]) -> None:
+def test_source_archive_contains_tests_and_documents(built: tuple[Path, Path, Path]) -> None:
     with tarfile.open(built[0]) as archive:
-        held = {name.partition("/")[2] for name in archive.getnames()}
+        contained = {name.partition("/")[2] for name in archive.getnames()}
     tests = {f"tests/{path.name}" for path in (ROOT / "tests").glob("*.py")}
-    assert tests | {"constraints.txt", "CITATION.cff", "CHANGELOG.md", "LICENSE", "mkdocs.yml", "docs/index.md"} <= held
-    assert not [name for name in held if re.search(r"__pycache__|\.pyc$|^results|^build", name)]
+    assert (
+        tests | {"constraints.txt", "CITATION.cff", "CHANGELOG.md", "LICENSE", "mkdocs.yml", "docs/index.md"}
+        <= contained
+    )
+    assert not [name for name in contained if re.search(r"__pycache__|\.pyc$|^results|^build", name)]
 
 
 # --- the command
 
 
-def test_every_command_of_the_package_is_under_the_one_name() -> None:
-    typer_apps = {path.stem for path in PACKAGE.glob("*.py") if re.search(r"^app = typer", path.read_text(), re.M)}
-    assert {module.__name__.rpartition(".")[2] for module in COMMANDS} == typer_apps - {"__main__"}
+def test_every_command_module_is_a_subcommand() -> None:
+    modules = {
+        path.stem for path in (PACKAGE / "cli").glob("*.py") if re.search(r"^app = typer", path.read_text(), re.M)
+    }
+    assert {module.__name__.rpartition(".")[2] for module in COMMANDS} == modules
 
 
 @pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__.rpartition(".")[2])
-def test_a_command_says_the_same_under_both_names(module: object) -> None:
+def test_subcommand_has_help_of_its_module(module: object) -> None:
     name = module.__name__.rpartition(".")[2]
     alone = CliRunner().invoke(module.app, ["--help"]).output
     together = CliRunner().invoke(app, [name, "--help"]).output
@@ -119,18 +125,18 @@ def test_a_command_says_the_same_under_both_names(module: object) -> None:
     assert f"{name} [OPTIONS]" in together.partition("\n")[0]
 
 
-def test_the_list_of_commands_fits_a_terminal() -> None:
+def test_list_of_commands_fits_80_columns() -> None:
     lines = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output.split("Commands:")[1].splitlines()
     assert [line for line in lines if "..." in line or len(line) > 80] == []
     assert len([line for line in lines if line.strip()]) == len(COMMANDS)
 
 
-def test_several_values_to_one_option_stay_those_of_the_option() -> None:
+def test_option_with_several_values_takes_all_of_them() -> None:
     result = CliRunner().invoke(app, ["batch", "--seqs", "no_such_a", "no_such_b", "--configs", "papper"])
     assert result.exit_code == 2 and "papper" in result.stderr
 
 
-def test_help_loads_nothing_heavy_and_the_version_is_told() -> None:
+def test_help_loads_no_heavy_library_and_version_is_printed() -> None:
     code = (
         "import sys; from v3d_torch.__main__ import app\n"
         "try: app(['run', '--help'])\n"
@@ -141,10 +147,24 @@ def test_help_loads_nothing_heavy_and_the_version_is_told() -> None:
     assert CliRunner().invoke(app, ["--version"]).output == f"v3d-torch {version('v3d-torch')}\n"
 
 
-# --- to be cited
+@pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__.rpartition(".")[2])
+def test_python_dash_m_runs_every_command(module: object) -> None:
+    name = module.__name__.rpartition(".")[2]
+    command = [sys.executable, "-m", "v3d_torch", name, "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603
+    assert f"Usage: v3d-torch {name} [OPTIONS]" in done.stdout
 
 
-def test_the_citation_is_of_this_version() -> None:
+def test_run_is_the_only_command_module_of_the_root() -> None:
+    done = subprocess.run([sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, check=True)
+    assert "--segmenter" in done.stdout
+    assert [module for module in COMMANDS if (PACKAGE / f"{module.__name__.rpartition('.')[2]}.py").exists()] == [run]
+
+
+# --- citation
+
+
+def test_citation_has_current_version_and_paper() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (citation["version"], citation["license"]) == (project["version"], project["license"])

@@ -1,4 +1,4 @@
-"""What README and docs tell users to type: commands are understood, links lead somewhere, the ten lines run."""
+"""Commands, links and code in README and docs: they parse, exist and run."""
 
 from __future__ import annotations
 
@@ -23,39 +23,43 @@ def blocks(path: Path, language: str) -> list[str]:
 
 
 def commands(path: Path) -> list[list[str]]:
-    """The commands of this package in the blocks of a page: name and arguments, as a shell splits them."""
+    """Commands of this package in the code blocks of a page: name and arguments, split as in a shell."""
     found = []
     for line in "".join(blocks(path, "bash")).splitlines():
         for part in line.split("&&"):
             words = shlex.split(part.partition(" > ")[0], comments=True)
-            if words[:2] == ["python", "-m"] and words[2].startswith("v3d_torch."):
-                found.append([words[2].removeprefix("v3d_torch."), *words[3:]])
+            if words[:3] == ["python", "-m", "v3d_torch"]:
+                found.append(words[3:])
+            elif words[:3] == ["python", "-m", "v3d_torch.run"]:
+                found.append(["run", *words[3:]])
             elif words[:1] == ["v3d-torch"]:
                 found.append(words[1:])
     return found
 
 
-TYPED = [(page, words) for page in PAGES for words in commands(page)]
+DOCUMENTED = [(page, words) for page in PAGES for words in commands(page)]
 
 
-def test_the_pages_tell_of_every_command() -> None:
-    assert {words[0] for page, words in TYPED if page == PAGES[0]} == set(MODULES)
-    assert len(TYPED) > 30
+def test_readme_shows_every_command() -> None:
+    assert {words[0] for page, words in DOCUMENTED if page == PAGES[0]} == set(MODULES)
+    assert len(DOCUMENTED) > 30
 
 
-@pytest.mark.parametrize(("page", "words"), TYPED, ids=[f"{page.stem}: {' '.join(words)}" for page, words in TYPED])
-def test_a_command_is_understood(page: Path, words: list[str]) -> None:
-    get_command(MODULES[words[0]].app).make_context(words[0], words[1:])  # raises a usage error where it is not
+@pytest.mark.parametrize(
+    ("page", "words"), DOCUMENTED, ids=[f"{page.stem}: {' '.join(words)}" for page, words in DOCUMENTED]
+)
+def test_documented_command_parses(page: Path, words: list[str]) -> None:
+    get_command(MODULES[words[0]].app).make_context(words[0], words[1:])  # raises a usage error if it does not parse
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_links_of_a_page_lead_to_files(page: Path) -> None:
+def test_links_of_page_exist(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         assert target.startswith("http") or (page.parent / target).exists(), target
 
 
-def test_the_ten_lines_run(moment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """On a moment of the demo."""
+def test_readme_example_runs(moment: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The example runs on six frames of the demo."""
     code = blocks(ROOT / "README.md", "python")[0]
     assert len(code.splitlines()) <= 10 and 'load_sequence("demo")' in code
     monkeypatch.setattr(v3d_torch, "load_sequence", lambda name: load_sequence(str(moment)))
@@ -67,6 +71,6 @@ def test_the_ten_lines_run(moment: Path, monkeypatch: pytest.MonkeyPatch, capsys
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_python_on_a_page_is_python(page: Path) -> None:
+def test_python_on_page_compiles(page: Path) -> None:
     for code in blocks(page, "python"):
         compile(code, str(page), "exec")

@@ -1,1 +1,1 @@
-"""Batches of runs on one machine or on a Ray cluster."""
+"""Many runs on one machine or on a Ray cluster, and the studies made of them."""

@@ -1,4 +1,4 @@
-"""What carries out the runs of a batch: the interface, and the events that it tells of."""
+"""Interface of the executors, which run the jobs of a batch, and the events that they report."""
 
 from __future__ import annotations
 
@@ -9,37 +9,47 @@ from typing import Protocol
 
 from v3d_torch.batch.job import Job
 
-THREADS = dict.fromkeys(
+ONE_THREAD_ENVIRONMENT = dict.fromkeys(
     (*("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "OPENCV_FOR_THREADS_NUM", "RAYON_NUM_THREADS"),
     "1",
 )
-"""Environment of a run that shares its machine with others: no library starts threads of its own."""
+"""Environment of a job that shares its machine with other jobs: no library starts threads of its own."""
 
 
 @dataclass(frozen=True)
 class JobProgress:
-    """A run is under way and has done so many of its frames."""
+    """Progress of a running job.
+
+    Attributes:
+        job: The job.
+        frames: Number of frames processed.
+    """
 
     job: Job
     frames: int
 
 
 @dataclass(frozen=True)
-class Finished:
-    """A run is over: with its results written, or with the sentence that it failed with."""
+class JobFinished:
+    """End of a job.
+
+    Attributes:
+        job: The job.
+        failure: Error message of the job; None if its results are complete.
+    """
 
     job: Job
     failure: str | None
 
 
 class Executor(Protocol):
-    """Carries out jobs, each in a process of its own: what happens to one is nothing to the others."""
+    """Runs each job in a process of its own, so that a crash affects one job only."""
 
-    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[JobProgress | Finished]:
-        """Tell what happens, as it happens. Runs under way are killed when the generator is closed.
+    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[JobProgress | JobFinished]:
+        """Run jobs and yield events as they happen. Closing the generator kills the running jobs.
 
         Args:
-            jobs: to be carried out, the first ones first.
-            stop: once it is set no more are started, and those under way end after their frame, with their results
-                written. Jobs that were not started have no event.
+            jobs: Jobs to run, in order of priority.
+            stop: Request to stop. Once it is set, no job starts, and running jobs end after their current frame and
+                write their results. Jobs that did not start have no event.
         """

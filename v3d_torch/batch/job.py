@@ -1,4 +1,4 @@
-"""One run of a batch: what it takes in, how it is configured, where its results go."""
+"""One run of a batch: its sequence, its configuration and the folder of its results."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from v3d_torch.evaluation.outcome import Outcome
 
 @dataclass(frozen=True)
 class Job:
-    """One run. It can be sent to another process or machine.
+    """One run of a batch. Jobs can be pickled and sent to another process or machine.
 
     Attributes:
-        sequence: name for tables.
-        source: what `load_sequence` opens, a path or a name.
-        frames: of the sequence.
-        data_root: where named sequences are kept.
-        config_name: name of the configuration for tables.
-        config: with its seed.
-        folder: for the results.
+        sequence: Name of the sequence in tables.
+        source: Path or name of the sequence, as `load_sequence` takes it.
+        frames: Number of frames of the sequence.
+        data_root: Folder of named sequences.
+        config_name: Name of the configuration in tables.
+        config: Configuration of the run, including its seed.
+        folder: Folder of the results.
     """
 
     sequence: str
@@ -37,28 +37,29 @@ class Job:
     folder: Path
 
     def __str__(self) -> str:
-        """One line for whoever waits."""
+        """Return a one-line description for the screen."""
         return f"{self.sequence}, {self.config_name}, seed {self.config.seed}"
 
-    def outcome(self, failure: str | None) -> Outcome:
-        """What a run that has ended gave.
+    def make_outcome(self, failure: str | None) -> Outcome:
+        """Return the outcome of the run that has just ended in the folder.
 
         Args:
-            failure: that it ended with, by what its executor says.
+            failure: Error message reported by the executor; None if the run succeeded.
         """
-        metrics = self._metrics()
+        metrics = self._read_metrics()
         if failure is None and metrics is None:
-            failure = f"{self.folder}: holds no metrics.json; it has to be a folder that all machines share"
-        given = metrics if failure is None and metrics is not None else {}  # of half a trajectory no score is taken
-        return Outcome(self.sequence, self.config_name, self.config.seed, given, failure)
+            failure = f"{self.folder}: contains no metrics.json; choose a folder that all machines share"
+        # A failed run has no scores: its trajectory covers only a part of the sequence.
+        scored = metrics if failure is None and metrics is not None else {}
+        return Outcome(self.sequence, self.config_name, self.config.seed, scored, failure)
 
-    def finished(self) -> Outcome | None:
-        """What an earlier run in the folder gave, where it came to its end.
+    def earlier_outcome(self) -> Outcome | None:
+        """Return the outcome of an earlier, complete run in the folder; None if there is no such run.
 
         Raises:
-            InputError: it came to its end with another configuration.
+            InputError: If the earlier run had another configuration.
         """
-        metrics = self._metrics()
+        metrics = self._read_metrics()
         if metrics is None or metrics.get("failure") is not None or metrics.get("processed") != self.frames:
             return None
         try:
@@ -67,12 +68,12 @@ class Job:
             config = None
         if config is None or single_threaded(config) != single_threaded(self.config):
             raise InputError(
-                f"{self.folder}: is a finished run with other values than {self.config_name} has now; choose another"
-                " folder with --out, or delete it to run it again"
+                f"{self.folder}: contains a finished run with other values than those of {self.config_name}; choose"
+                " another folder with --out, or delete this one to run it again"
             )
-        return self.outcome(None)
+        return self.make_outcome(None)
 
-    def _metrics(self) -> Mapping[str, Any] | None:
+    def _read_metrics(self) -> Mapping[str, Any] | None:
         try:
             metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
@@ -81,6 +82,6 @@ class Job:
 
 
 def single_threaded(config: Config) -> Config:
-    """The same configuration on one thread, which changes the time and nothing else."""
+    """Return the configuration with one thread, which changes run time but not results."""
     segmentation = config.segmentation.model_copy(update={"threads": 1})
     return config.model_copy(update={"threads": 1, "prefetch": False, "segmentation": segmentation})

@@ -1,4 +1,4 @@
-"""The runs that a batch is made of: every sequence with every configuration and every seed."""
+"""Jobs of a batch: every sequence with every configuration and every seed."""
 
 from __future__ import annotations
 
@@ -14,41 +14,44 @@ from v3d_torch.io.paths import expand_user
 from v3d_torch.segmentation import make_instance_source
 
 
-def read_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]:
-    """Configurations by their names in tables, which for a YAML file is its name without the suffix.
+def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]:
+    """Load configurations.
 
     Args:
-        names: as `find_config` takes them, each once or more often.
-        one_thread: whether runs share a machine, so that each has one thread.
+        names: Names or files, as `find_config` takes them. Duplicates are loaded once.
+        one_thread: Whether to limit each run to one thread, for runs that share a machine.
+
+    Returns:
+        Configurations by their name in tables, which is the file name without suffix.
 
     Raises:
-        ConfigError: one is not there or wrong, or two different ones have the same name.
+        ConfigError: If a configuration is missing or invalid, or if two different ones have the same name.
     """
     paths: dict[str, Path] = {}
     for name in names:
         path = find_config(name)
         label = FULL if path == CONFIGS[FULL] else path.stem
         if paths.setdefault(label, path).resolve() != path.resolve():
-            raise ConfigError(f"{name}: another configuration is called {label} too; give the file another name")
+            raise ConfigError(f"{name}: another configuration is also named {label}; rename the file")
     configs = {label: load_config(path) for label, path in paths.items()}
     return {label: single_threaded(config) for label, config in configs.items()} if one_thread else configs
 
 
-def make_sure_of_networks(configs: Mapping[str, Config]) -> None:
-    """Download and export what the configurations need, once and before the first run.
+def prepare_networks(configs: Mapping[str, Config]) -> None:
+    """Download and export the networks that the configurations need, once, before the first run.
 
     Raises:
-        WeightsError: if a network's weights cannot be had.
-        ConfigError: if a configuration wants masks from files, which belong to one sequence.
+        WeightsError: If the weights of a network are not available.
+        ConfigError: If a configuration reads masks from files, which belong to one sequence.
     """
-    needed: list[SegmentationConfig] = []
+    prepared: list[SegmentationConfig] = []
     for config in configs.values():
-        if config.segmentation not in needed:
-            needed.append(config.segmentation)
+        if config.segmentation not in prepared:
+            prepared.append(config.segmentation)
             make_instance_source(config.segmentation)
 
 
-def plan(
+def plan_jobs(
     sequences: Mapping[str, tuple[str, RGBDSequence]],
     configs: Mapping[str, Config],
     *,
@@ -56,14 +59,14 @@ def plan(
     data_root: Path | None,
     folder: Path,
 ) -> list[Job]:
-    """The runs in the order of sequences, configurations and seeds.
+    """Return the jobs of a batch, ordered by sequence, configuration and seed.
 
     Args:
-        sequences: what to open, and that opened, by the name for tables.
-        configs: by the name for tables.
-        seeds: number of runs of each, with seeds from 0.
-        data_root: where named sequences are kept.
-        folder: of the results; those of a run are in ``<sequence>/<configuration>/seed<k>`` in it.
+        sequences: Source (path or name) and opened sequence, by the name in tables.
+        configs: Configurations by the name in tables.
+        seeds: Number of runs for each sequence and configuration; their seeds count from 0.
+        data_root: Folder of named sequences.
+        folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
     """
     return [
         Job(

@@ -1,4 +1,4 @@
-"""How far a batch is, for whoever watches."""
+"""Progress bars of a batch."""
 
 from __future__ import annotations
 
@@ -8,42 +8,42 @@ from pathlib import Path
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from v3d_torch.batch.executor import Finished, JobProgress
+from v3d_torch.batch.executor import JobFinished, JobProgress
 from v3d_torch.batch.job import Job
 
 
 class BatchProgress:
-    """A bar for the frames of all runs, and below one for each run that is under way.
+    """One bar for the frames of all jobs, and below it one bar for each running job.
 
     Args:
-        progress: that shows them.
-        jobs: all runs.
-        missing: those that have not ended before.
+        progress: Display to add the bars to.
+        jobs: All jobs of the batch.
+        missing: Jobs that have not ended in an earlier batch.
     """
 
     def __init__(self, progress: Progress, jobs: Sequence[Job], missing: Sequence[Job]) -> None:
         self._progress = progress
-        self._tasks: dict[Path, TaskID] = {}
+        self._running: dict[Path, TaskID] = {}
         self._frames = {job.folder: job.frames for job in jobs} | {job.folder: 0 for job in missing}
         self._ended, self._total = len(jobs) - len(missing), len(jobs)
-        self._all = progress.add_task("all runs", total=sum(job.frames for job in jobs), note="")
-        self._show()
+        self._all_jobs = progress.add_task("all runs", total=sum(job.frames for job in jobs), note="")
+        self._update_total()
 
-    def __call__(self, event: JobProgress | Finished) -> None:
-        """Show what has happened."""
+    def __call__(self, event: JobProgress | JobFinished) -> None:
+        """Show an event."""
         job = event.job
         if isinstance(event, JobProgress):
-            if job.folder not in self._tasks:
-                self._tasks[job.folder] = self._progress.add_task(escape(str(job)), total=job.frames, note="")
+            if job.folder not in self._running:
+                self._running[job.folder] = self._progress.add_task(escape(str(job)), total=job.frames, note="")
             self._frames[job.folder] = event.frames
-            self._progress.update(self._tasks[job.folder], completed=event.frames)
+            self._progress.update(self._running[job.folder], completed=event.frames)
         else:
-            if job.folder in self._tasks:
-                self._progress.remove_task(self._tasks.pop(job.folder))
+            if job.folder in self._running:
+                self._progress.remove_task(self._running.pop(job.folder))
             self._frames[job.folder] = job.frames
             self._ended += 1
-        self._show()
+        self._update_total()
 
-    def _show(self) -> None:
+    def _update_total(self) -> None:
         note = f"{self._ended} of {self._total} runs"
-        self._progress.update(self._all, completed=sum(self._frames.values()), note=note)
+        self._progress.update(self._all_jobs, completed=sum(self._frames.values()), note=note)

@@ -1,4 +1,4 @@
-"""A batch from its names to its tables, with everything shown and written."""
+"""A batch from sequence patterns to summary tables: planning, execution, display and files."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from v3d_torch.batch.executor import Executor, Finished
-from v3d_torch.batch.plan import make_sure_of_networks, plan, read_configs
-from v3d_torch.batch.processes import Processes
+from v3d_torch.batch.batch_record import BatchRecord
+from v3d_torch.batch.executor import Executor, JobFinished
+from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_networks
+from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
-from v3d_torch.batch.ray_cluster import RayCluster
-from v3d_torch.batch.records import BatchRecord
-from v3d_torch.datasets.sequence_patterns import matching_sequences
-from v3d_torch.errors import InputError, OutputError
+from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.runs.console import interrupts_between_frames, open_sequences, progress_bars, wide_console
 from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.datasets.sequence_patterns import matching_sequences
+from v3d_torch.errors import InputError, OutputError
 
 
 def run_batch(
@@ -31,49 +31,51 @@ def run_batch(
     data_root: Path | None,
     ray: str | None,
 ) -> None:
-    """Run every sequence with every configuration and seed; see ``python -m v3d_torch batch --help``.
+    """Run every sequence with every configuration and seed; arguments as in ``v3d-torch batch --help``.
 
     Raises:
-        V3DError: on bad input, before the first run; or when the batch was interrupted or a run failed. What the others
-            gave is written.
+        V3DError: If the input is invalid (before the first run), if the batch was interrupted, or if a run failed. The
+            results of the other runs are written.
     """
-    refuse_resume_of_nothing(resume, out)
+    check_resume(resume, out)
     console = wide_console()
-    configs = read_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
+    configs = load_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
     names = matching_sequences(patterns, data_root)
-    executor: Executor = Processes(workers or 1) if ray is None else RayCluster(ray, workers)
+    executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
     opened = open_sequences(names, data_root, console)
     sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
-    make_sure_of_networks(configs)
+    prepare_networks(configs)
     folder = make_result_folder(out, "batch")
-    record = BatchRecord(plan(sequences, configs, seeds=seeds, data_root=data_root, folder=folder), folder.absolute())
-    complete(record, executor, console, resume=resume)
+    jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder)
+    run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume)
 
 
-def refuse_resume_of_nothing(resume: bool, out: Path | None) -> None:
-    """Raise `InputError` where it is not said which folder to go on in."""
+def check_resume(resume: bool, out: Path | None) -> None:
+    """Raise `InputError` if a batch is to be resumed and its folder is not given."""
     if resume and out is None:
-        raise InputError("--resume: say with --out in which folder to go on")
+        raise InputError("--resume: no folder to resume; give the folder of the batch with --out")
 
 
-def complete(record: BatchRecord, executor: Executor, console: Console, *, resume: bool) -> None:
-    """Carry out the runs that a record lacks, with everything shown and written.
+def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, *, resume: bool) -> None:
+    """Run the jobs of a batch that have no outcome yet; show the progress and write the tables.
 
     Args:
-        record: of all runs, in the folder of the results.
-        executor: carries them out.
-        console: shows how far they are, and the tables at the end.
-        resume: whether the folder may hold runs.
+        record: Outcomes of the batch so far.
+        executor: Runs the jobs.
+        console: Shows the progress, and the tables at the end.
+        resume: Whether the folder may contain complete runs.
 
     Raises:
-        V3DError: the folder holds runs or cannot be written, the user interrupted, or a run failed.
+        V3DError: If the folder contains runs or is not writable, if the user interrupted the batch, or if a run failed.
     """
     folder = record.folder
     if record.outcomes and not resume:
-        raise InputError(f"{folder}: holds runs of an earlier batch; go on with --resume, or choose another folder")
-    record.write()  # a folder that cannot be written is told of now
-    interrupted = _carry_out(record, executor, console)
-    for table in record.tables():
+        raise InputError(
+            f"{folder}: contains runs of an earlier batch; continue it with --resume, or choose another folder"
+        )
+    record.write()  # a folder that is not writable is an error before the first run
+    interrupted = _run(record, executor, console)
+    for table in record.screen_tables():
         console.print(table)
     if record.failed:
         console.print("failed:", *map(str, record.failed), sep="\n", markup=False)
@@ -82,40 +84,40 @@ def complete(record: BatchRecord, executor: Executor, console: Console, *, resum
     if interrupted and (failed or record.missing):
         done = len(record.outcomes) - failed
         raise InputError(
-            f"interrupted with {done} of {total} runs done; the same command with --resume runs the others"
+            f"interrupted with {done} of {total} runs done; repeat the command with --resume to run the others"
         )
     if failed:
-        raise InputError(f"{failed} of {total} runs failed; the same command with --resume runs them again")
+        raise InputError(f"{failed} of {total} runs failed; repeat the command with --resume to run them again")
 
 
-def _carry_out(record: BatchRecord, executor: Executor, console: Console) -> bool:
-    """Run what is missing, and write the tables after each run.
+def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
+    """Run the missing jobs and update the tables after each.
 
     Returns:
-        Whether the user ended it.
+        True if the user interrupted the batch.
 
     Raises:
-        InputError: the user ended it at once.
-        OutputError: the tables cannot be written.
+        InputError: If the user interrupted it twice.
+        OutputError: If the tables cannot be written.
     """
-    lost: OutputError | None = None
+    write_error: OutputError | None = None
     with progress_bars(console) as progress, interrupts_between_frames() as stop:
-        bars = BatchProgress(progress, record.jobs, record.missing)
+        show = BatchProgress(progress, record.jobs, record.missing)
         try:
             with closing(executor(record.missing, stop)) as events:
                 for event in events:
-                    bars(event)
-                    if isinstance(event, Finished):
+                    show(event)
+                    if isinstance(event, JobFinished):
                         progress.console.print(str(record.add(event)), markup=False)
                         try:
                             record.write()
-                        except OutputError as error:  # those under way may still end
-                            lost = error
+                        except OutputError as error:  # the running jobs can still finish
+                            write_error = error
                             stop.set()
         except KeyboardInterrupt as interrupt:
             raise InputError(
-                "interrupted twice: what was under way is lost; the same command with --resume goes on"
+                "interrupted twice: the running jobs were killed; repeat the command with --resume to continue"
             ) from interrupt
-    if lost is not None:
-        raise lost
+    if write_error is not None:
+        raise write_error
     return stop.is_set()

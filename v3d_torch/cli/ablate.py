@@ -1,4 +1,4 @@
-"""``python -m v3d_torch ablate --seq ...``: what each part of the method is worth, the paper's ablation study."""
+"""Command ``v3d-torch ablate``: the ablation study, which shows the effect of each part of the method."""
 
 from __future__ import annotations
 
@@ -15,24 +15,31 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 @app.command()
 @expand_user_paths
 def main(
-    seq: Annotated[list[str], typer.Option(help="demo, a TUM RGB-D sequence or a folder; may be given several times.")],
+    seq: Annotated[
+        list[str],
+        typer.Option(help="Sequence to run: demo, a TUM RGB-D sequence or a folder. Repeat the option for several."),
+    ],
     data_root: Annotated[
-        Path | None, typer.Option(envvar="V3D_DATA", help="Where named sequences are, or are downloaded to.")
+        Path | None,
+        typer.Option(envvar="V3D_DATA", help="Folder of named sequences; missing ones are downloaded to it."),
     ] = None,
     variants: Annotated[
-        str, typer.Option(help="What to run, with commas between.")
+        str, typer.Option(help="Variants to run, separated by commas.")
     ] = "baseline,no_voting,no_chamfer,no_prediction,no_unlabelled,not_upright,global_shutter,paper,full",
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each variant, with seeds from 0.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of runs of each variant, with seeds from 0.")] = 3,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", help="A value for all variants, such as segmentation.model=yolo11n-seg."),
+        typer.Option("--set", help="Configuration value for all variants, such as segmentation.model=yolo11n-seg."),
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/ablation/<time>].")] = None,
 ) -> None:
-    """Turn off parts of the system and set the scores side by side."""
-    from v3d_torch.batch.study import run_study
+    """Turn off parts of the system and compare the scores.
+
+    Each variant runs with each seed on each sequence, one run after the other.
+    """
+    from v3d_torch.batch.ablation_study import run_ablation_study
     from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         names = [name.strip() for name in variants.split(",")]
-        run_study(seq, names, seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)
+        run_ablation_study(seq, names, seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)

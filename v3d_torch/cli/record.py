@@ -1,4 +1,4 @@
-"""``python -m v3d_torch record --out ...``: a live camera, or any other source, saved as a folder in TUM layout."""
+"""Command ``v3d-torch record``: save a live camera or any other source as a folder in TUM layout."""
 
 from __future__ import annotations
 
@@ -15,26 +15,32 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_mar
 @app.command()
 @expand_user_paths
 def main(
-    out: Annotated[Path, typer.Option(help="Folder to write, new or empty.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; must be new or empty.")],
     seq: Annotated[
-        str, typer.Option(help="What to save: a live camera (realsense:, realsense:SERIAL), or a sequence, bag, video.")
+        str,
+        typer.Option(help="Source to save: a live camera (realsense:, realsense:SERIAL), or a sequence, bag or video."),
     ] = "realsense:",
     data_root: Annotated[
-        Path | None, typer.Option(envvar="V3D_DATA", help="Where named sequences are, or are downloaded to.")
+        Path | None,
+        typer.Option(envvar="V3D_DATA", help="Folder of named sequences; missing ones are downloaded to it."),
     ] = None,
     camera: Annotated[
-        str | None, typer.Option(help="camera.yaml, K.txt or a preset (tum_fr3), where the source does not say.")
+        str | None,
+        typer.Option(help="Camera, if the source does not describe it: camera.yaml, K.txt or a preset (tum_fr3)."),
     ] = None,
-    rgb_topic: Annotated[str | None, typer.Option(help="Topic of a bag's colour images [guessed].")] = None,
-    depth_topic: Annotated[str | None, typer.Option(help="Topic of a bag's depth images [guessed].")] = None,
-    info_topic: Annotated[str | None, typer.Option(help="Topic of the colour images' camera [guessed].")] = None,
+    rgb_topic: Annotated[str | None, typer.Option(help="Topic of the colour images in a bag [detected].")] = None,
+    depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images in a bag [detected].")] = None,
+    info_topic: Annotated[
+        str | None, typer.Option(help="Topic of the camera info of the colour images in a bag [detected].")
+    ] = None,
     fps: Annotated[
-        float | None, typer.Option(help="Frames a second, of a live camera or where nothing says the times.")
+        float | None,
+        typer.Option(help="Frame rate in Hz, for a live camera or a source without timestamps."),
     ] = None,
 ) -> None:
-    """Save any source, also a live camera, in TUM layout.
+    """Save a live camera or any other source in TUM layout.
 
-    Frames become PNG with their lists and camera, until the source ends or Ctrl-C.
+    Writes PNG images, their lists and the camera until the source ends or Ctrl-C is pressed.
     """
     from rich.console import Console
     from rich.progress import track
@@ -51,12 +57,12 @@ def main(
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
         with interrupts_between_frames() as interrupted, TUMWriter(out, source.camera, source.groundtruth) as writer:
-            for frame in track(source, "saving, Ctrl-C ends it", console=console, disable=not console.is_terminal):
+            for frame in track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal):
                 writer.add(frame)
                 if interrupted.is_set():
                     break
         if not len(writer):
-            raise InputError(f"{seq}: sent no frame before the end")
+            raise InputError(f"{seq}: the source ended before its first frame")
         console.print(f"{len(writer)} frames: {out}", markup=False)
         if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
-            raise InputError(f"{source.groundtruth_error} (the frames, without ground truth, are in {out})")
+            raise InputError(f"{source.groundtruth_error} (the frames are saved in {out} without ground truth)")

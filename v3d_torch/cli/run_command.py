@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.cli.stage_table import stage_table
+from v3d_torch.runs.stage_table import stage_table
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, changed, find_config, load_config
 from v3d_torch.datasets import RGBDStream, open_source

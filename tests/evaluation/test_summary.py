@@ -1,4 +1,4 @@
-"""The summary of a batch: medians, the best, the paper's figures, in Markdown, LaTeX, CSV and on the screen."""
+"""Summary of a batch in the layout of the paper's tables: Markdown, LaTeX, CSV and screen."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from v3d_torch.evaluation.summary import csv_text, error_tables, latex, markdown
 
 
 def runs(sequence: str, config: str, *ates: float | None) -> list[Outcome]:
-    """A run for each error, with RPE a tenth and a hundredfold of it; None is one that failed."""
+    """Outcomes with given ATE; RPE is 0.1 and 100 times the ATE. None stands for a failed run."""
 
     def metrics(ate: float | None) -> dict[str, Any]:
         if ate is None:
@@ -35,25 +35,25 @@ OUTCOMES = [
     *runs("my & [own]", "full", 0.2),
     *runs("my & [own]", "base_line", None),
 ]
-"""On one of the paper's sequences, and on another."""
+"""Outcomes on one of the paper's sequences and on another sequence."""
 
 
 def rows(text: str) -> list[list[str]]:
-    """Cells of the rows of a Markdown document."""
+    """Cells of all table rows of a Markdown document."""
     return [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
 
 
-def test_medians_ranges_failures_and_the_papers_figures() -> None:
+def test_table_shows_medians_ranges_failures_and_paper() -> None:
     heading, _, paper, own = rows(markdown(OUTCOMES))[:4]
     methods = list(paper_scores()["ate"]["fr3/w/xyz"])
     assert heading == ["sequence", "full", "base_line", *(f"{method} (paper)" for method in methods)]
     assert paper[:3] == ["fr3/w/xyz", "**0.0120 [0.0100-0.0151]**", "0.4000 [0.3000-0.5000], 1 failed"]
     scores = [paper_scores()["ate"]["fr3/w/xyz"][method].rmse for method in methods]
     assert paper[3:] == ["-" if score is None else f"{score:.4f}" for score in scores]
-    assert own == ["my & [own]", "0.2000", "failed", *["-"] * len(methods)]  # nothing to compare with, no best
+    assert own == ["my & [own]", "0.2000", "failed", *["-"] * len(methods)]  # a single method is not marked as the best
 
 
-def test_all_three_metrics_of_the_paper() -> None:
+def test_all_three_metrics_have_tables() -> None:
     tables = error_tables(OUTCOMES)
     assert [table.heading for table in tables] == ["ATE, m", "RPE, m/s", "RPE, deg/s"]
     assert [table.rows["fr3/w/xyz"][0].text for table in tables[1:]] == [
@@ -66,20 +66,20 @@ def test_all_three_metrics_of_the_paper() -> None:
 @pytest.mark.parametrize(
     ("ours", "best"), [(0.0140, ["full"]), (0.01412, ["full", "CFP-SLAM (paper)"]), (0.5, ["CFP-SLAM (paper)"])]
 )
-def test_the_best_of_a_row_is_the_lowest_as_shown(ours: float, best: list[str]) -> None:
+def test_best_of_row_is_lowest_as_shown(ours: float, best: list[str]) -> None:
     (table, *_) = error_tables([*runs("fr3/w/xyz", "full", ours), *runs("fr3/w/xyz", "base", 0.6)])
     cells = dict(zip(table.methods, table.rows["fr3/w/xyz"], strict=True))
     assert [method for method, cell in cells.items() if cell.best] == best
 
 
-def test_sequences_that_are_not_the_papers_have_no_columns_of_it() -> None:
+def test_other_sequences_have_no_paper_columns() -> None:
     document = markdown([*runs("demo", "full", 0.1), *runs("demo", "paper", 0.2)])
     assert rows(document)[0] == ["sequence", "full", "paper"]
     assert rows(document)[2] == ["demo", "**0.1000**", "0.2000"]
     assert "(paper)" not in document
 
 
-def test_failures_are_listed_apart() -> None:
+def test_failures_are_listed_below() -> None:
     document = markdown(OUTCOMES)
     assert document.count("- fr3/w/xyz, base_line, seed 1: failed: it | broke") == 1
     assert "Failed" not in markdown(runs("demo", "full", 0.1))
@@ -87,13 +87,13 @@ def test_failures_are_listed_apart() -> None:
     assert "seed 0: failed" in nothing and not rows(nothing)
 
 
-def test_without_ground_truth_there_is_nothing_to_show() -> None:
+def test_outcomes_without_ground_truth_have_no_tables() -> None:
     outcomes = [Outcome("demo", "full", 0, {"ate": None, "rpe": None})]
     assert error_tables(outcomes) == [] and screen_tables(outcomes) == []
     assert "tabular" not in latex(outcomes)
 
 
-def test_latex_is_whole_and_says_the_same() -> None:
+def test_latex_is_balanced_and_has_same_values() -> None:
     text = latex(OUTCOMES)
     for name in ("table*", "tabular"):
         assert text.count(f"\\begin{{{name}}}") == text.count(f"\\end{{{name}}}") == 3
@@ -113,7 +113,7 @@ def test_latex_is_whole_and_says_the_same() -> None:
     assert depth == 0
 
 
-def test_csv_has_the_figures_unrounded() -> None:
+def test_csv_has_unrounded_values() -> None:
     table = list(csv.DictReader(csv_text(OUTCOMES).splitlines()))
     ours = {(row["metric"], row["sequence"], row["method"]): row for row in table}
     assert len(ours) == len(table) == 3 * (2 * 2 + 8)
@@ -129,7 +129,7 @@ def test_csv_has_the_figures_unrounded() -> None:
     assert ours["ate.rmse", "fr3/w/xyz", "TRS (paper)"]["sd"] == ""  # the paper has a dash
 
 
-def test_the_screen_fits_and_brackets_are_no_markup() -> None:
+def test_screen_table_fits_and_brackets_are_not_markup() -> None:
     console = Console(width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
     for table in screen_tables(OUTCOMES):
         console.print(table)

@@ -1,4 +1,4 @@
-"""A job carried out, wherever that is."""
+"""Execution of one job, in whatever process or machine it was sent to."""
 
 from __future__ import annotations
 
@@ -19,58 +19,58 @@ from v3d_torch.segmentation import make_segmenter
 from v3d_torch.types import RGBDFrame
 
 
-def run_job(job: Job, report: Callable[[int], None]) -> str | None:
-    """Run a sequence and write its log and its results. Where it was killed before, it goes on from its checkpoint.
+def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
+    """Run a sequence and write its log and results; resume from a checkpoint if the same run was killed before.
 
     Args:
-        job: to be carried out.
-        report: called after each frame with the number of frames done; a KeyboardInterrupt out of it ends the run,
-            with the results until then written.
+        job: Job to run.
+        report_progress: Called after each frame with the number of frames processed. A KeyboardInterrupt raised in it
+            ends the run; the results so far are written.
 
     Returns:
-        The sentence that the run failed with; None where it did not.
+        Error message of the run; None if it succeeded.
     """
 
     def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
-        report(frame.index + 1)
+        report_progress(frame.index + 1)
 
     try:
-        checkpoint = _checkpoint(job)
+        checkpoint = _matching_checkpoint(job)
         if checkpoint is None:
             clear_earlier_results(job.folder)
         with log_to(job.folder / "run.log", append=checkpoint is not None):
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", GroundTruthWarning)  # the run ends with that sentence
+                warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
                 sequence = load_sequence(job.source, data_root=job.data_root)
             if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
                 clear_earlier_results(job.folder)
                 checkpoint = None
             segment = make_segmenter(job.config.segmentation)
-            run = Run(_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
+            run = Run(_make_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
             run(on_frame)
-    except Exception as error:  # a run that breaks must not cost the others; its log has the traceback
-        return sentence(error)
+    except Exception as error:  # an error in one run must not end the batch; its log has the traceback
+        return describe_error(error)
     return run.pipeline.record.failure
 
 
-def _request(job: Job) -> RunRequest:
+def _make_request(job: Job) -> RunRequest:
     return RunRequest(job.source, job.config, data_root=None if job.data_root is None else str(job.data_root))
 
 
-def _checkpoint(job: Job) -> Checkpoint | None:
-    """Of the same run, begun earlier; None where there is none that is whole: then it begins anew."""
+def _matching_checkpoint(job: Job) -> Checkpoint | None:
+    """Return the checkpoint of the same run; None if there is no readable one, so that the run starts anew."""
     try:
         checkpoint = read_checkpoint(job.folder)
     except InputError:
         return None
-    request = checkpoint.request
+    request, wanted = checkpoint.request, _make_request(job).absolute()
     same = replace(request, config=single_threaded(request.config)) == replace(
-        _request(job).absolute(), config=single_threaded(job.config)
+        wanted, config=single_threaded(wanted.config)
     )
     return checkpoint if same else None
 
 
-def sentence(error: Exception) -> str:
-    """What an error says in one line; an error in the program says its type, too."""
-    said = " ".join(str(error).split())
-    return said if isinstance(error, V3DError) else f"{type(error).__name__}: {said}"
+def describe_error(error: Exception) -> str:
+    """Return the message of an error on one line, with the type of the error unless it is a `V3DError`."""
+    message = " ".join(str(error).split())
+    return message if isinstance(error, V3DError) else f"{type(error).__name__}: {message}"

@@ -1,8 +1,8 @@
-"""Times of the object stage's primitives beside scikit-learn, Open3D, SciPy, Kornia and torch.cdist.
+"""Times of the primitives of the object stage beside scikit-learn, Open3D, SciPy, Kornia and torch.cdist.
 
-``python benchmarks/objects.py`` prints one table for one thread and one for two. All competitors get the same clouds
+``python benchmarks/primitives.py`` prints a table for one thread and one for two. All competitors get the same clouds
 and take turns in random order, so that a busy machine slows them alike. A time is the median over the turns; ``ratio``
-is the median of the peer's time over ours in the same turn: above 1 we are faster. Needs open3d and scikit-learn.
+is the median of the time of the peer over ours in the same turn: above 1 ours is faster. Needs open3d and scikit-learn.
 """
 
 from __future__ import annotations
@@ -20,11 +20,14 @@ import open3d as o3d
 import sklearn.cluster
 import torch
 import typer
+from heading import make_heading
 from kornia.filters import joint_bilateral_blur
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
+from storage import Measurement, Row
+from storage import save as store
 
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.voxel import voxel_pool
@@ -35,14 +38,15 @@ from v3d_torch.objects.voting import hough_vote
 
 OURS = "v3d_torch"
 SIZES = [(5, 500), (5, 5000), (50, 500), (50, 5000)]
-"""Instances of one frame and of ten, and points of each after pooling."""
+"""Number of instances (of one frame, and of ten) and number of points of each after pooling."""
 VOXEL, EPS, MIN_SAMPLES = 0.02, 0.08, 5
+"""Edge of a voxel and radius of DBSCAN in metres, and neighbours of a core point: the defaults of the package."""
 
 Competitors = dict[str, Callable[[], Any]]
 
 
 def surfaces(batch: int, count: int, spacing: float, seed: int = 0) -> np.ndarray:
-    """Wavy sheets 2 m away, sampled every ``spacing`` metres, with a depth camera's noise."""
+    """Sample wavy surfaces at 2 m every ``spacing`` metres, with the noise of a depth camera."""
     side = int(np.ceil(np.sqrt(count)))
     v, u = (axis.ravel()[:count] * spacing for axis in np.mgrid[:side, :side])
     sheet = np.stack([u, v, 2 + 0.1 * np.sin(5 * u)], axis=-1)
@@ -50,17 +54,17 @@ def surfaces(batch: int, count: int, spacing: float, seed: int = 0) -> np.ndarra
 
 
 def tensors(clouds: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    """Clouds as the stage passes them on: float32, with a mask."""
+    """Convert clouds to the format of the stage: float32 points with a mask."""
     return torch.from_numpy(clouds.astype(np.float32)), torch.ones(clouds.shape[:2], dtype=torch.bool)
 
 
 def open3d_cloud(points: np.ndarray) -> o3d.geometry.PointCloud:
-    """A cloud of Open3D."""
+    """Convert points to a cloud of Open3D."""
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
 
 def smoothing() -> Competitors:
-    """An image with a fifth of its depth missing."""
+    """Depth smoothing, on an image with a fifth of its depth missing."""
     generator = torch.Generator().manual_seed(0)
     depth = 2 + 0.2 * torch.rand(1, 1, 480, 640, generator=generator)
     depth[torch.rand(depth.shape, generator=generator) < 0.2] = 0
@@ -72,7 +76,7 @@ def smoothing() -> Competitors:
 
 
 def pooling(batch: int, count: int) -> Competitors:
-    """Nine points to a cell of the sheet, which the noise shares out to two voxels: ``count`` are left."""
+    """Voxel pooling to about ``count`` points: nine per cell of the surface, spread over two voxels."""
     clouds = surfaces(batch, count * 9 // 2, VOXEL / 3)
     points, valid = tensors(clouds)
     return {
@@ -82,7 +86,7 @@ def pooling(batch: int, count: int) -> Competitors:
 
 
 def clustering(batch: int, count: int) -> Competitors:
-    """Clouds as they come out of the voxels."""
+    """DBSCAN, on pooled clouds."""
     clouds = surfaces(batch, count, VOXEL)
     points, valid = tensors(clouds)
     peer = sklearn.cluster.DBSCAN(eps=EPS, min_samples=MIN_SAMPLES, n_jobs=torch.get_num_threads())
@@ -94,7 +98,7 @@ def clustering(batch: int, count: int) -> Competitors:
 
 
 def selecting(batch: int, count: int) -> Competitors:
-    """Six clusters and noise."""
+    """Selection of the largest cluster, among six clusters and noise."""
     labels = torch.from_numpy(np.random.default_rng(0).integers(-1, 6, (batch, count)))
     valid = torch.ones_like(labels, dtype=torch.bool)
     return {
@@ -104,9 +108,9 @@ def selecting(batch: int, count: int) -> Competitors:
 
 
 def comparing(batch: int, count: int) -> Competitors:
-    """Two samplings of the same surface."""
-    then, now = surfaces(batch, count, VOXEL, seed=1), surfaces(batch, count, VOXEL, seed=2)
-    p, q = tensors(then)[0], tensors(now)[0]
+    """Chamfer distance between two samplings of the same surface."""
+    previous, current = surfaces(batch, count, VOXEL, seed=1), surfaces(batch, count, VOXEL, seed=2)
+    p, q = tensors(previous)[0], tensors(current)[0]
 
     def scipy_chamfer(a: np.ndarray, b: np.ndarray) -> float:
         workers = torch.get_num_threads()
@@ -122,26 +126,27 @@ def comparing(batch: int, count: int) -> Competitors:
 
     competitors: Competitors = {
         OURS: lambda: chamfer_distance(p, q),
-        "SciPy": lambda: [scipy_chamfer(*pair) for pair in zip(then, now, strict=True)],
-        "Open3D": lambda: [open3d_chamfer(*pair) for pair in zip(then, now, strict=True)],
+        "SciPy": lambda: [scipy_chamfer(*pair) for pair in zip(previous, current, strict=True)],
+        "Open3D": lambda: [open3d_chamfer(*pair) for pair in zip(previous, current, strict=True)],
     }
-    if batch * count**2 < 1e9:  # beyond, a turn takes seconds and nothing new is learned
+    if batch * count**2 < 1e9:  # larger inputs take seconds per turn
         competitors["torch.cdist"] = lambda: [cdist_chamfer(*pair) for pair in zip(p, q, strict=True)]
     return competitors
 
 
 def voting() -> Competitors:
-    """Ten objects, two frames."""
-    then, now = np.random.default_rng(0).random((2, 10, 3))
-    previous, current, present = torch.from_numpy(then), torch.from_numpy(now), torch.ones(10, dtype=torch.bool)
+    """Hough voting, with ten objects."""
+    points_a, points_b = np.random.default_rng(0).random((2, 10, 3))
+    previous, current = torch.from_numpy(points_a), torch.from_numpy(points_b)
+    present = torch.ones(10, dtype=torch.bool)
     return {
         OURS: lambda: hough_vote(previous, current, present, 0.05, 2),
-        "SciPy": lambda: squareform(np.abs(pdist(now) - pdist(then)) >= 0.05).sum(axis=1) >= 2,
+        "SciPy": lambda: squareform(np.abs(pdist(points_b) - pdist(points_a)) >= 0.05).sum(axis=1) >= 2,
     }
 
 
 def contests() -> Iterator[tuple[str, str, Competitors]]:
-    """Primitive, size, competitors with ours first."""
+    """Yield primitive, size and competitors, ours first."""
     yield "smooth_depth", "640 x 480", smoothing()
     for batch, count in SIZES:
         size = f"{batch} x {count}"
@@ -153,32 +158,36 @@ def contests() -> Iterator[tuple[str, str, Competitors]]:
 
 
 def take_turns(competitors: Competitors, turns: int) -> dict[str, list[float]]:
-    """Milliseconds of each in each turn; more turns than asked for where they are short."""
+    """Measure the milliseconds of each competitor in each turn; turns are added until one second has passed."""
     times: dict[str, list[float]] = {name: [] for name in competitors}
-    shuffler = np.random.default_rng(0)  # or the one who comes after the slowest would always find a cold cache
+    shuffler = np.random.default_rng(0)  # random order: the one after the slowest has a cold cache
     end = time.perf_counter() + 1
     while len(times[OURS]) <= turns or time.perf_counter() < end:
         for name in shuffler.permutation(list(competitors)):
             start = time.perf_counter()
             competitors[name]()
             times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: values[1:] for name, values in times.items()}  # the first warms up
+    return {name: values[1:] for name, values in times.items()}  # without the first, which warms up
 
 
 def main(
-    threads: int = typer.Option(0, min=0, help="Threads to give to everyone; 0 runs with one, then with two."),
-    turns: int = typer.Option(11, min=1, help="Measurements per competitor, at least."),
+    threads: int = typer.Option(0, min=0, help="Threads of every competitor; 0 runs with one, then with two."),
+    turns: int = typer.Option(11, min=1, help="Smallest number of turns."),
+    save: bool = typer.Option(False, "--save", help="Store the rows in benchmarks/results."),
 ) -> None:
-    """Print a table of times for each number of threads."""
+    """Measure all primitives and print a table for each number of threads."""
     if threads == 0:
         for number in (1, 2):
-            # A process each, since OpenMP reads its settings once. Each library brings its own OpenMP, whose idle
-            # threads would spin on the core that the next competitor needs.
+            # A new process, because OpenMP reads its settings once. PASSIVE: each library has its own OpenMP, whose
+            # idle threads would otherwise spin on the core that the next competitor needs.
             settings = {"OMP_NUM_THREADS": str(number), "OMP_WAIT_POLICY": "PASSIVE"}
             command = [sys.executable, __file__, "--threads", str(number), "--turns", str(turns)]
+            command += ["--save"] if save else []
             subprocess.run(command, check=True, env=os.environ | settings)  # noqa: S603 (this file itself)
         return
 
+    heading = make_heading()
+    rows: list[Row] = []
     torch.set_num_threads(threads)
     table = Table("primitive", "size", "competitor", "ms", "ratio", title=f"threads: {threads}")
     for name, size, competitors in contests():
@@ -186,9 +195,13 @@ def main(
         for competitor, values in times.items():
             head = (name, size) if competitor == OURS else ("", "")
             ratio = median(theirs / ours for theirs, ours in zip(values, times[OURS], strict=True))
-            table.add_row(*head, competitor, f"{median(values):.2f}", f"{ratio:.2f}")
+            cells = {"competitor": competitor, "ms": f"{median(values):.2f}", "ratio": f"{ratio:.2f}"}
+            rows.append({"primitive": name, "size": size, "threads": str(threads)} | cells)
+            table.add_row(*head, *cells.values())
         table.add_section()
     Console().print(table)
+    if save:
+        store("primitives", Measurement(heading, rows))
 
 
 if __name__ == "__main__":

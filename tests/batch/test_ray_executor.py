@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import pandas as pd
 import psutil
 import pytest
-from helpers.batches import jobs, repeated
+from helpers.batches import plan_seeds, repeat_sequence
 from typer.testing import CliRunner
 
-from v3d_torch.batch.executor import Finished
+from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
-from v3d_torch.batch.job_process import run_job
-from v3d_torch.batch.ray_cluster import RayCluster
+from v3d_torch.batch.ray_executor import RayExecutor
+from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli.batch import app
 from v3d_torch.errors import InputError
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ray.cluster_utils import Cluster as Nodes
 
 
-def test_without_ray_there_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray_is_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     result = CliRunner().invoke(app, ["--seqs", "demo", "--ray", "auto"])
     assert result.exit_code == 2
@@ -37,7 +37,7 @@ def test_without_ray_there_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture(scope="module")
 def nodes() -> Iterator[Nodes]:
-    """Two nodes; they end with the tests."""
+    """Cluster of two nodes, which is shut down after the tests."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'v3d-torch[ray]'")
     from ray.cluster_utils import Cluster as Nodes
 
@@ -47,60 +47,60 @@ def nodes() -> Iterator[Nodes]:
     cluster.shutdown()
 
 
-def test_a_batch_on_a_cluster_gives_what_it_gives_here(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
-    arguments = ["--seqs", str(moment), "--configs", "baseline", "--seeds", "2", "--out", str(tmp_path / "there")]
+def test_results_on_cluster_are_identical_to_local_results(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
+    arguments = ["--seqs", str(moment), "--configs", "baseline", "--seeds", "2", "--out", str(tmp_path / "cluster")]
     result = CliRunner().invoke(app, [*arguments, "--ray", nodes.address])
     assert result.exit_code == 0, result.output
-    table = pd.read_parquet(tmp_path / "there" / "runs.parquet")
+    table = pd.read_parquet(tmp_path / "cluster" / "runs.parquet")
     assert table["seed"].tolist() == [0, 1] and (table["tracked"] == 6).all()
-    (job,) = jobs(moment, tmp_path / "here", seeds=1)
+    (job,) = plan_seeds(moment, tmp_path / "local", seeds=1)
     assert run_job(job, lambda frames: None) is None
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "config.yaml"):
-        there = tmp_path / "there" / "moment" / "baseline" / "seed0" / name
-        assert there.read_bytes() == (job.folder / name).read_bytes(), name
+        remote = tmp_path / "cluster" / "moment" / "baseline" / "seed0" / name
+        assert remote.read_bytes() == (job.folder / name).read_bytes(), name
 
 
-def pid_of(job: Job) -> int:
-    """The process, among those that these tests have started, that writes a job's log."""
+def find_process(job: Job) -> int:
+    """Return the id of the process, among those started by these tests, that has the log of a job open."""
     for process in psutil.Process().children(recursive=True):
         with suppress(psutil.Error):
             if any(Path(file.path) == job.folder / "run.log" for file in process.open_files()):
                 return process.pid
-    raise AssertionError(f"nobody runs {job}")
+    raise AssertionError(f"no process runs {job}")
 
 
-def test_one_dies_one_ends_the_rest_is_stopped(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
-    """Of four jobs on two cores the first is killed; when another has ended and one still runs the batch is stopped."""
-    planned = jobs(repeated(moment, tmp_path / "long", frames=30), tmp_path / "out", seeds=4)
+def test_killed_job_fails_and_stop_ends_running_jobs(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
+    """Kill the first of four jobs on two cores; stop the batch once a job has ended and another is running."""
+    planned = plan_seeds(repeat_sequence(moment, tmp_path / "long", frames=30), tmp_path / "out", seeds=4)
     stop = Event()
-    began: set[int] = set()
+    started: set[int] = set()
     ends: dict[int, str | None] = {}
     killed = None
-    for event in RayCluster(nodes.address)(planned, stop):
+    for event in RayExecutor(nodes.address)(planned, stop):
         seed = event.job.config.seed
-        if isinstance(event, Finished):
+        if isinstance(event, JobFinished):
             ends[seed] = event.failure
         else:
-            began.add(seed)
-            assert len(began - set(ends)) <= 2
+            started.add(seed)
+            assert len(started - set(ends)) <= 2
             if killed is None and event.frames:
                 killed = seed
-                os.kill(pid_of(event.job), signal.SIGKILL)
+                os.kill(find_process(event.job), signal.SIGKILL)
             elif event.frames and None in ends.values():
                 stop.set()
     assert killed is not None and "died unexpectedly" in str(ends[killed])
-    good = [seed for seed, failure in ends.items() if failure is None]
+    succeeded = [seed for seed, failure in ends.items() if failure is None]
     stopped = [seed for seed, failure in ends.items() if failure is not None and "interrupted after" in failure]
-    assert good and stopped and len(good) + len(stopped) == len(ends) - 1
+    assert succeeded and stopped and len(succeeded) + len(stopped) == len(ends) - 1
     for job in planned:
-        finished = job.finished()
-        assert (finished is not None) == (job.config.seed in good)
+        outcome = job.earlier_outcome()
+        assert (outcome is not None) == (job.config.seed in succeeded)
         if job.config.seed in stopped:
             assert (job.folder / "trajectory.txt").read_text() and (job.folder / "metrics.json").is_file()
 
 
 @pytest.mark.parametrize("address", ["nonsense", "127.0.0.1:1", "ray://127.0.0.1:1"])
-def test_a_cluster_that_is_not_there(address: str) -> None:
+def test_unreachable_cluster_is_error(address: str) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'v3d-torch[ray]'")
-    with pytest.raises(InputError, match=rf"--ray {address}: there is no such cluster \(.+\); .*ray start"):
-        RayCluster(address)
+    with pytest.raises(InputError, match=rf"--ray {address}: no Ray cluster found \(.+\); .*ray start"):
+        RayExecutor(address)

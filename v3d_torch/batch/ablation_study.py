@@ -1,4 +1,4 @@
-"""The runs of the ablation study: every variant with every seed on every sequence, one after the other."""
+"""Ablation study: every variant of the system with every seed on every sequence, one run after the other."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.run import Run
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
@@ -19,42 +23,41 @@ from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, csv_text, markdown, screen_table
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
-from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
-from v3d_torch.runs.request import RunRequest
-from v3d_torch.runs.result_folder import make_result_folder
-from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import keep_upright, make_instance_source
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 _NOTE = (
-    "The network ran once for each sequence and all runs were in one process: the times and the memory in their"
-    " metrics.json are not those of a run alone."
+    "The network ran once per sequence, and all runs shared one process: times and memory in their metrics.json are not"
+    " those of a single run."
 )
 
 
-class SegmentOnce:
-    """Keeps what a segmenter says of each frame of a sequence, and says the same, bit for bit, when asked again.
+class CachedSegmenter:
+    """Segmenter that computes the instances of each frame once and then returns identical copies.
 
-    The network takes the most time of a run, and the variants differ only in what comes after it.
+    The variants of a study differ only in what follows the network, which takes most of the time of a run.
+
+    Args:
+        segment: Segmenter to cache.
     """
 
     def __init__(self, segment: Segmenter) -> None:
         self._segment = segment
-        self._kept: dict[tuple[int, int], Instances] = {}
+        self._cache: dict[tuple[int, int], Instances] = {}
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Instances of a frame; frames are told apart by index and image, which may have been turned."""
+        """Return the instances of a frame. The key is index and image, because the image may have been rotated."""
         key = (frame.index, hash(frame.image.numpy().tobytes()))
-        if key not in self._kept:
+        if key not in self._cache:
             instances = self._segment(frame)
-            packed = np.packbits(instances.masks.numpy(), axis=-1)  # eight pixels a byte, or a long sequence takes GBs
-            self._kept[key] = replace(instances, masks=torch.from_numpy(packed))
-        kept = self._kept[key]
-        masks = np.unpackbits(kept.masks.numpy(), axis=-1, count=frame.image.shape[-1]).astype(bool)
-        return replace(kept, masks=torch.from_numpy(masks))
+            packed = np.packbits(instances.masks.numpy(), axis=-1)  # eight pixels per byte, to save memory
+            self._cache[key] = replace(instances, masks=torch.from_numpy(packed))
+        cached = self._cache[key]
+        masks = np.unpackbits(cached.masks.numpy(), axis=-1, count=frame.image.shape[-1]).astype(bool)
+        return replace(cached, masks=torch.from_numpy(masks))
 
 
-def run_study(
+def run_ablation_study(
     names: Sequence[str],
     variants: Sequence[str],
     *,
@@ -63,31 +66,32 @@ def run_study(
     data_root: Path | None,
     out: Path | None,
 ) -> None:
-    """Run the study with everything shown and written; see ``python -m v3d_torch ablate --help``.
+    """Run the study, show and write its tables; arguments as in ``v3d-torch ablate --help``.
 
     Raises:
-        V3DError: on bad input, or when the study was interrupted or a run failed; what the others gave is written.
+        V3DError: If the input is invalid, if the study was interrupted, or if a run failed. The results of the other
+            runs are written.
     """
     console = wide_console()
     configs = {
-        (variant, seed): load_config(_file(variant), [*overrides, f"seed={seed}"])
+        (variant, seed): load_config(_find_variant(variant), [*overrides, f"seed={seed}"])
         for variant in variants
         for seed in range(seeds)
     }
     sequences = open_sequences(names, data_root, console)
     network = cache(make_instance_source)
     for config in configs.values():
-        network(_without_rotation(config))  # what cannot be had is said before the first run, not after hours
+        network(_network_config(config))  # a missing network is an error before the first run
     folder = make_result_folder(out, "ablation")
     outcomes: list[Outcome] = []
     try:
         for name, sequence in sequences.items():
             sources: dict[SegmentationConfig, Segmenter] = {}
             for (variant, seed), config in configs.items():
-                source = sources.setdefault(_without_rotation(config), SegmentOnce(network(_without_rotation(config))))
+                source = sources.setdefault(_network_config(config), CachedSegmenter(network(_network_config(config))))
                 segment = keep_upright(source, config.segmentation)
-                place = make_result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
-                metrics, failure = _run(sequence, segment, config, place, console)
+                run_folder = make_result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
+                metrics, failure = _run(sequence, segment, config, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 console.print(str(outcomes[-1]), markup=False)
                 write_text(folder / "ablation.md", markdown(outcomes, _NOTE))
@@ -95,35 +99,36 @@ def run_study(
             console.print(screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
     except KeyboardInterrupt as interrupt:
         done, total = len(outcomes), len(configs) * len(sequences)
-        raise InputError(f"interrupted after {done} of {total} runs; what they gave is in {folder}") from interrupt
+        raise InputError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
     console.print(f"{LEGEND}\n{PAPER_SAYS}", markup=False)
     console.print(f"results: {folder}", markup=False)
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
         raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
 
 
-def _file(variant: str) -> Path:
-    if variant not in VARIANTS:
-        raise ConfigError(f"--variants {variant}: there is no such variant; there are {', '.join(VARIANTS)}")
-    return find_config(variant)
+def _find_variant(name: str) -> Path:
+    if name not in VARIANTS:
+        raise ConfigError(f"--variants {name}: unknown variant; choose from {', '.join(VARIANTS)}")
+    return find_config(name)
 
 
-def _without_rotation(config: Config) -> SegmentationConfig:
-    """What the network itself is told: images are turned, where they are, before it sees them."""
+def _network_config(config: Config) -> SegmentationConfig:
+    """Return the configuration of the network alone: images are rotated upright before the network."""
     return config.segmentation.model_copy(update={"upright": False})
 
 
 def _run(
     sequence: RGBDSequence, segment: Segmenter, config: Config, folder: Path, console: Console
 ) -> tuple[dict[str, object], str | None]:
-    """One run, its results written.
+    """Run a sequence and write the results.
 
     Returns:
-        Its metrics, or none of them and the sentence that it failed with.
+        Metrics and error message of the run; the metrics are empty if the run failed, the message is None if it
+        succeeded.
 
     Raises:
-        KeyboardInterrupt: the user ended it.
-        OutputError: when the results cannot be written.
+        KeyboardInterrupt: If the user interrupted the run.
+        OutputError: If the results cannot be written.
     """
     try:
         request = RunRequest(sequence.name, config)
@@ -132,7 +137,7 @@ def _run(
         )
     except OutputError:
         raise
-    except Exception as error:  # a variant that breaks must not cost the others; its log has the traceback
+    except Exception as error:  # an error in one variant must not end the study; its log has the traceback
         return {}, f"{type(error).__name__}: {error}"
     if pipeline.record.interrupted:
         raise KeyboardInterrupt

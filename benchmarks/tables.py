@@ -1,0 +1,148 @@
+"""Markdown tables of stored measurements, and lines on how they were measured."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from descriptions import describe, kind, published
+from storage import Measurement, Row
+
+from v3d_torch.evaluation.tables import row
+
+SYSTEMS = {"full": "full", "baseline": "baseline", "pyorbslam3": "ORB-SLAM3 (PyPI)", "open3d": "Open3D odometry"}
+"""Names of systems in tables; other systems keep their own names."""
+
+CONTENDERS = {
+    "v3d_torch": "v3d_torch",
+    "v3d_torch --serial": "v3d_torch `--serial`",
+    "v3d_torch --segmenter none": "v3d_torch `--segmenter none`",
+    "open3d": "Open3D odometry (no segmentation)",
+    "pyorbslam3": "ORB-SLAM3 (PyPI; no segmentation)",
+}
+"""Names of contenders in tables, in the order of their rows."""
+
+
+def accuracy_table(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield a line per sequence: ATE of each system that ran, then of those in ``peers.yaml``."""
+    rows = rows_of(measurements)
+    systems = [system for system in SYSTEMS if any(cells["system"] == system for cells in rows)]
+    systems += [system for system in unique(cells["system"] for cells in rows) if system not in SYSTEMS]
+    sequences = unique(cells["sequence"] for cells in rows)
+    peers = unique(peer for sequence in sequences for peer in published(sequence))
+    yield row(["sequence", "frames", *(SYSTEMS.get(system, system) for system in systems), *peers])
+    yield row(["---", *["---:"] * (1 + len(systems) + len(peers))])
+    for sequence in sequences:
+        measured = {cells["system"]: cells for cells in rows if cells["sequence"] == sequence}
+        texts = [accuracy_cell(measured[system]) if system in measured else "-" for system in systems]
+        texts += [published(sequence).get(peer, "-") for peer in peers]
+        frames = next((cells["frames"] for cells in measured.values() if "frames" in cells), "-")
+        yield row([describe(sequence), frames, *mark_lowest(texts)])
+
+
+def accuracy_cell(cells: Row) -> str:
+    """Return the ATE of a system, with its coverage if that is below 100%."""
+    return f"{cells['ate']} ({cells['poses']})" if "poses" in cells else cells["ate"]
+
+
+def speed_table(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield a line per contender: speed on each sequence, then its ratio to ORB-SLAM3."""
+    rows = {(cells["contender"], cells["sequence"]): cells for cells in rows_of(measurements)}
+    sequences = unique(sequence for _, sequence in rows)
+    frames = {sequence: cells["frames"] for (_, sequence), cells in rows.items() if cells["frames"] != "-"}
+    headings = [f"{sequence} ({kind(sequence)}), {frames.get(sequence, '-')} frames" for sequence in sequences]
+    ratios = [f"relative to ORB-SLAM3, {sequence}" for sequence in sequences]
+    yield row(["frames per second (CPU ms per frame)", *headings, *ratios])
+    yield row(["---", *["---:"] * (2 * len(sequences))])
+    for contender in [name for name in CONTENDERS if any(name == measured for measured, _ in rows)]:
+        measured = [rows.get((contender, sequence)) for sequence in sequences]
+        speeds = [f"{cells['fps']} ({cells['cpu_ms']})" if cells else "-" for cells in measured]
+        yield row([CONTENDERS[contender], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)])
+
+
+def pivot(
+    rows: Sequence[Row], index: str, column: str, value: str, names: Mapping[str, str] | None = None
+) -> Iterator[str]:
+    """Yield a table with a line per value of one cell and a column per value of another one.
+
+    Args:
+        rows: Rows to tabulate.
+        index: Cell whose values are the lines.
+        column: Cell whose values are the columns; sequences get their kind in the heading.
+        value: Cell in the table.
+        names: Names of the lines.
+    """
+    cells = {(cells[index], cells[column]): cells[value] for cells in rows}
+    columns = unique(key for _, key in cells)
+    headings = [f"{key} ({kind(key)})" if column == "sequence" else key for key in columns]
+    yield row([index, *headings])
+    yield row(["---", *["---:"] * len(columns)])
+    for line in unique(key for key, _ in cells):
+        yield row([(names or {}).get(line, line), *(cells.get((line, key), "-") for key in columns)])
+
+
+def flat(rows: Sequence[Row], columns: Mapping[str, str]) -> Iterator[str]:
+    """Yield a table with a line per row and the columns that at least one row has.
+
+    Args:
+        rows: Rows to tabulate.
+        columns: Headings of the columns by cell.
+    """
+    shown = [name for name in columns if any(name in cells for cells in rows)]
+    yield row([columns[name] for name in shown])
+    yield row(["---"] * len(shown))
+    for cells in rows:
+        yield row([cells.get(name, "-") for name in shown])
+
+
+def mark_lowest(texts: Sequence[str]) -> list[str]:
+    """Return cells with the lowest leading number in bold, as often as it is shown."""
+    numbers = [float(match[0]) if (match := re.match(r"[\d.]+", text)) else None for text in texts]
+    lowest = min((number for number in numbers if number is not None), default=None)
+    return [
+        re.sub(r"^[\d.]+", lambda match: f"**{match[0]}**", text) if number is not None and number == lowest else text
+        for text, number in zip(texts, numbers, strict=True)
+    ]
+
+
+def rows_of(measurements: Iterable[Measurement]) -> list[Row]:
+    """Return all rows."""
+    return [cells for measurement in measurements for cells in measurement.rows]
+
+
+def notes(measurements: Iterable[Measurement]) -> list[str]:
+    """Return all notes."""
+    return [note for measurement in measurements for note in measurement.notes]
+
+
+def commits(measurements: Iterable[Measurement]) -> list[str]:
+    """Return the distinct commits."""
+    return unique(measurement.heading.commit for measurement in measurements)
+
+
+def bullets(texts: Sequence[str]) -> Iterator[str]:
+    """Yield a list item per text."""
+    yield from (f"- {text}" for text in texts)
+
+
+def provenance(measurements: Sequence[Measurement], key: str | None = None) -> Iterator[str]:
+    """Yield a line per measurement: command, commit, date and hardware.
+
+    Args:
+        measurements: Measurements of a table.
+        key: Cell that distinguishes the rows of several measurements.
+    """
+    for measurement in measurements:
+        heading = measurement.heading
+        label = ""
+        if key is not None and len(measurements) > 1:
+            label = ", ".join(unique(SYSTEMS.get(cells[key], cells[key]) for cells in measurement.rows)) + ": "
+        hardware = f"hardware {heading.hardware}" if heading.hardware == "not recorded" else heading.hardware
+        command = [f"`{heading.command}`"] if heading.command else []
+        details = [f"commit {heading.commit}", heading.date, hardware, heading.versions]
+        yield f"- {label}" + "; ".join([*command, *filter(None, details)])
+
+
+def unique(items: Iterable[str]) -> list[str]:
+    """Return the distinct items in the order of their first occurrence."""
+    return list(dict.fromkeys(items))

@@ -1,0 +1,26 @@
+"""Progress bars of a batch."""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+
+from helpers.batches import plan_seeds
+from rich.console import Console
+
+from v3d_torch.batch.executor import JobFinished, JobProgress
+from v3d_torch.batch.progress import BatchProgress
+from v3d_torch.runs.console import progress_bars
+
+
+def test_bars_show_all_running_jobs(moment: Path, tmp_path: Path) -> None:
+    all_jobs = plan_seeds(moment, tmp_path, seeds=4)
+    first, second = all_jobs[1:3]
+    screen = Console(force_terminal=True, width=100, file=StringIO())
+    with progress_bars(screen) as progress:
+        show = BatchProgress(progress, all_jobs, all_jobs[1:])
+        for event in (JobProgress(first, 0), JobProgress(second, 0), JobProgress(first, 5), JobFinished(second, None)):
+            show(event)
+        shown = {task.description: (task.completed, task.total) for task in progress.tasks}
+        notes = [task.fields["note"] for task in progress.tasks]
+    assert shown == {"all runs": (6 + 5 + 6, 24), str(first): (5, 6)} and notes == ["2 of 4 runs", ""]

@@ -1,0 +1,80 @@
+"""Sequence patterns: paths, names in the data root, names of the benchmark."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, short_name
+from v3d_torch.datasets.sequence_patterns import matching_sequences
+from v3d_torch.errors import InputError
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Folder with sequences and other files."""
+    for name in ("walk_a", "walk_b", "sit", "rgbd_dataset_freiburg1_rpy", "fr1_xyz"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+        (tmp_path / "data" / name / "rgb.txt").write_text("")
+    (tmp_path / "data" / "walk_notes").mkdir()
+    (tmp_path / "data" / "README.md").write_text("")
+    return tmp_path / "data"
+
+
+def test_names_without_wildcard_are_returned_unchanged(root: Path) -> None:
+    assert matching_sequences(["demo", "nowhere", "fr3/w/xyz", "demo"], root) == ["demo", "nowhere", "fr3/w/xyz"]
+
+
+def test_existing_folder_with_brackets_is_not_a_pattern(root: Path) -> None:
+    (root / "take [1]").mkdir()
+    assert matching_sequences([str(root / "take [1]")], root) == [str(root / "take [1]")]
+
+
+def test_pattern_matches_only_sequences_in_data_root(root: Path) -> None:
+    assert matching_sequences(["walk_*"], root) == ["walk_a", "walk_b"]
+    assert matching_sequences(["*"], root) == ["fr1_xyz", "rgbd_dataset_freiburg1_rpy", "sit", "walk_a", "walk_b"]
+    assert matching_sequences(["walk_[!a]", "s?t"], root) == ["walk_b", "sit"]
+
+
+def test_pattern_matches_paths(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert matching_sequences([str(root / "walk*")]) == [str(root / "walk_a"), str(root / "walk_b")]
+    monkeypatch.chdir(root.parent)
+    assert matching_sequences(["data/s*"], Path("elsewhere")) == ["data/sit"]
+
+
+def test_pattern_matches_names_of_the_benchmark(root: Path) -> None:
+    walking = ["fr3/w/xyz", "fr3/w/half", "fr3/w/static", "fr3/w/rpy"]
+    for pattern in ("fr3/w/*", "fr3_walking_*", "freiburg3_walking*", "rgbd_dataset_freiburg3_walking_*", "FR3/W/*"):
+        assert matching_sequences([pattern], root) == walking
+    third = matching_sequences(["fr3/*"], root)
+    assert third[:8] == [short_name(name) for name in PAPER_SEQUENCES]  # the paper's sequences come first, in its order
+    others = [short_name(n) for n in SEQUENCES if "freiburg3" in n and not n.endswith("validation")]
+    assert sorted(third) == sorted(others)
+
+
+def test_validation_sequences_match_only_if_named(root: Path) -> None:
+    found = matching_sequences(["fr1/*_validation"], root)
+    assert found and all(name.endswith("validation") for name in found)
+
+
+def test_sequence_with_several_names_matches_once(root: Path) -> None:
+    found = matching_sequences(["fr1/rpy", "fr1/*", "freiburg1-rpy"], root)
+    assert found[0] == "fr1/rpy" and found.count("fr1/rpy") == 1
+    assert (
+        len(set(found)) == len(found) == len([n for n in SEQUENCES if n.startswith("rgbd_dataset_freiburg1")]) / 2 + 1
+    )
+    assert matching_sequences(["fr?_xyz"], root) == ["fr1_xyz", "fr2/xyz"]  # fr1_xyz is a folder in the data root
+
+
+def test_pattern_without_match_is_error(root: Path) -> None:
+    for pattern in ("walks_*", "fr4/*", "walk_note*", str(root / "none*")):
+        with pytest.raises(InputError, match="matches no sequence") as raised:
+            matching_sequences(["sit", pattern], root)
+        assert str(raised.value).startswith(pattern) and str(root) in str(raised.value)
+
+
+@pytest.mark.parametrize("pattern", [5000 * "x" + "/*", "~nobody-of-this-name/*", "a**b/*", "[" + 3 * "*" + "]"])
+def test_invalid_pattern_is_error(pattern: str, root: Path) -> None:
+    with pytest.raises(InputError, match="match"):
+        matching_sequences([pattern], root)

@@ -1,0 +1,128 @@
+"""Outcomes of the runs of a batch, in memory and as tables on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from rich.table import Table
+
+from v3d_torch.batch.executor import JobFinished
+from v3d_torch.batch.job import Job
+from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.summary import csv_text, latex, markdown, screen_tables
+from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.types import TrackingStatus
+
+METRIC_TYPES: Mapping[str, pa.DataType] = {
+    **dict.fromkeys(("frames", "processed", *TrackingStatus, "keyframes", "loops"), pa.int64()),
+    **dict.fromkeys(("coverage", "ate.rmse", "ate.std"), pa.float64()),
+    **dict.fromkeys(("rpe.trans.rmse", "rpe.trans.std", "rpe.rot.rmse", "rpe.rot.std"), pa.float64()),
+    **dict.fromkeys(("masks.moving_left_out", "masks.static_left_out"), pa.float64()),
+    **dict.fromkeys(("masks.id_changes_per_60_frames", "masks.people_found"), pa.float64()),
+    **dict.fromkeys(("fps", "seconds", "peak_memory_mb"), pa.float64()),
+}
+"""Metrics in ``runs.parquet`` by their key in ``metrics.json``, and their types.
+
+The name of a column is the key with ``_`` instead of the dots.
+"""
+
+_SCHEMA = pa.schema(
+    [
+        ("sequence", pa.string()),
+        ("config", pa.string()),
+        ("seed", pa.int64()),
+        *((key.replace(".", "_"), data_type) for key, data_type in METRIC_TYPES.items()),
+        ("failure", pa.string()),
+        ("path", pa.string()),
+    ]
+)
+
+
+class BatchRecord:
+    """Outcomes of the jobs of a batch, including complete runs of earlier batches in the same folder.
+
+    Args:
+        jobs: All jobs of the batch.
+        folder: Folder of the results.
+
+    Raises:
+        InputError: If a complete run in the folder has another configuration.
+    """
+
+    def __init__(self, jobs: Sequence[Job], folder: Path) -> None:
+        self.jobs = jobs
+        self.folder = folder
+        self._outcomes = {job.folder: outcome for job in jobs if (outcome := job.earlier_outcome()) is not None}
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """Outcomes of the jobs that have ended, in the order of the jobs."""
+        return [self._outcomes[job.folder] for job in self.jobs if job.folder in self._outcomes]
+
+    @property
+    def failed(self) -> list[Outcome]:
+        """Outcomes of the jobs that have failed."""
+        return [outcome for outcome in self.outcomes if outcome.failure is not None]
+
+    @property
+    def missing(self) -> list[Job]:
+        """Jobs that have not ended."""
+        return [job for job in self.jobs if job.folder not in self._outcomes]
+
+    def add(self, event: JobFinished) -> Outcome:
+        """Store the outcome of a job that has ended, and return it."""
+        outcome = self._outcomes[event.job.folder] = event.job.make_outcome(event.failure)
+        return outcome
+
+    def write(self) -> None:
+        """Write ``runs.parquet`` and the summaries.
+
+        Raises:
+            OutputError: If the folder is not writable or the disk is full.
+        """
+        ended = [(job, self._outcomes[job.folder]) for job in self.jobs if job.folder in self._outcomes]
+        write_runs(self.folder / "runs.parquet", ended)
+        self.write_summaries()
+
+    def write_summaries(self) -> None:
+        """Write the summaries only.
+
+        Raises:
+            OutputError: If the folder is not writable or the disk is full.
+        """
+        write_text(self.folder / "summary.md", markdown(self.outcomes))
+        write_text(self.folder / "summary.tex", latex(self.outcomes))
+        write_text(self.folder / "summary.csv", csv_text(self.outcomes))
+
+    def screen_tables(self) -> list[Table]:
+        """Return the summary as tables for the screen."""
+        return screen_tables(self.outcomes)
+
+
+def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:
+    """Write a Parquet table with one row per run, atomically. The metrics of a failed run are empty.
+
+    Args:
+        path: Parquet file to write. The column ``path`` is relative to its folder, so that the folder can be moved.
+        runs: Jobs and their outcomes.
+
+    Raises:
+        OutputError: If the folder is not writable or the disk is full.
+    """
+    rows = [_row(job, outcome, path.parent) for job, outcome in runs]
+    with atomic_write(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=_SCHEMA), temporary)
+
+
+def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
+    return {
+        "sequence": outcome.sequence,
+        "config": outcome.config,
+        "seed": outcome.seed,
+        **{key.replace(".", "_"): outcome.figure(key) for key in METRIC_TYPES},
+        "failure": outcome.failure,
+        "path": job.folder.relative_to(folder).as_posix(),
+    }

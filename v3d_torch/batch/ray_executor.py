@@ -1,0 +1,147 @@
+"""Executor that runs the jobs of a batch on a Ray cluster."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Generator, Sequence
+from itertools import islice
+from threading import Event
+from typing import Any
+
+from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress
+from v3d_torch.batch.job import Job
+from v3d_torch.batch.run_job import run_job
+from v3d_torch.runs.console import interrupts_between_frames
+from v3d_torch.errors import InputError
+
+_POLL_INTERVAL = 0.2
+"""Time between two polls of the progress, seconds: often enough for a progress bar, and cheap for the cluster."""
+
+_CONNECT_TIMEOUT = 5.0
+"""Longest wait for the head of a cluster to accept a connection, seconds; on a network that works it takes less."""
+
+
+class RayExecutor:
+    """An `Executor` that runs each job in a process of a Ray cluster, with one core and one thread.
+
+    The package has to be installed on all machines, and they have to share the folders of the results and of the
+    sequences. A job whose process or machine dies is not run again.
+
+    Args:
+        address: Address of the cluster, as ``ray.init`` takes it: ``auto`` for the cluster that this machine belongs
+            to, ``local`` for a new cluster on this machine, or host and port of the head of another cluster.
+        workers: Number of jobs at a time; None for one job per core of the cluster.
+
+    Raises:
+        InputError: If Ray is not installed, or if there is no such cluster.
+    """
+
+    def __init__(self, address: str, workers: int | None = None) -> None:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would send usage statistics
+        try:
+            import ray
+            import ray.util.scheduling_strategies
+        except ImportError as error:
+            raise InputError("--ray: Ray is not installed; pip install 'v3d-torch[ray]'") from error
+        try:
+            _check_connection(address)
+            ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise InputError(
+                f"--ray {address}: no Ray cluster found ({_first_line(error)}); start one with ray start --head, or"
+                " use --ray local"
+            ) from error
+        self._ray = ray
+        self.workers = workers
+
+    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[JobProgress | JobFinished]:
+        """Run jobs; see `Executor`."""
+        ray = self._ray
+        this_machine = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
+            ray.get_runtime_context().get_node_id(), soft=False
+        )
+        # The board is on this machine, so that it survives the end of any other machine.
+        board = ray.remote(num_cpus=0, scheduling_strategy=this_machine)(_ProgressBoard).remote()
+        run = ray.remote(
+            num_cpus=1,
+            max_retries=0,
+            max_calls=1,  # a new process for each job
+            runtime_env={"env_vars": ONE_THREAD_ENVIRONMENT},
+        )(_task)
+        waiting = iter(range(len(jobs)))
+        pending: dict[Any, int] = {}
+        cancelled = False
+        try:
+            while True:
+                if not stop.is_set():
+                    free = None if self.workers is None else self.workers - len(pending)
+                    pending |= {run.remote(jobs[index], index, board): index for index in islice(waiting, free)}
+                elif not cancelled:
+                    cancelled = True
+                    for reference in pending:
+                        ray.cancel(reference)
+                if not pending:
+                    return
+                ended, _ = ray.wait(list(pending), timeout=_POLL_INTERVAL)
+                for index, frames in ray.get(board.take.remote()).items():
+                    if index in pending.values():  # a report can arrive after the end of its job
+                        yield JobProgress(jobs[index], frames)
+                for reference in ended:
+                    job = jobs[pending.pop(reference)]
+                    try:
+                        yield JobFinished(job, ray.get(reference))
+                    except ray.exceptions.TaskCancelledError:  # before it started
+                        continue
+                    except ray.exceptions.RayError as error:
+                        yield JobFinished(job, f"its process or machine failed ({_first_line(error)})")
+        except ray.exceptions.RayError as error:
+            raise InputError(
+                f"connection to the Ray cluster lost ({_first_line(error)}); repeat the command with --resume to"
+                " continue"
+            ) from error
+        finally:
+            ray.shutdown()
+
+
+def _check_connection(address: str) -> None:
+    """Raise OSError if a host and port do not accept connections: Ray itself would retry for many minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT).close()
+
+
+def _first_line(error: Exception) -> str:
+    """Return the first line of an error of Ray, whose message can fill pages."""
+    message = str(getattr(error, "cause", None) or error).strip()
+    return message.splitlines()[0] if message else type(error).__name__
+
+
+class _ProgressBoard:
+    """Ray actor that collects the progress of the running jobs."""
+
+    def __init__(self) -> None:
+        self._frames: dict[int, int] = {}
+
+    def report(self, index: int, frames: int) -> None:
+        """Store the number of frames that a job has processed."""
+        self._frames[index] = frames
+
+    def take(self) -> dict[int, int]:
+        """Return and clear the frames processed, by job, of the jobs that reported since the last call."""
+        reports, self._frames = self._frames, {}
+        return reports
+
+
+def _task(job: Job, index: int, board: Any) -> str | None:
+    """Run a job and report its progress; main function of a Ray task."""
+    with interrupts_between_frames() as cancelled:  # Ray cancels a task with the signal of Ctrl-C
+
+        def report_progress(frames: int) -> None:
+            board.report.remote(index, frames)  # not awaited: a task that waits would yield its core to another task
+            if cancelled.is_set():
+                raise KeyboardInterrupt
+
+        report_progress(0)
+        return run_job(job, report_progress)
