@@ -18,7 +18,7 @@ from heading import make_heading
 from sequences import locate_sequence
 from storage import Measurement, Row
 
-from v3d_torch.evaluation.tables import row, spread
+from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 
 CELLS = {
     "ate": ("ate.rmse", ".4f"),
@@ -35,15 +35,15 @@ def summarise(runs: Sequence[Row]) -> Iterator[Row]:
         matching = [run for run in runs if (run["sequence"], run["variant"]) == (sequence, variant)]
         cells = {"sequence": sequence, "variant": variant}
         for name, (column, form) in CELLS.items():
-            cells[name] = spread([float(run[column]) for run in matching if run[column]], form)
+            cells[name] = format_median_and_range([float(run[column]) for run in matching if run[column]], form)
         yield cells
 
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
     """Yield a line per sequence and variant."""
-    yield row(["sequence", "variant", "ATE, m", "moving left out", "static left out", "id changes"])
-    yield row(["---", "---"] + ["---:"] * len(CELLS))
-    yield from (row([cells["sequence"], cells["variant"], *(cells[name] for name in CELLS)]) for cells in rows)
+    yield markdown_row(["sequence", "variant", "ATE, m", "moving left out", "static left out", "id changes"])
+    yield markdown_row(["---", "---"] + ["---:"] * len(CELLS))
+    yield from (markdown_row([cells["sequence"], cells["variant"], *(cells[name] for name in CELLS)]) for cells in rows)
 
 
 def main() -> None:

@@ -30,8 +30,8 @@ from storage import Measurement, Row
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.paper_tables import paper_scores, paper_sequence
-from v3d_torch.evaluation.tables import row, spread
+from v3d_torch.evaluation.paper_tables import find_paper_sequence, load_paper_scores
+from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 from v3d_torch.types import TrackingStatus
 
 CONFIGURATIONS = {
@@ -118,28 +118,30 @@ def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root
     configurations = unique(outcome.configuration for outcome in outcomes)
     peers = {sequence: known_scores(sequence, known) for sequence in sequences}
     columns = unique(name for scores in peers.values() for name in scores)
-    yield row(["sequence", "what", "frames", *configurations, *columns])
-    yield row(["---"] * 2 + ["---:"] * (1 + len(configurations) + len(columns)))
+    yield markdown_row(["sequence", "what", "frames", *configurations, *columns])
+    yield markdown_row(["---"] * 2 + ["---:"] * (1 + len(configurations) + len(columns)))
     for sequence in sequences:
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
         frames = unique(str(outcome.metrics["frames"]) for outcome in runs if outcome.metrics)
         scores = [ate_cell([o for o in runs if o.configuration == name]) for name in configurations]
         beside = [peers[sequence].get(name, "-") for name in columns]
-        yield row([sequence, description(sequence, known, data_root), *(frames or ["-"]), *scores, *beside])
+        yield markdown_row([sequence, description(sequence, known, data_root), *(frames or ["-"]), *scores, *beside])
 
 
 def runs_table(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield a row per sequence and configuration: frames by tracking status, coverage and speed."""
-    yield row(["sequence", "configuration", "runs failed", *TrackingStatus, "coverage", "frames per second"])
-    yield row(["---"] * 2 + ["---:"] * (3 + len(TrackingStatus)))
+    yield markdown_row(["sequence", "configuration", "runs failed", *TrackingStatus, "coverage", "frames per second"])
+    yield markdown_row(["---"] * 2 + ["---:"] * (3 + len(TrackingStatus)))
     for sequence, configuration in unique((outcome.sequence, outcome.configuration) for outcome in outcomes):
         runs = [o for o in outcomes if (o.sequence, o.configuration) == (sequence, configuration)]
         metrics = [outcome.metrics for outcome in runs if outcome.metrics is not None]
         failed = f"{len(runs) - len(metrics)} of {len(runs)}"
-        statuses = [spread([m[status] for m in metrics if status in m], ".0f") for status in TrackingStatus]
-        coverage = spread([m["coverage"] for m in metrics if "coverage" in m], ".1%")
-        fps = spread([m["fps"] for m in metrics], ".1f")
-        yield row([sequence, configuration, failed, *statuses, coverage, fps])
+        statuses = [
+            format_median_and_range([m[status] for m in metrics if status in m], ".0f") for status in TrackingStatus
+        ]
+        coverage = format_median_and_range([m["coverage"] for m in metrics if "coverage" in m], ".1%")
+        fps = format_median_and_range([m["fps"] for m in metrics], ".1f")
+        yield markdown_row([sequence, configuration, failed, *statuses, coverage, fps])
 
 
 def accuracy_rows(outcomes: Sequence[Outcome]) -> Iterator[Row]:
@@ -149,9 +151,12 @@ def accuracy_rows(outcomes: Sequence[Outcome]) -> Iterator[Row]:
         metrics = [outcome.metrics for outcome in runs if outcome.metrics is not None]
         cells = {"sequence": Path(sequence).name, "system": system, "ate": ate_cell(runs)}
         if metrics:
-            cells |= {"frames": str(metrics[0]["frames"]), "fps": spread([m["fps"] for m in metrics], ".1f")}
+            cells |= {
+                "frames": str(metrics[0]["frames"]),
+                "fps": format_median_and_range([m["fps"] for m in metrics], ".1f"),
+            }
             if any(m.get("coverage", 1) < 1 for m in metrics):
-                cells["poses"] = spread([m["coverage"] for m in metrics], ".0%") + " of the frames"
+                cells["poses"] = format_median_and_range([m["coverage"] for m in metrics], ".0%") + " of the frames"
         yield cells
 
 
@@ -171,8 +176,8 @@ def notes(outcomes: Sequence[Outcome], known: dict[str, Any]) -> Iterator[str]:
 
 def known_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
     """Return the ATE RMSE in metres of systems that were measured elsewhere, by system."""
-    if (paper := paper_sequence(sequence)) is not None:
-        scores = paper_scores()["ate"][paper]
+    if (paper := find_paper_sequence(sequence)) is not None:
+        scores = load_paper_scores()["ate"][paper]
         return {f"{name} (paper)": f"{score.rmse:.4f}" for name, score in scores.items() if score.rmse is not None}
     scores = known["sequences"].get(Path(sequence).name, {}).get("ate", {})
     return {f"{name} (not rerun)": score for name, score in scores.items()}
@@ -193,7 +198,9 @@ def ate_cell(runs: Sequence[Outcome]) -> str:
     failed = sum(outcome.metrics is None for outcome in runs)
     if failed == len(runs):
         return "failed"
-    return spread([run.ate for run in runs if run.ate is not None], ".4f") + (f", {failed} failed" if failed else "")
+    return format_median_and_range([run.ate for run in runs if run.ate is not None], ".4f") + (
+        f", {failed} failed" if failed else ""
+    )
 
 
 def unique(items: Iterable[T]) -> list[T]:

@@ -29,7 +29,7 @@ from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import Config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
-from v3d_torch.evaluation.tables import row
+from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.geometry.se3 import invert, se3_exp
 
 BLOCKS = 10
@@ -81,7 +81,10 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
     system(lambda *_: snapshots.append(take_snapshot()))
     stages = list(slam.timer.seconds)
     columns = ["frames", "ms per frame", "slowest", "CPU ms per frame", "resident MB", "keyframes", "loops"]
-    lines = [row([*columns, *(f"{stage} ms" for stage in stages)]), row(["---:"] * (len(columns) + len(stages)))]
+    lines = [
+        markdown_row([*columns, *(f"{stage} ms" for stage in stages)]),
+        markdown_row(["---:"] * (len(columns) + len(stages))),
+    ]
     cpu_ms: list[str] = []
     ends: list[Snapshot] = []
     for block in range(BLOCKS):
@@ -103,7 +106,7 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
             str(stop.loops),
             *(f"{1e3 * fmean(frame.get(stage, 0.0) for frame in rows):.1f}" for stage in stages),
         ]
-        lines.append(row(cells))
+        lines.append(markdown_row(cells))
     early, late = ends[0], ends[-1]
     later = frames - frames // BLOCKS
     summary = {
@@ -153,9 +156,9 @@ KEYFRAME_COLUMNS = {
 
 def keyframe_table(rows: Sequence[Row]) -> Iterator[str]:
     """Yield a line per number of keyframes."""
-    yield row(list(KEYFRAME_COLUMNS.values()))
-    yield row(["---:"] * len(KEYFRAME_COLUMNS))
-    yield from (row([cells[name] for name in KEYFRAME_COLUMNS]) for cells in rows)
+    yield markdown_row(list(KEYFRAME_COLUMNS.values()))
+    yield markdown_row(["---:"] * len(KEYFRAME_COLUMNS))
+    yield from (markdown_row([cells[name] for name in KEYFRAME_COLUMNS]) for cells in rows)
 
 
 def random_descriptors(generator: torch.Generator) -> Tensor:

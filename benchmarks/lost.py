@@ -36,7 +36,7 @@ from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
-from v3d_torch.evaluation.tables import row
+from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import NoSegmentation
@@ -242,8 +242,13 @@ def main() -> None:
             rows += measure(sequence, options.gaps, options.before, options.after, config, masks)
     except V3DError as error:
         parser.error(str(error))
-    lines = [*heading.lines(), "", row(list(COLUMNS.values())), row(["---", "---", *(len(COLUMNS) - 2) * ["---:"]])]
-    lines += [row([cells[name] for name in COLUMNS]) for cells in rows]
+    lines = [
+        *heading.lines(),
+        "",
+        markdown_row(list(COLUMNS.values())),
+        markdown_row(["---", "---", *(len(COLUMNS) - 2) * ["---:"]]),
+    ]
+    lines += [markdown_row([cells[name] for name in COLUMNS]) for cells in rows]
     publish(lines, options, parser, {"lost": Measurement(heading, rows)})
 
 

@@ -25,7 +25,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.base import HasMotionMasks
 from v3d_torch.errors import InputError, V3DError
-from v3d_torch.evaluation.tables import row
+from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction.mesh import fuse_mesh
@@ -138,8 +138,14 @@ def main() -> None:
             slam, views, people = run(sequence)
             rows = list(count_people(sequence.name, people))
             costs = measure_costs(sequence, slam, views)
-            lines += ["", f"## {name}", "", row(list(COLUMNS.values())), row(["---"] + ["---:"] * (len(COLUMNS) - 1))]
-            lines += [row([cells[column] for column in COLUMNS]) for cells in rows]
+            lines += [
+                "",
+                f"## {name}",
+                "",
+                markdown_row(list(COLUMNS.values())),
+                markdown_row(["---"] + ["---:"] * (len(COLUMNS) - 1)),
+            ]
+            lines += [markdown_row([cells[column] for column in COLUMNS]) for cells in rows]
             lines += ["", f"CPU time on {os.cpu_count()} cores: " + "; ".join(f"{k} {v}" for k, v in costs.items())]
             people_rows += rows
             cost_rows.append(costs)

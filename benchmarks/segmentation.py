@@ -22,7 +22,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.tables import row
+from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
@@ -107,7 +107,7 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
         reference = reference or segmenter.people
         found = sum(int((people & reference[index]).sum()) for index, people in segmenter.people.items())
         expected = sum(int(reference[index].sum()) for index in segmenter.people)
-        scores = run.mask_evaluation.scores()
+        scores = run.mask_evaluation.compute_scores()
         truth = sequence.groundtruth
         ate = truth and evaluate(truth, pipeline.slam.poses.trajectory(), frames=len(sequence)).ate.rmse
         yield {
@@ -141,9 +141,9 @@ COLUMNS = {
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
     """Yield a line per variant."""
-    yield row(list(COLUMNS.values()))
-    yield row(["---"] + ["---:"] * (len(COLUMNS) - 1))
-    yield from (row([cells[name] for name in COLUMNS]) for cells in rows)
+    yield markdown_row(list(COLUMNS.values()))
+    yield markdown_row(["---"] + ["---:"] * (len(COLUMNS) - 1))
+    yield from (markdown_row([cells[name] for name in COLUMNS]) for cells in rows)
 
 
 ABOUT = (

@@ -22,7 +22,7 @@ from storage import Measurement, Row
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import V3DError
-from v3d_torch.evaluation.tables import row, spread
+from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 
 REFERENCE = "pyorbslam3"
 CONTENDERS = (*OURS, *PEERS)
@@ -77,11 +77,11 @@ def contender_rows(turns: Sequence[Turn]) -> Iterator[Row]:
         yield {
             "contender": name,
             "frames": str(runs[0].frames) if runs else "-",
-            "fps": spread([rate(run) for run in runs], ".1f"),
-            "fps_ratio": spread([rate(run) / rate(reference) for run, reference in pairs], ".2f"),
-            "cpu_ms": spread([cpu(run) for run in runs], ".1f"),
-            "cpu_ratio": spread([cpu(run) / cpu(reference) for run, reference in pairs], ".2f"),
-            "coverage": spread([poses(run) / run.frames for run in runs], ".0%"),
+            "fps": format_median_and_range([rate(run) for run in runs], ".1f"),
+            "fps_ratio": format_median_and_range([rate(run) / rate(reference) for run, reference in pairs], ".2f"),
+            "cpu_ms": format_median_and_range([cpu(run) for run in runs], ".1f"),
+            "cpu_ratio": format_median_and_range([cpu(run) / cpu(reference) for run, reference in pairs], ".2f"),
+            "coverage": format_median_and_range([poses(run) / run.frames for run in runs], ".0%"),
             "failed": f"{len(turns) - len(runs)} of {len(turns)}",
         }
 
@@ -89,10 +89,10 @@ def contender_rows(turns: Sequence[Turn]) -> Iterator[Row]:
 def speed_table(turns: Sequence[Turn]) -> Iterator[str]:
     """Yield a line per contender."""
     columns = ["contender", "frames per second", "ratio", "CPU ms per frame", "ratio", "coverage", "runs failed"]
-    yield row(columns)
-    yield row(["---"] + ["---:"] * (len(columns) - 1))
+    yield markdown_row(columns)
+    yield markdown_row(["---"] + ["---:"] * (len(columns) - 1))
     shown = ("contender", "fps", "fps_ratio", "cpu_ms", "cpu_ratio", "coverage", "failed")
-    yield from (row([cells[name] for name in shown]) for cells in contender_rows(turns))
+    yield from (markdown_row([cells[name] for name in shown]) for cells in contender_rows(turns))
 
 
 def poses(run: Measured) -> int:
@@ -106,16 +106,16 @@ def stage_times(turns: Sequence[Turn]) -> Iterator[Row]:
         runs = [run for turn in turns if isinstance(run := turn[name], Measured)]
         for stage in dict.fromkeys(stage for run in runs for stage in run.stages):
             times = [1e3 * run.stages[stage] / run.frames for run in runs if stage in run.stages]
-            yield {"contender": name, "stage": stage, "ms": spread(times, ".1f")}
+            yield {"contender": name, "stage": stage, "ms": format_median_and_range(times, ".1f")}
 
 
 def stage_table(turns: Sequence[Turn]) -> Iterator[str]:
     """Yield a line per stage: milliseconds per frame of each of our contenders."""
-    yield row(["stage, ms per frame", *OURS])
-    yield row(["---"] + ["---:"] * len(OURS))
+    yield markdown_row(["stage, ms per frame", *OURS])
+    yield markdown_row(["---"] + ["---:"] * len(OURS))
     times = {(cells["contender"], cells["stage"]): cells["ms"] for cells in stage_times(turns)}
     for stage in dict.fromkeys(stage for _, stage in times):
-        yield row([stage, *(times.get((name, stage), "-") for name in OURS)])
+        yield markdown_row([stage, *(times.get((name, stage), "-") for name in OURS)])
 
 
 def failures(turns: Sequence[Turn]) -> Iterator[str]:

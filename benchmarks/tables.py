@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from descriptions import describe, kind, published
 from storage import Measurement, Row
 
-from v3d_torch.evaluation.tables import row
+from v3d_torch.evaluation.tables import markdown_row
 
 SYSTEMS = {"full": "full", "baseline": "baseline", "pyorbslam3": "ORB-SLAM3 (PyPI)", "open3d": "Open3D odometry"}
 """Names of systems in tables; other systems keep their own names."""
@@ -30,14 +30,14 @@ def accuracy_table(measurements: Sequence[Measurement]) -> Iterator[str]:
     systems += [system for system in unique(cells["system"] for cells in rows) if system not in SYSTEMS]
     sequences = unique(cells["sequence"] for cells in rows)
     peers = unique(peer for sequence in sequences for peer in published(sequence))
-    yield row(["sequence", "frames", *(SYSTEMS.get(system, system) for system in systems), *peers])
-    yield row(["---", *["---:"] * (1 + len(systems) + len(peers))])
+    yield markdown_row(["sequence", "frames", *(SYSTEMS.get(system, system) for system in systems), *peers])
+    yield markdown_row(["---", *["---:"] * (1 + len(systems) + len(peers))])
     for sequence in sequences:
         measured = {cells["system"]: cells for cells in rows if cells["sequence"] == sequence}
         texts = [accuracy_cell(measured[system]) if system in measured else "-" for system in systems]
         texts += [published(sequence).get(peer, "-") for peer in peers]
         frames = next((cells["frames"] for cells in measured.values() if "frames" in cells), "-")
-        yield row([describe(sequence), frames, *mark_lowest(texts)])
+        yield markdown_row([describe(sequence), frames, *mark_lowest(texts)])
 
 
 def accuracy_cell(cells: Row) -> str:
@@ -52,12 +52,14 @@ def speed_table(measurements: Sequence[Measurement]) -> Iterator[str]:
     frames = {sequence: cells["frames"] for (_, sequence), cells in rows.items() if cells["frames"] != "-"}
     headings = [f"{sequence} ({kind(sequence)}), {frames.get(sequence, '-')} frames" for sequence in sequences]
     ratios = [f"relative to ORB-SLAM3, {sequence}" for sequence in sequences]
-    yield row(["frames per second (CPU ms per frame)", *headings, *ratios])
-    yield row(["---", *["---:"] * (2 * len(sequences))])
+    yield markdown_row(["frames per second (CPU ms per frame)", *headings, *ratios])
+    yield markdown_row(["---", *["---:"] * (2 * len(sequences))])
     for contender in [name for name in CONTENDERS if any(name == measured for measured, _ in rows)]:
         measured = [rows.get((contender, sequence)) for sequence in sequences]
         speeds = [f"{cells['fps']} ({cells['cpu_ms']})" if cells else "-" for cells in measured]
-        yield row([CONTENDERS[contender], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)])
+        yield markdown_row(
+            [CONTENDERS[contender], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)]
+        )
 
 
 def pivot(
@@ -75,10 +77,10 @@ def pivot(
     cells = {(cells[index], cells[column]): cells[value] for cells in rows}
     columns = unique(key for _, key in cells)
     headings = [f"{key} ({kind(key)})" if column == "sequence" else key for key in columns]
-    yield row([index, *headings])
-    yield row(["---", *["---:"] * len(columns)])
+    yield markdown_row([index, *headings])
+    yield markdown_row(["---", *["---:"] * len(columns)])
     for line in unique(key for key, _ in cells):
-        yield row([(names or {}).get(line, line), *(cells.get((line, key), "-") for key in columns)])
+        yield markdown_row([(names or {}).get(line, line), *(cells.get((line, key), "-") for key in columns)])
 
 
 def flat(rows: Sequence[Row], columns: Mapping[str, str]) -> Iterator[str]:
@@ -89,10 +91,10 @@ def flat(rows: Sequence[Row], columns: Mapping[str, str]) -> Iterator[str]:
         columns: Headings of the columns by cell.
     """
     shown = [name for name in columns if any(name in cells for cells in rows)]
-    yield row([columns[name] for name in shown])
-    yield row(["---"] * len(shown))
+    yield markdown_row([columns[name] for name in shown])
+    yield markdown_row(["---"] * len(shown))
     for cells in rows:
-        yield row([cells.get(name, "-") for name in shown])
+        yield markdown_row([cells.get(name, "-") for name in shown])
 
 
 def mark_lowest(texts: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from helpers.corpus import CATEGORIES
 from helpers.corpus.base import write_base
-from helpers.corpus.case import Case, Place, Right, Says
+from helpers.corpus.case import Case, Fails, Succeeds, Workspace
 from typer.testing import CliRunner
 
 from v3d_torch.cli import report, run
@@ -46,13 +46,13 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+def place(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Workspace]:
     """Create a working directory with a copy of the intact sequence."""
     shutil.copytree(base, tmp_path / "seq")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("V3D_DATA", raising=False)
-    place = Place(tmp_path)
+    place = Workspace(tmp_path)
     place.seq = str(place.folder)
     yield place
     for path in tmp_path.rglob("*"):  # so that pytest can remove folders without permissions
@@ -76,27 +76,27 @@ def memory_limit() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def arguments(place: Place) -> list[str]:
+def arguments(place: Workspace) -> list[str]:
     return ["--seq", place.seq, "--out", str(place.out), *place.options]
 
 
-def assert_expected_end(place: Place, ends: Right | Says, code: int, stdout: str, stderr: str) -> None:
-    if isinstance(ends, Right):
+def assert_expected_end(place: Workspace, ends: Succeeds | Fails, code: int, stdout: str, stderr: str) -> None:
+    if isinstance(ends, Succeeds):
         assert (code, stderr) == (0, "")
         metrics = json.loads((place.out / "metrics.json").read_text())
         assert (metrics["processed"], metrics["lost"], metrics["failure"]) == (ends.frames, ends.lost, None)
         assert saved_poses(place) == ends.frames
-        assert (metrics["ate"] is None) == (ends.ate is None)
-        assert ends.ate is None or metrics["ate"]["rmse"] < ends.ate
+        assert (metrics["ate"] is None) == (ends.max_ate is None)
+        assert ends.max_ate is None or metrics["ate"]["rmse"] < ends.max_ate
         assert ends.note in stdout
     else:
         assert code == 2, stderr
         assert stderr.startswith("error: ") and stderr.endswith("\n") and stderr.count("\n") == 1, stderr
         assert ends.fits(stderr.removeprefix("error: ").removesuffix("\n"), place), stderr
-        assert saved_poses(place) == ends.kept
+        assert saved_poses(place) == ends.saved_poses
 
 
-def saved_poses(place: Place) -> int | None:
+def saved_poses(place: Workspace) -> int | None:
     """Number of poses in the results; None if there are no results."""
     trajectory = place.out / "trajectory.txt"
     return len(trajectory.read_text().splitlines()) if trajectory.is_file() else None
@@ -106,27 +106,27 @@ def saved_poses(place: Place) -> int | None:
 @pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 @pytest.mark.parametrize(("category", "case"), CASES)
 def test_damaged_input_ends_as_expected(
-    category: str, case: Case, place: Place, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    category: str, case: Case, place: Workspace, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if category not in WITH_FIGURES:
         monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
-    case.make(place)
-    with case.during(place), memory_limit():
+    case.damage(place)
+    with case.context(place), memory_limit():
         done = CliRunner().invoke(run.app, arguments(place))
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exc_info
-    assert_expected_end(place, case.ends, done.exit_code, done.stdout, done.stderr)
+    assert_expected_end(place, case.expected, done.exit_code, done.stdout, done.stderr)
     assert capfd.readouterr().err == ""  # libraries must not write to stderr either
     assert not list(place.root.glob("**/*.part*"))
 
 
 @pytest.mark.parametrize(("category", "name"), SHELL.items(), ids=SHELL)
-def test_damaged_input_ends_as_expected_in_a_subprocess(category: str, name: str, place: Place) -> None:
+def test_damaged_input_ends_as_expected_in_a_subprocess(category: str, name: str, place: Workspace) -> None:
     case = next(case for case in CATEGORIES[category] if case.name == name)
-    case.make(place)
+    case.damage(place)
     command = [sys.executable, "-m", "v3d_torch.run", *arguments(place)]
     environment = os.environ | {"PYTHONPATH": str(Path(run.__file__).parents[1]), "COLUMNS": "200", "NO_COLOR": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)  # noqa: S603
-    assert_expected_end(place, case.ends, done.returncode, done.stdout, done.stderr)
+    assert_expected_end(place, case.expected, done.returncode, done.stdout, done.stderr)
 
 
 def test_case_names_are_unique() -> None:
@@ -135,16 +135,16 @@ def test_case_names_are_unique() -> None:
     assert sum(len(cases) for cases in CATEGORIES.values()) >= 60
 
 
-def test_earlier_results_are_replaced_and_other_files_are_kept(place: Place) -> None:
+def test_earlier_results_are_replaced_and_other_files_are_kept(place: Workspace) -> None:
     (case,) = (case for case in CATEGORIES["results and permissions"] if case.name == "results of an earlier run")
-    case.make(place)
+    case.damage(place)
     assert CliRunner().invoke(run.app, arguments(place)).exit_code == 0
     assert (place.out / "notes.txt").read_text() == "of an earlier run"
     stamps = [f"{float(line.split()[0]):.6f}.png" for line in (place.out / "trajectory.txt").read_text().splitlines()]
     assert sorted(path.name for path in (place.out / "masks").iterdir()) == stamps
 
 
-def test_clear_earlier_results_removes_all_files_of_a_run(place: Place) -> None:
+def test_clear_earlier_results_removes_all_files_of_a_run(place: Workspace) -> None:
     """A new result file must also be added to the files that `clear_earlier_results` removes."""
     from v3d_torch.runs.result_folder import clear_earlier_results
 

@@ -66,8 +66,14 @@ def pair(batch: int, count: int, dtype: torch.dtype) -> Inputs:
 
 def clouds_of_two_frames(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     p, q, p_valid, q_valid = pair(batch, count, dtype).values()
-    T_now_then = se3_exp(0.3 * random(batch, 6, dtype=torch.float64)).to(dtype)
-    return {"then": p, "now": q, "then_valid": p_valid, "now_valid": q_valid, "T_now_then": T_now_then}
+    T_current_previous = se3_exp(0.3 * random(batch, 6, dtype=torch.float64)).to(dtype)
+    return {
+        "previous": p,
+        "current": q,
+        "previous_valid": p_valid,
+        "current_valid": q_valid,
+        "T_current_previous": T_current_previous,
+    }
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,10 @@ class Case:
 
 
 CLOUD, PAIR = {"points": "valid"}, {"p": "p_valid", "q": "q_valid"}
-CENTROIDS, TWICE = {"previous": "present", "current": "present"}, {"then": "then_valid", "now": "now_valid"}
+CENTROIDS, TWICE = (
+    {"previous": "present", "current": "present"},
+    {"previous": "previous_valid", "current": "current_valid"},
+)
 CASES = {
     "DepthSmoother": Case(
         v3d.DepthSmoother(3, 0.8, 0.03),
@@ -123,7 +132,7 @@ CASES = {
         partial(v3d.intra_object_motion, distance_threshold=0.2),
         clouds_of_two_frames,
         TWICE,
-        ("then", "now", "T_now_then"),
+        ("previous", "current", "T_current_previous"),
     ),
 }
 each = pytest.mark.parametrize("case", CASES.values(), ids=CASES)

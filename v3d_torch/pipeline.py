@@ -24,10 +24,10 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
 from v3d_torch.runtime.process import trim_memory
+from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
-from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 
 _LOG = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import FrameResult, PreprocessedFrame
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
-from v3d_torch.geometry.se3 import invert, rigid
+from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.feature_support import FeatureSupport
@@ -100,9 +100,7 @@ class V3DSLAM:
         # Objects
         free_space = config.objects.free_space
         self.free_space_check = FreeSpaceCheck(free_space, camera)
-        self.propose_unlabelled = partial(
-            unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area
-        )
+        self.propose_unlabelled = partial(unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area)
         self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
         self.classify_motion = MotionClassifier(config.objects, camera)
         # Camera pose and map
@@ -171,21 +169,24 @@ class V3DSLAM:
             features = self.compensate(preprocessed.features, depth, frame.depth_delay, velocity, self.map.readout)
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
-            view = self.free_space_check.make_view(frame.stamp, depth, rigid(motion.T_cp @ self.poses.T_cw))
-            occupied = self.free_space_check(view, trusted=motion.is_measured)
+            view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
+            occupied = self.free_space_check(view, pose_known=motion.is_measured)
             if self.config.segmentation.source != "none":
                 instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
-            support = FeatureSupport(features.pixel, motion.matched(len(features)))
+            support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))
             objects = self.classify_motion(instances, clouds, view, occupied, support)
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
-            landmarks, features = motion.landmarks(self._previous, len(features))[is_static], preprocessed.features[is_static]
+            landmarks, features = (
+                motion.propagate_landmarks(self._previous, len(features))[is_static],
+                preprocessed.features[is_static],
+            )
             features = self.compensate(features, depth, frame.depth_delay, motion.velocity, self.map.readout)
-            T_cw = rigid(motion.T_cp @ self.poses.T_cw)
+            T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
             pose = self.track_camera(features, depth, T_cw, landmarks, motion, self.poses)
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
             self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
@@ -195,7 +196,7 @@ class V3DSLAM:
             T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
             self._apply_world_correction(T_new_old)
             if pose.status is not TrackingStatus.LOST:
-                self.free_space_check.remember(view.moved_to(self.poses.T_cw))
+                self.free_space_check.add_view(view.with_pose(self.poses.T_cw))
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, features, objects.static_mask, landmarks)
             if keyframe is not None:
@@ -272,5 +273,5 @@ class V3DSLAM:
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
         """Move everything outside the map that is stored in the world frame, after a correction of the map."""
         if T_new_old is not None:
-            self.classify_motion.tracker.move_world(T_new_old)
-            self.free_space_check.move_world(T_new_old)
+            self.classify_motion.tracker.apply_world_correction(T_new_old)
+            self.free_space_check.apply_world_correction(T_new_old)

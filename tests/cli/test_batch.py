@@ -29,9 +29,9 @@ from v3d_torch.batch.executor import JobFinished, JobProgress
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.cli.batch import app
-from v3d_torch.runs.console import open_sequences
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError
+from v3d_torch.runs.console import open_sequences
 
 FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),

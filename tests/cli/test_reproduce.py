@@ -25,8 +25,8 @@ from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets import PAPER_SEQUENCES, locate, short_name
 from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.summary import csv_text, latex, markdown
-from v3d_torch.evaluation.paper_tables import paper_scores
+from v3d_torch.evaluation.paper_tables import load_paper_scores
+from v3d_torch.evaluation.summary import format_csv, format_latex, format_markdown
 
 SHORT = [short_name(name) for name in PAPER_SEQUENCES]
 SERVED = [name for name in PAPER_SEQUENCES if name.endswith(("walking_xyz", "sitting_rpy"))]
@@ -147,7 +147,7 @@ def test_missing_sequences_are_downloaded_run_and_tabulated(server: str, tmp_pat
         table = table_in(document, heading)
         assert list(table) == SHORT
         for full_name, (sequence, cells) in zip(PAPER_SEQUENCES, table.items(), strict=True):
-            score = paper_scores()[metric][sequence]["V3D-SLAM"].rmse
+            score = load_paper_scores()[metric][sequence]["V3D-SLAM"].rmse
             assert plain(cells["V3D-SLAM (paper)"]) == f"{score:.4f}"
             if full_name not in SERVED:
                 assert cells["baseline"] == "not here"
@@ -253,10 +253,10 @@ def test_damaged_sequence_is_an_error(server: str, fake_runs: list[str], tmp_pat
 def test_missing_sequences_keep_the_papers_order_and_scores() -> None:
     runs = [Outcome("fr3/w/static", "full", 0, metrics_of(0.006)), Outcome("fr3/s/xyz", "full", 0, metrics_of(0.009))]
     absent = [name for name in SHORT if name not in ("fr3/w/static", "fr3/s/xyz")]
-    table = table_in(markdown(runs, absent), "ATE, m")
+    table = table_in(format_markdown(runs, absent), "ATE, m")
     assert list(table) == SHORT
     assert table["fr3/w/rpy"]["full"] == "not here" and table["fr3/w/rpy"]["DynaSLAM (paper)"] == "**0.0354**"
     assert table["fr3/w/static"]["full"] == "**0.0060**"
-    assert latex(runs, absent).count("not here") == 3 * 6
-    missing = [row for row in csv.DictReader(csv_text(runs, absent).splitlines()) if row["method"] == "full"]
+    assert format_latex(runs, absent).count("not here") == 3 * 6
+    missing = [row for row in csv.DictReader(format_csv(runs, absent).splitlines()) if row["method"] == "full"]
     assert [row["median"] for row in missing[:8]] == ["0.009", *[""] * 5, "0.006", ""]

@@ -28,7 +28,7 @@ from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAMES, RATE, write_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
-from v3d_torch.runs import console, result_folder
+from v3d_torch.runs import result_folder
 
 FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),

@@ -62,7 +62,7 @@ def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
                 for kind in kinds:
                     counts[kind][0] += int(left_out[v, u])
                     counts[kind][1] += 1
-    scores = evaluation.scores()
+    scores = evaluation.compute_scores()
     assert scores is not None and scores.frames == len(seeds)
     for kind, score in zip(
         counts, (scores.moving_left_out, scores.static_left_out, scores.static_left_out_anywhere), strict=True
@@ -90,7 +90,7 @@ def test_convention_fractions_are_over_pixels_not_frames() -> None:
     corner[0, 0] = 1
     evaluation.add(0.0, full, depth, torch.ones(10, 10, dtype=torch.bool), {})
     evaluation.add(1.0, corner, depth, torch.zeros(10, 10, dtype=torch.bool), {})
-    scores = evaluation.scores()
+    scores = evaluation.compute_scores()
     assert scores is not None
     assert scores.moving_left_out == 100 / 101
     assert scores.static_left_out == 0.0
@@ -100,14 +100,14 @@ def test_unsure_pixels_are_neither_moving_nor_static() -> None:
     evaluation = MaskEvaluation()
     truth = torch.full((10, 10), 255, dtype=torch.uint8)
     evaluation.add(0.0, truth, torch.ones(1, 10, 10), torch.ones(10, 10, dtype=torch.bool), {})
-    scores = evaluation.scores()
+    scores = evaluation.compute_scores()
     assert scores is not None
     assert scores.moving_left_out is scores.static_left_out is scores.static_left_out_anywhere is None
     assert scores.people == () and scores.id_changes_per_60_frames is None
 
 
 def test_evaluation_without_frames_has_no_scores() -> None:
-    assert MaskEvaluation().scores() is None
+    assert MaskEvaluation().compute_scores() is None
 
 
 # --- people in view, and the objects that cover them
@@ -205,7 +205,7 @@ def test_scores_of_two_people() -> None:
         truth = person_at(2) + (person_at(40, 2) if b is not None else 0)
         objects = {id_: mask for id_, mask in ((a, person_at(2) > 0), (b, person_at(41) > 0)) if id_}
         evaluation.add(frame / 10, truth, depth, nothing, objects)
-    scores = evaluation.scores()
+    scores = evaluation.compute_scores()
     assert scores is not None
     assert [(p.id, p.in_view, p.found, p.id_changes) for p in scores.people] == [(1, 8, 6, 3), (2, 3, 3, 0)]
     assert scores.id_changes_per_60_frames == pytest.approx(60 * 3 / 11)
@@ -221,7 +221,7 @@ def test_person_with_few_pixels_is_not_in_view() -> None:
         depth[0, 0, :without_depth] = 0
         evaluation = MaskEvaluation()
         evaluation.add(0.0, truth, depth, truth > 0, {})
-        scores = evaluation.scores()
+        scores = evaluation.compute_scores()
         assert scores is not None
         assert [person.id for person in scores.people] == in_view
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.evaluation import Evaluation, evaluate
-from v3d_torch.evaluation.paper_tables import paper_scores, paper_sequence, paper_table
+from v3d_torch.evaluation.paper_tables import find_paper_sequence, load_paper_scores, make_paper_table
 
 SEQUENCES = {
     f"fr3/{people[0]}/{motion[:4] if motion == 'halfsphere' else motion}": f"freiburg3_{people}_{motion}"
@@ -35,7 +35,7 @@ def evaluate_published(v3d_data: Path, sequence: str) -> Evaluation:
 @pytest.mark.parametrize("sequence", SEQUENCES)
 def test_published_trajectories_reproduce_the_papers_tables(v3d_data: Path, sequence: str) -> None:
     evaluation = evaluate_published(v3d_data, sequence)
-    ate, trans, rot = (paper_scores()[metric][sequence]["V3D-SLAM"] for metric in ("ate", "rpe_trans", "rpe_rot"))
+    ate, trans, rot = (load_paper_scores()[metric][sequence]["V3D-SLAM"] for metric in ("ate", "rpe_trans", "rpe_rot"))
     assert (evaluation.ate.rmse, evaluation.ate.std) == pytest.approx(ate, abs=2e-4)
     if sequence in TRANSLATION_ONLY:
         assert evaluation.rpe is None
@@ -53,7 +53,7 @@ def test_paper_scores_equal_the_papers_source(v3d_data: Path) -> None:
     tables = re.findall(r"\\begin\{tabular\}.*?\\end\{tabular\}", source.read_text(encoding="utf-8"), re.DOTALL)
     tables = [table for table in tables if "fr3/w/rpy" in table]
     assert len(tables) == 3
-    for table, scores in zip(tables, paper_scores().values(), strict=True):
+    for table, scores in zip(tables, load_paper_scores().values(), strict=True):
         for sequence in SEQUENCES:
             row = re.search(rf"{sequence} &(.*?)\\\\", table, re.DOTALL)
             assert row is not None
@@ -65,7 +65,7 @@ def test_paper_scores_equal_the_papers_source(v3d_data: Path) -> None:
 def test_paper_table_compares_result_with_paper() -> None:
     groundtruth = random_walk(60, seed=22)
     evaluation = evaluate(groundtruth, noisy(groundtruth, seed=23, sigma=1e-4))
-    table = paper_table("rgbd_dataset_freiburg3_walking_xyz", evaluation)
+    table = make_paper_table("rgbd_dataset_freiburg3_walking_xyz", evaluation)
     assert table is not None
     console = Console(width=160, record=True, file=io.StringIO())
     console.print(table)
@@ -78,7 +78,7 @@ def test_paper_table_compares_result_with_paper() -> None:
 
 def test_paper_table_omits_rpe_over_other_delta() -> None:
     groundtruth = random_walk(90, seed=24)
-    table = paper_table("fr3/w/xyz", evaluate(groundtruth, noisy(groundtruth, seed=25), rpe_delta=2.0))
+    table = make_paper_table("fr3/w/xyz", evaluate(groundtruth, noisy(groundtruth, seed=25), rpe_delta=2.0))
     assert table is not None
     assert [list(column.cells)[-1] for column in table.columns[3:]] == ["-"] * 4
 
@@ -99,5 +99,5 @@ def test_paper_table_omits_rpe_over_other_delta() -> None:
     ],
 )
 def test_paper_sequence_is_found_in_names_and_paths(name: str, sequence: str | None) -> None:
-    assert paper_sequence(name) == sequence
-    assert set(paper_scores()["ate"]) == set(SEQUENCES)
+    assert find_paper_sequence(name) == sequence
+    assert set(load_paper_scores()["ate"]) == set(SEQUENCES)

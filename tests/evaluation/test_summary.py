@@ -11,8 +11,14 @@ import pytest
 from rich.console import Console
 
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.paper_tables import paper_scores
-from v3d_torch.evaluation.summary import csv_text, error_tables, latex, markdown, screen_tables
+from v3d_torch.evaluation.paper_tables import load_paper_scores
+from v3d_torch.evaluation.summary import (
+    format_csv,
+    format_latex,
+    format_markdown,
+    make_error_tables,
+    make_screen_tables,
+)
 
 
 def runs(sequence: str, config: str, *ates: float | None) -> list[Outcome]:
@@ -44,17 +50,17 @@ def rows(text: str) -> list[list[str]]:
 
 
 def test_table_shows_medians_ranges_failures_and_paper() -> None:
-    heading, _, paper, own = rows(markdown(OUTCOMES))[:4]
-    methods = list(paper_scores()["ate"]["fr3/w/xyz"])
+    heading, _, paper, own = rows(format_markdown(OUTCOMES))[:4]
+    methods = list(load_paper_scores()["ate"]["fr3/w/xyz"])
     assert heading == ["sequence", "full", "base_line", *(f"{method} (paper)" for method in methods)]
     assert paper[:3] == ["fr3/w/xyz", "**0.0120 [0.0100-0.0151]**", "0.4000 [0.3000-0.5000], 1 failed"]
-    scores = [paper_scores()["ate"]["fr3/w/xyz"][method].rmse for method in methods]
+    scores = [load_paper_scores()["ate"]["fr3/w/xyz"][method].rmse for method in methods]
     assert paper[3:] == ["-" if score is None else f"{score:.4f}" for score in scores]
     assert own == ["my & [own]", "0.2000", "failed", *["-"] * len(methods)]  # a single method is not marked as the best
 
 
 def test_all_three_metrics_have_tables() -> None:
-    tables = error_tables(OUTCOMES)
+    tables = make_error_tables(OUTCOMES)
     assert [table.heading for table in tables] == ["ATE, m", "RPE, m/s", "RPE, deg/s"]
     assert [table.rows["fr3/w/xyz"][0].text for table in tables[1:]] == [
         "0.0012 [0.0010-0.0015]",
@@ -67,34 +73,34 @@ def test_all_three_metrics_have_tables() -> None:
     ("ours", "best"), [(0.0140, ["full"]), (0.01412, ["full", "CFP-SLAM (paper)"]), (0.5, ["CFP-SLAM (paper)"])]
 )
 def test_best_of_row_is_lowest_as_shown(ours: float, best: list[str]) -> None:
-    (table, *_) = error_tables([*runs("fr3/w/xyz", "full", ours), *runs("fr3/w/xyz", "base", 0.6)])
+    (table, *_) = make_error_tables([*runs("fr3/w/xyz", "full", ours), *runs("fr3/w/xyz", "base", 0.6)])
     cells = dict(zip(table.methods, table.rows["fr3/w/xyz"], strict=True))
     assert [method for method, cell in cells.items() if cell.best] == best
 
 
 def test_other_sequences_have_no_paper_columns() -> None:
-    document = markdown([*runs("demo", "full", 0.1), *runs("demo", "paper", 0.2)])
+    document = format_markdown([*runs("demo", "full", 0.1), *runs("demo", "paper", 0.2)])
     assert rows(document)[0] == ["sequence", "full", "paper"]
     assert rows(document)[2] == ["demo", "**0.1000**", "0.2000"]
     assert "(paper)" not in document
 
 
 def test_failures_are_listed_below() -> None:
-    document = markdown(OUTCOMES)
+    document = format_markdown(OUTCOMES)
     assert document.count("- fr3/w/xyz, base_line, seed 1: failed: it | broke") == 1
-    assert "Failed" not in markdown(runs("demo", "full", 0.1))
-    nothing = markdown(runs("demo", "full", None))
+    assert "Failed" not in format_markdown(runs("demo", "full", 0.1))
+    nothing = format_markdown(runs("demo", "full", None))
     assert "seed 0: failed" in nothing and not rows(nothing)
 
 
 def test_outcomes_without_ground_truth_have_no_tables() -> None:
     outcomes = [Outcome("demo", "full", 0, {"ate": None, "rpe": None})]
-    assert error_tables(outcomes) == [] and screen_tables(outcomes) == []
-    assert "tabular" not in latex(outcomes)
+    assert make_error_tables(outcomes) == [] and make_screen_tables(outcomes) == []
+    assert "tabular" not in format_latex(outcomes)
 
 
 def test_latex_is_balanced_and_has_same_values() -> None:
-    text = latex(OUTCOMES)
+    text = format_latex(OUTCOMES)
     for name in ("table*", "tabular"):
         assert text.count(f"\\begin{{{name}}}") == text.count(f"\\end{{{name}}}") == 3
     for rule in ("toprule", "midrule", "bottomrule"):
@@ -114,7 +120,7 @@ def test_latex_is_balanced_and_has_same_values() -> None:
 
 
 def test_csv_has_unrounded_values() -> None:
-    table = list(csv.DictReader(csv_text(OUTCOMES).splitlines()))
+    table = list(csv.DictReader(format_csv(OUTCOMES).splitlines()))
     ours = {(row["metric"], row["sequence"], row["method"]): row for row in table}
     assert len(ours) == len(table) == 3 * (2 * 2 + 8)
     row = ours["ate.rmse", "fr3/w/xyz", "full"]
@@ -131,7 +137,7 @@ def test_csv_has_unrounded_values() -> None:
 
 def test_screen_table_fits_and_brackets_are_not_markup() -> None:
     console = Console(width=80, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
-    for table in screen_tables(OUTCOMES):
+    for table in make_screen_tables(OUTCOMES):
         console.print(table)
     text = console.export_text()
     for words in ("my & [own]", "[0.0100-0.0151]", "V3D-SLAM", "1 failed", "RPE, deg/s"):

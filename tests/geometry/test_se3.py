@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import invert, rigid, se3_exp, se3_log
+from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
@@ -75,10 +75,10 @@ def test_convention_tangent_vector_is_translation_then_rotation() -> None:
 
 def test_orthonormalise_returns_the_nearest_rotation() -> None:
     T = se3_exp(tangents(2.0))
-    torch.testing.assert_close(rigid(T), T, rtol=0, atol=1e-14)
+    torch.testing.assert_close(orthonormalise(T), T, rtol=0, atol=1e-14)
     perturbed = T.clone()
     perturbed[:, :3, :3] += 1e-3 * torch.sin(torch.arange(64 * 9, dtype=torch.float64)).reshape(64, 3, 3)
-    nearest = rigid(perturbed)
+    nearest = orthonormalise(perturbed)
     R = nearest[:, :3, :3]
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(64, 3, 3), rtol=0, atol=1e-14)
     torch.testing.assert_close(nearest, T, rtol=0, atol=5e-3)
@@ -93,7 +93,7 @@ def test_orthonormalised_chain_of_poses_stays_rigid() -> None:
     step = se3_exp(1e-2 * tangents(1.0, 1)[0])
     step[3, 3] += 2.2e-16
     for _ in range(1000):
-        relative = rigid(step @ pose @ invert(keyframe))
+        relative = orthonormalise(step @ pose @ invert(keyframe))
         pose = relative @ keyframe
     assert pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     identity = torch.eye(3, dtype=torch.float64)

@@ -100,16 +100,18 @@ def test_voxel_index_of_each_point(dtype: torch.dtype) -> None:
     points, valid = random_clouds(3, 4000, dtype=dtype)
     valid[1, 20:] = False  # the voxels of this cloud are mostly padding
     voxels = voxel_pool(points, valid, 0.05)
-    assert voxels.owner.shape == valid.shape and voxels.owner.dtype == torch.int64
-    assert torch.equal(voxels.owner >= 0, valid) and voxels.owner[~valid].eq(-1).all()
+    assert voxels.voxel_index.shape == valid.shape and voxels.voxel_index.dtype == torch.int64
+    assert torch.equal(voxels.voxel_index >= 0, valid) and voxels.voxel_index[~valid].eq(-1).all()
     for b in range(3):
         cells = pd.DataFrame(np.floor(points[b, valid[b]].numpy() / np.asarray(0.05, points.numpy().dtype)))
-        np.testing.assert_array_equal(voxels.owner[b, valid[b]].numpy(), cells.groupby([0, 1, 2]).ngroup())
+        np.testing.assert_array_equal(voxels.voxel_index[b, valid[b]].numpy(), cells.groupby([0, 1, 2]).ngroup())
 
 
 def test_voxel_index_of_padding_is_minus_one() -> None:
     for batch, count in [(0, 5), (2, 0), (2, 5)]:
-        voxel_index = voxel_pool(torch.zeros(batch, count, 3), torch.zeros(batch, count, dtype=torch.bool), 0.1).owner
+        voxel_index = voxel_pool(
+            torch.zeros(batch, count, 3), torch.zeros(batch, count, dtype=torch.bool), 0.1
+        ).voxel_index
         assert torch.equal(voxel_index, torch.full((batch, count), -1))
 
 

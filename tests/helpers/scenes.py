@@ -395,13 +395,13 @@ class ObjectStage:
         self.instances = instances.concatenate(unlabelled)
         clouds = self._back_project(depth if cloud_depth is None else cloud_depth, self.instances)
         result = self._classify(self.instances, clouds, view, newly_occupied, self.feature_support)
-        self._free_space_check.remember(view)
+        self._free_space_check.add_view(view)
         return result
 
     def move_world(self, T_new_old: Tensor) -> None:
         """Apply a correction of the world."""
-        self._classify.tracker.move_world(T_new_old)
-        self._free_space_check.move_world(T_new_old)
+        self._classify.tracker.apply_world_correction(T_new_old)
+        self._free_space_check.apply_world_correction(T_new_old)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of all parts."""

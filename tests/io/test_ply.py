@@ -16,7 +16,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.io.ply import write_ply
 from v3d_torch.types import Trajectory
-from v3d_torch.viz.camera_path import STATUS_COLOURS, CameraPath, camera_path
+from v3d_torch.viz.camera_path import PATH_COLOURS, CameraPath, make_camera_path
 
 CAMERA = PinholeCamera(fx=500.0, fy=510.0, cx=300.0, cy=250.0)
 
@@ -65,7 +65,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def drawn(frames: int = 10, keyframes: tuple[int, ...] = (0, 6), statuses: list[str] | None = None) -> CameraPath:
     trajectory = way(frames)
     T_wk = trajectory.T_wc[list(keyframes)]
-    return camera_path(trajectory, statuses or frames * ["tracked"], T_wk, list(keyframes), CAMERA)
+    return make_camera_path(trajectory, statuses or frames * ["tracked"], T_wk, list(keyframes), CAMERA)
 
 
 def way(frames: int) -> Trajectory:
@@ -115,7 +115,7 @@ def test_colours_tell_time_and_trouble() -> None:
     assert path.colours.shape == path.points.shape and path.colours.dtype == torch.uint8
     for row, status in enumerate(statuses):
         timed = [round(255 * value) for value in colormaps["viridis"](row / 9)[:3]]
-        assert path.colours[row].tolist() == (timed if status == "tracked" else rgb(STATUS_COLOURS[status])), row
+        assert path.colours[row].tolist() == (timed if status == "tracked" else rgb(PATH_COLOURS[status])), row
     for frame, colours in zip((0, 6, 9), path.colours[10:].reshape(3, 6, 3), strict=True):
         assert torch.equal(colours, path.colours[frame].expand(6, 3))
 
@@ -123,8 +123,8 @@ def test_colours_tell_time_and_trouble() -> None:
 def test_keyframes_of_an_earlier_run_are_grey() -> None:
     trajectory = way(3)
     T_wk: Tensor = trajectory.T_wc
-    path = camera_path(trajectory, 3 * ["tracked"], T_wk, [-1, -1, 2], CAMERA)
-    assert path.colours[3:15].unique(dim=0).tolist() == [rgb(STATUS_COLOURS["earlier"])]
+    path = make_camera_path(trajectory, 3 * ["tracked"], T_wk, [-1, -1, 2], CAMERA)
+    assert path.colours[3:15].unique(dim=0).tolist() == [rgb(PATH_COLOURS["earlier"])]
     assert torch.equal(path.colours[15], path.colours[2])
 
 

@@ -19,7 +19,7 @@ from v3d_torch.mapping.bundle_adjustment import (
     bundle_adjust,
 )
 from v3d_torch.optim.levenberg_marquardt import huber
-from v3d_torch.optim.reprojection import reprojection
+from v3d_torch.optim.reprojection import reprojection_residuals
 from v3d_torch.optim.schur import solve_normal_equations
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
@@ -67,7 +67,7 @@ class Scene:
 def residuals(T_cw: Tensor, points: Tensor, observations: Observations) -> Tensor:
     T = T_cw[observations.pose]
     in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
-    return reprojection(in_camera, observations, CAMERA)
+    return reprojection_residuals(in_camera, observations, CAMERA)
 
 
 def test_step_equals_dense_solution() -> None:
@@ -83,7 +83,7 @@ def test_step_equals_dense_solution() -> None:
     by_pose, by_point = torch.autograd.functional.jacobian(moved, zeros)
     r = moved(*zeros)
     J = torch.cat([by_pose.reshape(-1, 12), by_point.reshape(-1, 36)], dim=1)
-    _, weights = huber((r * r).sum(dim=-1), scene.observations.limit)
+    _, weights = huber((r * r).sum(dim=-1), scene.observations.chi2_threshold)
     weighted = (J * weights.repeat_interleave(3)[:, None]).T
     H = weighted @ J
     expected = torch.linalg.solve(H + damping * H.diagonal().diag(), -weighted @ r.flatten())
@@ -118,7 +118,7 @@ def test_profile_is_that_of_the_cost_adjusted_anew() -> None:
 
 def test_same_optimum_as_scipy() -> None:
     scene = Scene(poses=3, points=12, seen_by=3)
-    limit = scene.observations.limit
+    limit = scene.observations.chi2_threshold
 
     def unpack(x: np.ndarray) -> tuple[Tensor, Tensor]:
         numbers = torch.from_numpy(x)
@@ -154,7 +154,7 @@ def test_same_optimum_as_gtsam() -> None:
     seen = scene.observations
     for m in range(seen.pose.shape[0]):
         (u, v), w, sigma = seen.uv[m].tolist(), float(seen.inverse_depth[m]), float(seen.pixel_sigma[m])
-        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(seen.limit[m].sqrt()))
+        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(seen.chi2_threshold[m].sqrt()))
         keys = int(seen.pose[m]), 1000 + int(seen.point[m])
         if w > 0:
             noise = gtsam.noiseModel.Gaussian.Covariance(A @ np.diag([sigma**2, sigma**2, DEPTH_SIGMA**2]) @ A.T)
@@ -196,7 +196,7 @@ def test_outliers_do_not_matter_and_are_found() -> None:
     result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed)
     clean = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
     assert se3_log(result.T_cw @ invert(clean.T_cw)).abs().max() < 0.005
-    outlier = result.chi2 > observations.limit
+    outlier = result.chi2 > observations.chi2_threshold
     assert outlier[wrong].double().mean() > 0.99
     assert outlier[~wrong].double().mean() < 0.15
 

@@ -18,7 +18,6 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.features.features import Features
-from v3d_torch.slam import PREFETCHED_FRAMES
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Loop
 from v3d_torch.mapping.map_columns import to_columns
@@ -28,7 +27,7 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.slam import V3DSLAM
+from v3d_torch.slam import PREFETCHED_FRAMES, V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
 FEW = ["segmentation.source=none", "features.count=800"]  # enough for a wall of noise, and three times as fast

@@ -80,7 +80,7 @@ def test_misalignment_grows_with_the_rotation_rate() -> None:
     depth = torch.full((1, CAMERA.height, CAMERA.width), WALL)
     check = FreeSpaceCheck(FreeSpaceConfig(depth_sync_error=0.02), CAMERA)
     assert check.make_view(0.0, depth, HERE).misalignment == 0  # no earlier view
-    check.remember(view())
+    check.add_view(view())
     assert check.make_view(0.1, depth, HERE).misalignment == 0
     assert check.make_view(0.1, depth, turned(3.0)).misalignment == round(math.radians(0.6) * CAMERA.fx)
     assert check.make_view(0.1, depth, turned(60.0)).misalignment == round(math.radians(12.0) * CAMERA.fx)
@@ -279,7 +279,7 @@ def check_with(*views: DepthView, **config: object) -> FreeSpaceCheck:
     """Return a free-space check with stored views."""
     check = FreeSpaceCheck(FreeSpaceConfig(**config), CAMERA)
     for observed in views:
-        check.remember(observed)
+        check.add_view(observed)
     return check
 
 
@@ -365,7 +365,7 @@ def test_disabled_check_compares_nothing() -> None:
 
 def test_view_with_guessed_pose_is_not_compared() -> None:
     check, now = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
-    assert check(now, trusted=False).appeared.numel() == 0
+    assert check(now, pose_known=False).appeared.numel() == 0
     assert check(now).appeared.shape[0] == 2
 
 
@@ -383,7 +383,7 @@ def test_box_appears_for_the_time_of_each_baseline(rate: int) -> None:
                 assert row.isnan().all()
             else:
                 assert (box(row) == expected).all() and (around(row) == 0).all()
-        check.remember(now)
+        check.add_view(now)
 
 
 def test_views_older_than_the_longest_baseline_are_dropped() -> None:
@@ -391,7 +391,7 @@ def test_views_older_than_the_longest_baseline_are_dropped() -> None:
     for frame in range(100):
         observed = view(at=frame / 10)
         references.append(weakref.ref(observed))
-        check.remember(observed)
+        check.add_view(observed)
     del observed
     gc.collect()
     assert 10 <= sum(ref() is not None for ref in references) <= 13
@@ -427,7 +427,7 @@ def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> No
     check = check_with(view(at=0.0), view(WITH_BOX, at=0.6))
     expected = check(view(WITH_BOX, at=0.9)).appeared
     assert (box(expected[0]) == 0).all() and (box(expected[1]) == 1).all()
-    check.move_world(T_new_old)
+    check.apply_world_correction(T_new_old)
     appeared = check(view(WITH_BOX, at=0.9, T_wc=T_new_old)).appeared
     torch.testing.assert_close(appeared, expected, rtol=0, atol=0, equal_nan=True)
 
@@ -479,6 +479,6 @@ def test_state_dict_continues_with_identical_results() -> None:
         torch.testing.assert_close(
             original(current).appeared, continued(other).appeared, rtol=0, atol=0, equal_nan=True
         )
-        original.remember(current)
-        continued.remember(other)
+        original.add_view(current)
+        continued.add_view(other)
     assert not original(view(WITH_BOX, at=1.8)).appeared.isnan().all()

@@ -546,7 +546,7 @@ def test_world_correction_moves_the_whole_track(xi: tuple[float, ...]) -> None:
         T_wc = HERE.clone()
         T_wc[2, 3] = -0.02 * frame
         if frame == 4:
-            corrected.tracker.move_world(T_new_old)
+            corrected.tracker.apply_world_correction(T_new_old)
         depth, instances = render(boards, T_wc)
         clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
         arguments = (frame / 30, instances, clouds, depth)

@@ -40,11 +40,11 @@ def test_camera_motion_is_compensated_by_the_transform() -> None:
     assert expected.deforming.tolist() == [False, True]
     assert module(*in_camera).deforming.all()  # without the transform everything moves
     for T in (T_ba, T_ba.expand(2, 4, 4)):
-        result = module(*in_camera, T_now_then=T)
+        result = module(*in_camera, T_current_previous=T)
         torch.testing.assert_close(result.distance, expected.distance, atol=1e-12, rtol=0)
         assert torch.equal(result.deforming, expected.deforming)
     coarse = module(
-        *(points.float() for points in in_camera), T_now_then=T_ba
+        *(points.float() for points in in_camera), T_current_previous=T_ba
     )  # clouds can be float32 with float64 poses
     assert coarse.distance.dtype == torch.float32
     torch.testing.assert_close(coarse.distance.double(), expected.distance, atol=1e-6, rtol=0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
-from v3d_torch.optim.reprojection import Measurements, reprojection
+from v3d_torch.optim.reprojection import Measurements, reprojection_residuals
 
 
 def refine(T_cw: Tensor, points: Tensor, measured: Measurements) -> PoseRefinement:
@@ -30,7 +30,7 @@ def test_refined_pose_equals_the_optimum_of_scipy() -> None:
 
     def residuals(xi: np.ndarray) -> np.ndarray:
         T = se3_exp(torch.from_numpy(xi)) @ T_cw
-        return reprojection(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)[inliers].flatten().numpy()
+        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)[inliers].flatten().numpy()
 
     best = scipy.optimize.least_squares(residuals, np.zeros(6), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     expected = se3_exp(torch.from_numpy(best.x)) @ T_cw

@@ -7,7 +7,7 @@ from helpers.measured_landmarks import CAMERA, measure_landmarks
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.optim.reprojection import Measurements, reprojection, reprojection_jacobian
+from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian, reprojection_residuals
 
 
 def test_convention_residuals_are_projection_minus_measurement() -> None:
@@ -18,7 +18,7 @@ def test_convention_residuals_are_projection_minus_measurement() -> None:
         inverse_depth_sigma=0.1,
     )
     points = torch.tensor([[0.01, 0.02, 1.0]] * 2, dtype=torch.float64)
-    residuals = reprojection(points, measured, CAMERA)
+    residuals = reprojection_residuals(points, measured, CAMERA)
     expected = [[535.4 * 0.01 / 2, 539.2 * 0.02 / 2, 0.5 / 0.1], [535.4 * 0.01 / 2, 539.2 * 0.02 / 2, 0.0]]
     torch.testing.assert_close(residuals, torch.tensor(expected, dtype=torch.float64))
 
@@ -28,7 +28,7 @@ def test_jacobian_equals_autograd() -> None:
 
     def residuals(xi: Tensor) -> Tensor:
         T = se3_exp(xi) @ T_cw
-        return reprojection(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)
+        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)
 
     expected = torch.autograd.functional.jacobian(residuals, torch.zeros(6, dtype=torch.float64))
     jacobian = reprojection_jacobian(points @ T_cw[:3, :3].T + T_cw[:3, 3], measured, CAMERA)

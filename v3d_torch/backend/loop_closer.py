@@ -17,7 +17,7 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
-from v3d_torch.tracking.map_tracker import MapTracker, Tracking
+from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 
 _MIN_SHARED_LANDMARKS = 30
 """Number of shared landmarks from which two keyframes are joined in the pose graph. ORB-SLAM2 requires 100 for its
@@ -34,7 +34,7 @@ class PlaceMatch:
     """
 
     keyframe: Keyframe
-    tracking: Tracking
+    tracking: MapTracking
 
 
 @dataclass(frozen=True)

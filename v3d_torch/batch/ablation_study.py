@@ -12,17 +12,24 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
-from v3d_torch.runs.request import RunRequest
-from v3d_torch.runs.result_folder import make_result_folder
-from v3d_torch.runs.run import Run
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError, OutputError
-from v3d_torch.evaluation.ablation import LEGEND, PAPER_SAYS, VARIANTS, csv_text, markdown, screen_table
+from v3d_torch.evaluation.ablation import (
+    LEGEND,
+    PAPER_RESULTS,
+    VARIANTS,
+    format_csv,
+    format_markdown,
+    make_screen_table,
+)
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
+from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import keep_upright, make_instance_source
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
@@ -94,13 +101,13 @@ def run_ablation_study(
                 metrics, failure = _run(sequence, segment, config, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 console.print(str(outcomes[-1]), markup=False)
-                write_text(folder / "ablation.md", markdown(outcomes, _NOTE))
-                write_text(folder / "ablation.csv", csv_text(outcomes))
-            console.print(screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
+                write_text(folder / "ablation.md", format_markdown(outcomes, _NOTE))
+                write_text(folder / "ablation.csv", format_csv(outcomes))
+            console.print(make_screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
     except KeyboardInterrupt as interrupt:
         done, total = len(outcomes), len(configs) * len(sequences)
         raise InputError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
-    console.print(f"{LEGEND}\n{PAPER_SAYS}", markup=False)
+    console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
     console.print(f"results: {folder}", markup=False)
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
         raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")

@@ -12,7 +12,7 @@ from rich.table import Table
 from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.summary import csv_text, latex, markdown, screen_tables
+from v3d_torch.evaluation.summary import format_csv, format_latex, format_markdown, make_screen_tables
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.types import TrackingStatus
 
@@ -93,13 +93,13 @@ class BatchRecord:
         Raises:
             OutputError: If the folder is not writable or the disk is full.
         """
-        write_text(self.folder / "summary.md", markdown(self.outcomes))
-        write_text(self.folder / "summary.tex", latex(self.outcomes))
-        write_text(self.folder / "summary.csv", csv_text(self.outcomes))
+        write_text(self.folder / "summary.md", format_markdown(self.outcomes))
+        write_text(self.folder / "summary.tex", format_latex(self.outcomes))
+        write_text(self.folder / "summary.csv", format_csv(self.outcomes))
 
     def screen_tables(self) -> list[Table]:
         """Return the summary as tables for the screen."""
-        return screen_tables(self.outcomes)
+        return make_screen_tables(self.outcomes)
 
 
 def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:
@@ -122,7 +122,7 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         "sequence": outcome.sequence,
         "config": outcome.config,
         "seed": outcome.seed,
-        **{key.replace(".", "_"): outcome.figure(key) for key in METRIC_TYPES},
+        **{key.replace(".", "_"): outcome.get_metric(key) for key in METRIC_TYPES},
         "failure": outcome.failure,
         "path": job.folder.relative_to(folder).as_posix(),
     }

@@ -13,19 +13,25 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_networks
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.runner import check_resume, run_missing_jobs
-from v3d_torch.runs.console import open_sequence, wide_console
-from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.config.loading import FULL
 from v3d_torch.datasets import PAPER_SEQUENCES, RGBDSequence, short_name
-from v3d_torch.datasets.locate import data_folder, stored_path
+from v3d_torch.datasets.locate import data_folder, find_stored
 from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.evaluation import ablation
-from v3d_torch.evaluation.tables import screen_table
-from v3d_torch.evaluation.tables import latex_table, markdown_table
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.summary import LEGEND, PACKAGES, csv_text, latex, markdown, screen_tables
+from v3d_torch.evaluation.summary import (
+    LATEX_PACKAGES,
+    LEGEND,
+    format_csv,
+    format_latex,
+    format_markdown,
+    make_screen_tables,
+)
+from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_table
 from v3d_torch.io.files import write_text
+from v3d_torch.runs.console import open_sequence, wide_console
+from v3d_torch.runs.result_folder import make_result_folder
 
 TABLE_CONFIGS = (FULL, "paper", "baseline")
 """Default configurations in the paper's tables."""
@@ -107,21 +113,28 @@ class ReproductionRecord(BatchRecord):
         Raises:
             OutputError: If the folder is not writable or the disk is full.
         """
-        write_text(self.folder / "summary.md", markdown(self._table_outcomes, self._absent))
-        write_text(self.folder / "summary.tex", latex(self._table_outcomes, self._absent))
-        write_text(self.folder / "summary.csv", csv_text(self._table_outcomes, self._absent))
-        if (table := ablation.overview(self._study_outcomes, self._absent)) is not None:
-            document = [ablation.markdown(self._study_outcomes), *markdown_table(table), "", ablation.TIMES_FULL]
-            legend = f"{LEGEND} {ablation.TIMES_FULL}"
+        write_text(self.folder / "summary.md", format_markdown(self._table_outcomes, self._absent))
+        write_text(self.folder / "summary.tex", format_latex(self._table_outcomes, self._absent))
+        write_text(self.folder / "summary.csv", format_csv(self._table_outcomes, self._absent))
+        if (table := ablation.make_overview_table(self._study_outcomes, self._absent)) is not None:
+            document = [
+                ablation.format_markdown(self._study_outcomes),
+                *format_markdown_table(table),
+                "",
+                ablation.RATIO_LEGEND,
+            ]
+            legend = f"{LEGEND} {ablation.RATIO_LEGEND}"
             write_text(self.folder / "ablation.md", "\n".join(document) + "\n")
-            write_text(self.folder / "ablation.tex", "\n".join([PACKAGES, *latex_table(table, legend)]) + "\n")
-            write_text(self.folder / "ablation.csv", ablation.csv_text(self._study_outcomes))
+            write_text(
+                self.folder / "ablation.tex", "\n".join([LATEX_PACKAGES, *format_latex_table(table, legend)]) + "\n"
+            )
+            write_text(self.folder / "ablation.csv", ablation.format_csv(self._study_outcomes))
 
     def screen_tables(self) -> list[Table]:
         """Return the paper's tables and that of the study for the screen."""
-        table = ablation.overview(self._study_outcomes, self._absent)
-        shown = screen_tables(self._table_outcomes, self._absent)
-        return [*shown, *([screen_table(table)] if table is not None else [])]
+        table = ablation.make_overview_table(self._study_outcomes, self._absent)
+        shown = make_screen_tables(self._table_outcomes, self._absent)
+        return [*shown, *([make_screen_table(table)] if table is not None else [])]
 
 
 def describe_missing(missing: Sequence[str], folder: Path, reason: str | None) -> str:
@@ -156,7 +169,7 @@ def _open_paper_sequences(
     reason: str | None = None
     for full_name in PAPER_SEQUENCES:
         name = short_name(full_name)
-        if not download and stored_path(name, data_root) is None:
+        if not download and find_stored(name, data_root) is None:
             missing.append(full_name)
             continue
         try:

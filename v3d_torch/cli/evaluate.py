@@ -43,11 +43,11 @@ def main(
     from v3d_torch.datasets.tum_trajectory import read_trajectory
     from v3d_torch.errors import InputError, V3DError
     from v3d_torch.evaluation import evaluate
-    from v3d_torch.evaluation.paper_tables import paper_sequence, paper_table
+    from v3d_torch.evaluation.paper_tables import find_paper_sequence, make_paper_table
 
     try:
         truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)
-        if sequence is not None and paper_sequence(sequence) is None:
+        if sequence is not None and find_paper_sequence(sequence) is None:
             raise InputError(f"--sequence {sequence}: is not in the paper's tables; use a name such as fr3/w/xyz")
         try:
             evaluation = evaluate(truth, poses, max_time_difference=max_difference, rpe_delta=delta, frames=frames)
@@ -65,8 +65,8 @@ def main(
     console.print(_error_table(evaluation))
     for note in evaluation.notes:
         console.print(f"note: {note}")
-    name = sequence or paper_sequence(groundtruth.as_posix()) or paper_sequence(estimate.as_posix())
-    if name is not None and (table := paper_table(name, evaluation)) is not None:
+    name = sequence or find_paper_sequence(groundtruth.as_posix()) or find_paper_sequence(estimate.as_posix())
+    if name is not None and (table := make_paper_table(name, evaluation)) is not None:
         console.print(table)
 
 

@@ -10,13 +10,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.runs.stage_table import stage_table
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, changed, find_config, load_config
 from v3d_torch.datasets import RGBDStream, open_source
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
-from v3d_torch.evaluation.paper_tables import paper_table
+from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.pipeline import Pipeline
@@ -26,6 +25,7 @@ from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.stage_table import stage_table
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.viz.viewer import make_viewer
 
@@ -179,7 +179,7 @@ def _print_summary(
     """
     record = pipeline.record
     console.print(_summary_table(pipeline, evaluation))
-    if evaluation is not None and (table := paper_table(pipeline.sequence.name, evaluation)) is not None:
+    if evaluation is not None and (table := make_paper_table(pipeline.sequence.name, evaluation)) is not None:
         console.print(table)
     if display.profile and record.frames:
         console.print(stage_table(record))
@@ -218,7 +218,7 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")
         if evaluation.rpe is not None:
             table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
-    if (masks := record.mask_evaluation.scores()) is not None:
+    if (masks := record.mask_evaluation.compute_scores()) is not None:
         fractions = {"moving": masks.moving_left_out, "static": masks.static_left_out}
         texts = [f"{value:.1%} of the {name} pixels" for name, value in fractions.items() if value is not None]
         table.add_row("masked", ", ".join(texts))

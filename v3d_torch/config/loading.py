@@ -47,7 +47,9 @@ def find_config(name: StrPath) -> Path:
     with suppress(OSError):  # names can be too long for a path
         if (path := expand_user(name)).is_file():
             return path
-    raise ConfigError(f"{name}: is neither the name of a configuration ({', '.join(CONFIGS)}) nor a YAML file; check name or path")
+    raise ConfigError(
+        f"{name}: is neither the name of a configuration ({', '.join(CONFIGS)}) nor a YAML file; check name or path"
+    )
 
 
 def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> Config:

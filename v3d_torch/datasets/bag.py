@@ -13,8 +13,8 @@ from torch import Tensor
 
 from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.bag_topics import Topics, choose_topics
-from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
-from v3d_torch.datasets.lists import MAX_DIFFERENCE
+from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.stored import Cursor, StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -71,10 +71,10 @@ class BagSequence(StoredSequence):
                 " depth that is registered to colour (align_depth), or give --depth-topic if it is so all the same"
             )
         colour, depth = (list(stamps[topic]) for topic in (topics.rgb, topics.depth))
-        pairs = associate(colour, depth, MAX_DIFFERENCE)
+        pairs = associate(colour, depth, MAX_STAMP_DIFFERENCE)
         if not pairs:
             raise InputError(
-                f"{path}: no image on {topics.rgb} lies within {MAX_DIFFERENCE} s of one on {topics.depth};"
+                f"{path}: no image on {topics.rgb} lies within {MAX_STAMP_DIFFERENCE} s of one on {topics.depth};"
                 " choose others with --rgb-topic and --depth-topic"
             )
         delays = [depth[j] - colour[i] for i, j in pairs]
@@ -87,7 +87,7 @@ class BagSequence(StoredSequence):
         i, j = self._pairs[index]
         image = colour_from(self._colours[i][-1], f"{self.path}: {self.topics.rgb}")
         depth = depth_from(self._depths[j][-1], self.camera.depth_scale, f"{self.path}: {self.topics.depth}")
-        return self._registered(
+        return self._check_registered(
             (f"{self.path}: {self.topics.rgb}", image),
             (f"{self.path}: {self.topics.depth}", depth),
             "name depth that is registered to colour with --depth-topic",
@@ -188,4 +188,4 @@ def _read_camera(path: Path, topics: Topics) -> PinholeCamera:
             " rectified images, or give --camera with k1, k2, p1, p2, k3"
         )
     size = {"width": info.width, "height": info.height, "depth_scale": _MILLIMETRES}
-    return checked_camera(fields | size | {"distortion": (lens + [0.0] * 5)[:5]}, f"{path}: {topics.info}")
+    return camera_from_fields(fields | size | {"distortion": (lens + [0.0] * 5)[:5]}, f"{path}: {topics.info}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.encodings import COLOURS, to_rgb
-from v3d_torch.datasets.images import decode_colour, decode_depth, metres
+from v3d_torch.datasets.images import decode_colour, decode_depth, depth_to_metres
 from v3d_torch.errors import InputError
 
 _DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -63,7 +63,7 @@ def depth_from(message: Any, depth_scale: float, source: str) -> Tensor:
         raise InputError(f"{source}: holds {message.encoding} images, not depth; name another with --depth-topic")
     dtype = np.dtype((">" if message.is_bigendian else "<") + _DEPTHS[message.encoding])
     pixels = _rows(message, dtype, source)
-    return _measured(pixels) if dtype.kind == "f" else metres(pixels, depth_scale)
+    return _measured(pixels) if dtype.kind == "f" else depth_to_metres(pixels, depth_scale)
 
 
 def _rows(message: Any, pixel: np.dtype[Any], source: str) -> NDArray[Any]:
@@ -82,12 +82,12 @@ def _rows(message: Any, pixel: np.dtype[Any], source: str) -> NDArray[Any]:
 def _decompressed(message: Any, depth_scale: float, source: str) -> Tensor:
     content = message.data.tobytes()
     if "compressedDepth" not in message.format:
-        return metres(decode_depth(content, source), depth_scale)
+        return depth_to_metres(decode_depth(content, source), depth_scale)
     if "rvl" in message.format.lower():
         raise InputError(f"{source}: depth in RVL cannot be read; republish it as PNG or raw and record that")
     units = decode_depth(content[_HEADER:], source)
     if not message.format.startswith("32FC1"):
-        return metres(units, depth_scale)
+        return depth_to_metres(units, depth_scale)
     _, a, b = struct.unpack("<iff", content[:_HEADER])
     inverse = units.astype(np.float32)  # depth is a / (inverse - b), and 0 no measurement
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -9,7 +9,7 @@ import torch
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.tum import TUMSequence, is_tum
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import rigid
+from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(
@@ -67,5 +67,5 @@ def is_bonn(path: Path) -> bool:
 
 def camera_poses(markers: Trajectory) -> Trajectory:
     """Convert poses of the markers to poses of the camera: ``T_ROS^-1 T T_ROS T_markers_camera``, without the scale."""
-    T_markers_camera = rigid(_T_MARKERS_CAMERA)
+    T_markers_camera = orthonormalise(_T_MARKERS_CAMERA)
     return Trajectory(markers.stamps, _T_ROS.T @ markers.T_wc @ _T_ROS @ T_markers_camera)

@@ -123,7 +123,7 @@ def _from_yaml(text: str, source: str) -> PinholeCamera:
         raise InputError(
             f"{source}: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"
         )
-    return checked_camera(tree, source)
+    return camera_from_fields(tree, source)
 
 
 def _from_numbers(text: str, source: str) -> PinholeCamera:
@@ -145,10 +145,10 @@ def _from_numbers(text: str, source: str) -> PinholeCamera:
             " height, or a 3x3 camera matrix without skew"
         )
     fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, "depth_scale": depth_scale}
-    return checked_camera(fields, source)
+    return camera_from_fields(fields, source)
 
 
-def checked_camera(fields: dict[Any, Any], source: str) -> PinholeCamera:
+def camera_from_fields(fields: dict[Any, Any], source: str) -> PinholeCamera:
     """Create a camera from unchecked fields.
 
     Args:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.image_files import list_images, stamp_in_name
-from v3d_torch.datasets.lists import MAX_DIFFERENCE, ImagePair
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import associate
@@ -71,10 +71,10 @@ def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Pat
     """Pair colour and depth images by the rules of `ImageFolder`."""
     colour_by_stamp, depth_by_stamp = _by_stamp(colour), _by_stamp(depth)
     if len(colour_by_stamp) == len(colour) and len(depth_by_stamp) == len(depth):
-        indices = associate(list(colour_by_stamp), list(depth_by_stamp), MAX_DIFFERENCE)
+        indices = associate(list(colour_by_stamp), list(depth_by_stamp), MAX_STAMP_DIFFERENCE)
         if not indices:
             raise InputError(
-                f"{folder}: no colour image is within {MAX_DIFFERENCE} s of a depth image; check that both belong to"
+                f"{folder}: no colour image is within {MAX_STAMP_DIFFERENCE} s of a depth image; check that both belong to"
                 " the same recording"
             )
         return [(list(colour_by_stamp.values())[i], list(depth_by_stamp.values())[j]) for i, j in indices]

@@ -67,7 +67,7 @@ def read_depth(path: Path, depth_scale: float) -> Tensor:
         units = io.read_image_png_u16(str(path), "mono")[..., 0]
     except Exception:
         units = _decode_depth_with_pillow(path, path)
-    return metres(units, depth_scale)
+    return depth_to_metres(units, depth_scale)
 
 
 def decode_colour(content: bytes, source: object) -> Tensor:
@@ -107,7 +107,7 @@ def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
     return _decode_depth_with_pillow(BytesIO(content), source)
 
 
-def metres(units: NDArray[Any], depth_scale: float) -> Tensor:
+def depth_to_metres(units: NDArray[Any], depth_scale: float) -> Tensor:
     """Convert depth units to metres.
 
     Args:

@@ -24,7 +24,7 @@ _MAX_GAP = 10.0
 """Maximum median time between images, seconds. No trackable sequence has so few images; timestamps in milliseconds at
 30 Hz exceed this limit."""
 
-MAX_DIFFERENCE = 0.02
+MAX_STAMP_DIFFERENCE = 0.02
 """Maximum difference between the timestamps of a colour and a depth image of one frame, seconds: the default of the
 TUM benchmark's association tool."""
 
@@ -133,10 +133,10 @@ def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
                 f"{path.parent}: has no {path.name}; list the images of the sequence in {colour.name} and {depth.name}"
             )
     images, depths = read_image_list(colour), read_image_list(depth)
-    indices = associate([stamp for stamp, _ in images], [stamp for stamp, _ in depths], MAX_DIFFERENCE)
+    indices = associate([stamp for stamp, _ in images], [stamp for stamp, _ in depths], MAX_STAMP_DIFFERENCE)
     if not indices:
         raise InputError(
-            f"{colour.parent}: no timestamp in {colour.name} is within {MAX_DIFFERENCE} s of one in {depth.name};"
+            f"{colour.parent}: no timestamp in {colour.name} is within {MAX_STAMP_DIFFERENCE} s of one in {depth.name};"
             " check that both lists belong to the same recording"
         )
     return [
@@ -177,7 +177,7 @@ def _parse_stamp(word: str, path: Path, number: int) -> float:
 
 def _depth_delay(colour: float, depth: float) -> float:
     """Depth stamp minus colour stamp; 0 if the difference is so large that the stamps come from different clocks."""
-    return depth - colour if abs(depth - colour) <= MAX_DIFFERENCE else 0.0
+    return depth - colour if abs(depth - colour) <= MAX_STAMP_DIFFERENCE else 0.0
 
 
 def _sort_unique(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[float, _T]]:

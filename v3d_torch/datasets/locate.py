@@ -38,7 +38,7 @@ def find_or_download(name: str, *, data_root: Path | None, download: bool, progr
     """
     if not name:
         raise InputError("the sequence name is empty; pass a name, a folder or a file")
-    if (found := stored_path(name, data_root)) is not None:
+    if (found := find_stored(name, data_root)) is not None:
         return found
     full_name, folder = canonical_name(name), data_folder(data_root)
     if full_name is None:
@@ -55,7 +55,7 @@ def find_or_download(name: str, *, data_root: Path | None, download: bool, progr
         ) from error
 
 
-def stored_path(name: str, data_root: Path | None) -> Path | None:
+def find_stored(name: str, data_root: Path | None) -> Path | None:
     """Path of a sequence that is already on disk, with the search order of `find_or_download`; None if not found."""
     if (path := expand_user(name)).exists():
         return path

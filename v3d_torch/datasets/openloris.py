@@ -8,14 +8,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
 from v3d_torch.datasets.lists import pair_lists
 from v3d_torch.datasets.matrix_files import opencv_matrix, read_opencv_yaml
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, rigid
+from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.types import Trajectory
 
 _COLOUR = "d400_color_optical_frame"
@@ -64,7 +64,7 @@ def _read_camera(path: Path) -> PinholeCamera:
             f"{path}: has no {_COLOUR} with width, height and intrinsics; copy it again, or pass --camera"
         ) from error
     fields |= {"distortion": distortion + [0.0] * (5 - len(distortion)), "depth_scale": _DEPTH_SCALE}
-    return checked_camera(fields, str(path))
+    return camera_from_fields(fields, str(path))
 
 
 def _camera_poses(groundtruth: Path, calibration: Path) -> Trajectory:
@@ -88,7 +88,7 @@ def _find_transform(parent: str, child: str, path: Path) -> Tensor:
         raise InputError(
             f"{path}: has no transform from {child} to {parent}, the frame of groundtruth.txt; copy it again"
         )
-    return rigid(found[child])
+    return orthonormalise(found[child])
 
 
 def _read_transforms(path: Path) -> dict[tuple[str, str], Tensor]:

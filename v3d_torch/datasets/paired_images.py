@@ -49,7 +49,7 @@ class PairedImages(StoredSequence):
 
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         colour, depth = (self.folder / file for file in (self._pairs[index].colour, self._pairs[index].depth))
-        return self._registered(
+        return self._check_registered(
             (colour, self._read_colour(colour)), (depth, read_depth(depth, self.camera.depth_scale))
         )
 

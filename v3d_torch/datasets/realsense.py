@@ -15,7 +15,7 @@ from v3d_torch.datasets import realsense_device
 from v3d_torch.datasets.bag import topic_types
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.encodings import COLOURS, to_rgb
-from v3d_torch.datasets.images import metres
+from v3d_torch.datasets.images import depth_to_metres
 from v3d_torch.datasets.realsense_camera import camera_of, library, per_metre
 from v3d_torch.datasets.realsense_device import Device
 from v3d_torch.errors import InputError
@@ -102,7 +102,7 @@ class RealSenseStream:
         # The memory of both images is librealsense's, which uses it again: what is made of it is a copy.
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOURS[encoding][0])
         units = np.asanyarray(depth.get_data())
-        image, measured = to_rgb(encoding, pixels), metres(units, units_per_metre)
+        image, measured = to_rgb(encoding, pixels), depth_to_metres(units, units_per_metre)
         return RGBDFrame(index, stamp, image, measured, camera=self.camera)
 
 

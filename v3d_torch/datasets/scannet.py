@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, checked_camera, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
 from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
@@ -106,7 +106,7 @@ def _depth_camera(frames: Path, pair: ImagePair) -> PinholeCamera | None:
         colour_size = image_size(frames / pair.colour)
         K = _scale(K, width / colour_size[0], height / colour_size[1])
     fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
-    return checked_camera(fields | {"depth_scale": _DEPTH_SCALE}, str(source))
+    return camera_from_fields(fields | {"depth_scale": _DEPTH_SCALE}, str(source))
 
 
 def _read_camera_matrix(path: Path) -> NDArray[np.float64]:

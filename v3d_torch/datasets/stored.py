@@ -52,7 +52,7 @@ class StoredSequence(ABC):
         self.name = name.encode(errors="replace").decode()  # the name of a folder can be invalid UTF-8
         self.stamps: Tensor = torch.tensor(stamps, dtype=torch.float64)
         self.camera = camera
-        self._delays = delays or [0.0] * len(stamps)
+        self._depth_delays = delays or [0.0] * len(stamps)
         self.groundtruth: Trajectory | None = None
         self.groundtruth_error: InputError | None = None
         try:
@@ -89,7 +89,7 @@ class StoredSequence(ABC):
             raise IndexError(f"{self.name} has {len(self)} frames, index {index} is out of range")
         image, depth = self._read(index)
         stamp = float(self.stamps[index])
-        return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._delays[index])
+        return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._depth_delays[index])
 
     def check_first_frame(self, source: object) -> None:
         """Decode the first frame, so that an error common to all frames is reported before anything is computed.
@@ -112,7 +112,7 @@ class StoredSequence(ABC):
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         """Read the colour and depth image of an existing frame, in the format of `RGBDFrame`."""
 
-    def _registered(
+    def _check_registered(
         self,
         colour: tuple[object, Tensor],
         depth: tuple[object, Tensor],

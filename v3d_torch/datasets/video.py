@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.images import metres
-from v3d_torch.datasets.lists import MAX_DIFFERENCE
+from v3d_torch.datasets.images import depth_to_metres
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.stored import Cursor, StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
@@ -59,10 +59,10 @@ class VideoSequence(StoredSequence):
         own = choose_camera(camera, colour.parent)
         (times, cut), (depth_times, depth_cut) = _times(colour, fps, progress), _times(depth, fps, raw=True)
         self._cut = cut or depth_cut
-        self._pairs = associate(times, depth_times, MAX_DIFFERENCE)
+        self._pairs = associate(times, depth_times, MAX_STAMP_DIFFERENCE)
         if not self._pairs:
             raise InputError(
-                f"{colour}: no frame lies within {MAX_DIFFERENCE} s of one in {depth.name}; do they belong together?"
+                f"{colour}: no frame lies within {MAX_STAMP_DIFFERENCE} s of one in {depth.name}; do they belong together?"
             )
         super().__init__(path.resolve().stem, [times[i] for i, _ in self._pairs], own)
         self._colours = Cursor(lambda: _frames(colour))
@@ -82,8 +82,8 @@ class VideoSequence(StoredSequence):
         i, j = self._pairs[index]
         pixels, units = self._colours[i].retrieve()[1], self._depths[j].retrieve()[1]
         image = torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
-        depth = metres(units.squeeze(), self.camera.depth_scale)
-        return self._registered((self._colour, image), (self._depth, depth))
+        depth = depth_to_metres(units.squeeze(), self.camera.depth_scale)
+        return self._check_registered((self._colour, image), (self._depth, depth))
 
 
 def is_video(path: Path) -> bool:

@@ -14,8 +14,8 @@ from rich.table import Table
 from v3d_torch.config.loading import FULL
 from v3d_torch.evaluation.outcome import Outcome, collect_metric
 from v3d_torch.evaluation.paper_tables import HEADINGS
-from v3d_torch.evaluation.summary import error_tables
-from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, row, spread
+from v3d_torch.evaluation.summary import make_error_tables
+from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, format_median_and_range, markdown_row
 
 VARIANTS = (
     "baseline",
@@ -38,7 +38,7 @@ LEGEND = (
 )
 """Explanation of the columns."""
 
-PAPER_SAYS = (
+PAPER_RESULTS = (
     "The paper (Sec. IV-D) has no table of its ablation, but compares ATEs: without voting, 8 % lower than the baseline"
     " and four times that of the full system; without the intra-object stage (Chamfer distance), 6 % higher than that"
     " of the full system."
@@ -48,7 +48,7 @@ PAPER_SAYS = (
 PAPER_RATIOS: Mapping[str, float] = {"baseline": 4 / 0.92, "no_voting": 4.0, "no_chamfer": 1.06, FULL: 1.0}
 """ATE of a variant divided by the full system's ATE, from `PAPER_RESULTS`."""
 
-TIMES_FULL = (
+RATIO_LEGEND = (
     "Ratio to full: ATE divided by the full system's ATE, geometric mean over the sequences on which both were run;"
     " (paper): according to the paper's text."
 )
@@ -85,10 +85,10 @@ COLUMNS: Mapping[str, Column] = {
 """Columns of the tables by their key in ``metrics.json``."""
 
 
-def screen_table(outcomes: Sequence[Outcome]) -> Table:
+def make_screen_table(outcomes: Sequence[Outcome]) -> Table:
     """Return the results on one sequence for the screen, one row per variant, the best of each error in green."""
     headings, rows = _summarise(outcomes)
-    table = Table(title=f"Ablation on {escape(outcomes[0].sequence)}", caption=verdict(outcomes))
+    table = Table(title=f"Ablation on {escape(outcomes[0].sequence)}", caption=conclusion(outcomes))
     table.add_column("variant", no_wrap=True)
     for heading in headings:
         table.add_column(heading, justify="right", overflow="fold")
@@ -98,26 +98,26 @@ def screen_table(outcomes: Sequence[Outcome]) -> Table:
     return table
 
 
-def markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
+def format_markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
     """Return a Markdown document with one table per sequence, the best of each error in bold, and the failed runs.
 
     Args:
         outcomes: Outcomes of the runs.
         note: Remark on how the runs were made.
     """
-    lines = ["# Ablation", LEGEND, "", PAPER_SAYS, "", *([note] if note else [])]
+    lines = ["# Ablation", LEGEND, "", PAPER_RESULTS, "", *([note] if note else [])]
     for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
         headings, rows = _summarise(runs)
-        lines += ["", f"## {sequence}", f"Seeds: {len({run.seed for run in runs})}. {verdict(runs)}", ""]
-        lines += [row(["variant", *headings]), row(["---", *["---:"] * len(headings)])]
+        lines += ["", f"## {sequence}", f"Seeds: {len({run.seed for run in runs})}. {conclusion(runs)}", ""]
+        lines += [markdown_row(["variant", *headings]), markdown_row(["---", *["---:"] * len(headings)])]
         for variant, cells in rows.items():
-            lines.append(row([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
+            lines.append(markdown_row([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
         lines += ["", *(f"- {run}" for run in runs if run.failure is not None)]
     return "\n".join(lines) + "\n"
 
 
-def overview(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTable | None:
+def make_overview_table(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTable | None:
     """Return the ATE of all variants on all sequences, and its ratio to the full system's ATE.
 
     Args:
@@ -128,7 +128,9 @@ def overview(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTa
         Table with one column per variant. The last two rows are the geometric mean of the ratio, over the sequences on
         which both were run, and the ratio according to the paper. None if no run has an ATE.
     """
-    tables = [table for table in error_tables(outcomes, papers=(), absent=absent) if table.heading == HEADINGS["ate"]]
+    tables = [
+        table for table in make_error_tables(outcomes, papers=(), absent=absent) if table.heading == HEADINGS["ate"]
+    ]
     if not tables:
         return None
     (ate,) = tables
@@ -150,17 +152,17 @@ def _ratio_to_full(outcomes: Sequence[Outcome], variant: str) -> str:
     return f"{geometric_mean(ratios):.2f}" if ratios else "-"
 
 
-def csv_text(outcomes: Sequence[Outcome]) -> str:
+def format_csv(outcomes: Sequence[Outcome]) -> str:
     """Return all outcomes as CSV, one line per run."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["sequence", "variant", "seed", *COLUMNS, "failure"])
     for run in outcomes:
-        writer.writerow([run.sequence, run.config, run.seed, *(run.figure(key) for key in COLUMNS), run.failure])
+        writer.writerow([run.sequence, run.config, run.seed, *(run.get_metric(key) for key in COLUMNS), run.failure])
     return text.getvalue()
 
 
-def verdict(outcomes: Sequence[Outcome]) -> str:
+def conclusion(outcomes: Sequence[Outcome]) -> str:
     """Return a sentence on whether the full system has the lowest ATE on one sequence, or is within noise of it.
 
     Two variants are within noise of each other if their ranges over the seeds overlap. Values are rounded as in the
@@ -192,7 +194,7 @@ def _summarise(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[C
             lowest = format_lowest(medians.values(), column.form)
             for variant, values in measured.items():
                 best = column.is_error and bool(values) and format(medians[variant], column.form) == lowest
-                rows[variant].append(Cell(spread(values, column.form), best))
+                rows[variant].append(Cell(format_median_and_range(values, column.form), best))
     failed = {variant: sum(run.failure is not None for run in outcomes if run.config == variant) for variant in rows}
     if any(failed.values()):
         headings.append("failed")

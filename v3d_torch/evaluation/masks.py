@@ -109,7 +109,7 @@ class MaskEvaluation:
         for person, id_ in zip(people.tolist(), covering_ids(truth, people, objects).tolist(), strict=True):
             self._ids_in_view.setdefault(person, []).append((stamp, id_))
 
-    def scores(self) -> MaskScores | None:
+    def compute_scores(self) -> MaskScores | None:
         """Compute the scores of the added frames; None if no frame was added."""
         if not self._frames:
             return None

@@ -25,15 +25,15 @@ class Outcome:
     metrics: Mapping[str, Any]
     failure: str | None = None
 
-    def figure(self, place: str) -> float | None:
+    def get_metric(self, key: str) -> float | None:
         """Return a metric by its dotted key, such as ``ate.rmse``; None if it was not measured."""
         value: Any = self.metrics
-        for name in place.split("."):
+        for name in key.split("."):
             value = (value or {}).get(name)
         return value
 
     def __str__(self) -> str:
-        ate = self.figure("ate.rmse")
+        ate = self.get_metric("ate.rmse")
         score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth, not scored"
         result = score if self.failure is None else f"failed: {self.failure}"
         return f"{self.sequence}, {self.config}, seed {self.seed}: {result}"
@@ -41,5 +41,5 @@ class Outcome:
 
 def collect_metric(outcomes: Iterable[Outcome], key: str) -> list[float]:
     """Collect a metric of several runs, without the runs in which it was not measured."""
-    values = (outcome.figure(key) for outcome in outcomes)
+    values = (outcome.get_metric(key) for outcome in outcomes)
     return [value for value in values if value is not None]

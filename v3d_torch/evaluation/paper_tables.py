@@ -29,7 +29,7 @@ _RESULT = "this result"
 
 
 @cache
-def paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
+def load_paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
     """Return the numbers of the paper's tables as ``[metric][sequence][method]``.
 
     Metrics are ``ate`` (metres), ``rpe_trans`` (metres over 1 s) and ``rpe_rot`` (degrees over 1 s), sequences
@@ -44,7 +44,7 @@ def paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
     }
 
 
-def paper_sequence(name: str) -> str | None:
+def find_paper_sequence(name: str) -> str | None:
     """Find the sequence of the paper named by a text or by the path of a file.
 
     Args:
@@ -60,7 +60,7 @@ def paper_sequence(name: str) -> str | None:
     return short_name(found[0]) if len(found) == 1 else None
 
 
-def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
+def make_paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
     """Return a table of the paper's methods and a result on the same sequence, the best RMSE of each column in green.
 
     Args:
@@ -70,10 +70,10 @@ def paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
     Returns:
         The table; None if the paper does not evaluate the sequence.
     """
-    name = paper_sequence(sequence)
+    name = find_paper_sequence(sequence)
     if name is None:
         return None
-    scores = paper_scores()
+    scores = load_paper_scores()
     rows = {method: [scores[metric][name][method] for metric in HEADINGS] for method in scores["ate"][name]}
     rows[_RESULT] = _scores(evaluation)
     best = [

@@ -11,15 +11,15 @@ from statistics import median
 from rich.table import Table
 
 from v3d_torch.evaluation.outcome import Outcome, collect_metric
-from v3d_torch.evaluation.paper_tables import HEADINGS, paper_scores, paper_sequence
+from v3d_torch.evaluation.paper_tables import HEADINGS, find_paper_sequence, load_paper_scores
 from v3d_torch.evaluation.tables import (
     Cell,
     ErrorTable,
+    format_latex_table,
     format_lowest,
-    latex_table,
-    markdown_table,
-    screen_table,
-    spread,
+    format_markdown_table,
+    format_median_and_range,
+    make_screen_table,
 )
 
 METRIC_KEYS: Mapping[str, str] = {"ate": "ate.rmse", "rpe_trans": "rpe.trans.rmse", "rpe_rot": "rpe.rot.rmse"}
@@ -28,7 +28,7 @@ METRIC_KEYS: Mapping[str, str] = {"ate": "ate.rmse", "rpe_trans": "rpe.trans.rms
 LEGEND = "RMSE, median and [range] over the seeds; RPE over 1 s. The lowest value of a row is bold."
 """Explanation of the tables."""
 
-PACKAGES = "% \\usepackage{booktabs}"
+LATEX_PACKAGES = "% \\usepackage{booktabs}"
 """First line of a LaTeX file of tables: the packages that it requires, as a comment."""
 
 _FORMAT = ".4f"
@@ -37,7 +37,7 @@ _PAPER_NOTE = f"Methods marked{_PAPER_SUFFIX} were not run here: their values ar
 _SCREEN_METHODS = ("ORB-SLAM2", "V3D-SLAM")  # as many of the paper's methods as fit on a screen of 80 columns
 
 
-def error_tables(
+def make_error_tables(
     outcomes: Sequence[Outcome], papers: Sequence[str] | None = None, absent: Sequence[str] = ()
 ) -> list[ErrorTable]:
     """Return one table for each metric that was measured in at least one run.
@@ -55,26 +55,26 @@ def error_tables(
     return tables
 
 
-def markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
+def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     """Return a Markdown document with all tables and the runs that failed; see `make_error_tables`."""
     lines = ["# Summary", "", LEGEND]
-    tables = error_tables(outcomes, absent=absent)
+    tables = make_error_tables(outcomes, absent=absent)
     if any(method.endswith(_PAPER_SUFFIX) for table in tables for method in table.methods):
         lines += ["", _PAPER_NOTE]
-    lines += [line for table in tables for line in markdown_table(table)]
+    lines += [line for table in tables for line in format_markdown_table(table)]
     failed = [f"- {outcome}" for outcome in outcomes if outcome.failure is not None]
     lines += ["", "## Failed", "", *failed] if failed else []
     return "\n".join(lines) + "\n"
 
 
-def latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
+def format_latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     """Return all tables as LaTeX, which requires the package booktabs; see `make_error_tables`."""
-    tables = error_tables(outcomes, absent=absent)
-    lines = [PACKAGES, *(line for table in tables for line in latex_table(table, LEGEND))]
+    tables = make_error_tables(outcomes, absent=absent)
+    lines = [LATEX_PACKAGES, *(line for table in tables for line in format_latex_table(table, LEGEND))]
     return "\n".join(lines) + "\n"
 
 
-def csv_text(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
+def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     """Return all values as CSV, unrounded, one line per metric, sequence and method; see `make_error_tables`.
 
     The last column is the standard deviation of the errors, as in the paper's tables: the median over the seeds.
@@ -92,9 +92,9 @@ def csv_text(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     return text.getvalue()
 
 
-def screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[Table]:
+def make_screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[Table]:
     """Return the tables for the screen, with the first and the last method of the paper; see `make_error_tables`."""
-    return [screen_table(table) for table in error_tables(outcomes, _SCREEN_METHODS, absent)]
+    return [make_screen_table(table) for table in make_error_tables(outcomes, _SCREEN_METHODS, absent)]
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class _Result:
             return "not here"
         if self.seeds and self.failed == self.seeds:
             return "failed"
-        return spread(self.values, _FORMAT) + (f", {self.failed} failed" if self.failed else "")
+        return format_median_and_range(self.values, _FORMAT) + (f", {self.failed} failed" if self.failed else "")
 
 
 def _results(
@@ -141,8 +141,8 @@ def _results(
             values = collect_metric(runs, METRIC_KEYS[metric])
             deviations = collect_metric(runs, METRIC_KEYS[metric].replace("rmse", "std"))
             results.append(_Result(sequence, config, values, len(runs), failed, sequence in absent, deviations))
-        if (paper_name := paper_sequence(sequence)) is not None:
-            for method, score in paper_scores()[metric][paper_name].items():
+        if (paper_name := find_paper_sequence(sequence)) is not None:
+            for method, score in load_paper_scores()[metric][paper_name].items():
                 if papers is None or method in papers:
                     values, deviations = ([value] if value is not None else [] for value in score)
                     results.append(_Result(sequence, f"{method}{_PAPER_SUFFIX}", values, deviations=deviations))
@@ -153,7 +153,7 @@ def _order_sequences(sequences: Sequence[str], absent: Sequence[str]) -> list[st
     """Return each sequence once, in the given order; in the paper's order if some of its sequences are absent."""
     if not absent:
         return list(dict.fromkeys(sequences))
-    return [sequence for sequence in paper_scores()["ate"] if sequence in {*sequences, *absent}]
+    return [sequence for sequence in load_paper_scores()["ate"] if sequence in {*sequences, *absent}]
 
 
 def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:

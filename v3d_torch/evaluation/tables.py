@@ -39,7 +39,7 @@ class ErrorTable:
     rows: Mapping[str, tuple[Cell, ...]]
 
 
-def spread(values: Sequence[float], form: str) -> str:
+def format_median_and_range(values: Sequence[float], form: str) -> str:
     """Format the median of values, followed by their range unless all print the same.
 
     Args:
@@ -57,21 +57,21 @@ def format_lowest(values: Iterable[float], form: str) -> str:
     return format(min(values), form)
 
 
-def row(cells: Sequence[str]) -> str:
+def markdown_row(cells: Sequence[str]) -> str:
     """Format a row of a Markdown table."""
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
-def markdown_table(table: ErrorTable) -> list[str]:
+def format_markdown_table(table: ErrorTable) -> list[str]:
     """Return the lines of a Markdown section with the table, the best values in bold."""
-    lines = ["", f"## {table.heading}", "", row(["sequence", *table.methods])]
-    lines.append(row(["---", *["---:"] * len(table.methods)]))
+    lines = ["", f"## {table.heading}", "", markdown_row(["sequence", *table.methods])]
+    lines.append(markdown_row(["---", *["---:"] * len(table.methods)]))
     for sequence, cells in table.rows.items():
-        lines.append(row([sequence, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
+        lines.append(markdown_row([sequence, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
     return lines
 
 
-def latex_table(table: ErrorTable, legend: str) -> list[str]:
+def format_latex_table(table: ErrorTable, legend: str) -> list[str]:
     """Return the lines of a LaTeX table, the best values in bold. It requires the package booktabs."""
     lines = [
         "\\begin{table*}",
@@ -89,7 +89,7 @@ def latex_table(table: ErrorTable, legend: str) -> list[str]:
     return [*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table*}"]
 
 
-def screen_table(table: ErrorTable) -> Table:
+def make_screen_table(table: ErrorTable) -> Table:
     """Return the table for the screen, the best values in green."""
     shown = Table(title=f"{table.heading}, RMSE", box=box.SIMPLE_HEAD)
     shown.add_column("sequence", no_wrap=True)

@@ -118,7 +118,7 @@ def pixel_sigma(octave: Tensor, config: TrackingConfig, pyramid: FeaturesConfig)
     return config.pixel_sigma * pyramid.scale ** octave.to(torch.float64)
 
 
-def measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
+def to_measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
     """Convert features to measurements with their noise.
 
     Args:

@@ -36,7 +36,7 @@ class LocalMap:
 
 
 @dataclass(frozen=True)
-class Projection:
+class ProjectedLandmarks:
     """Predicted image positions of the V landmarks of a local map that are in view.
 
     Attributes:
@@ -46,8 +46,8 @@ class Projection:
         levels: Expected levels of the scale pyramid, int64, shape :math:`(V,)`.
     """
 
-    rows: Tensor
-    pixels: Tensor
+    indices: Tensor
+    uv: Tensor
     depth: Tensor
     levels: Tensor
 
@@ -82,7 +82,9 @@ class ProjectionMatcher:
         upper = [math.inf, camera.width, camera.height, math.inf, features.levels - 1 + margin]
         self._lower, self._upper = torch.tensor([lower, upper], dtype=torch.float64)[..., None]
 
-    def __call__(self, features: Features, projection: Projection, local_map: LocalMap, radius: float) -> Tensor:
+    def __call__(
+        self, features: Features, projection: ProjectedLandmarks, local_map: LocalMap, radius: float
+    ) -> Tensor:
         """Match projected landmarks to nearby features with similar descriptors.
 
         Args:
@@ -96,19 +98,19 @@ class ProjectionMatcher:
             most once.
         """
         pairs = match_by_projection(
-            projection.pixels,
+            projection.uv,
             radius * self._scale ** projection.levels.to(torch.float64),
             projection.levels,
-            local_map.descriptors.index_select(0, projection.rows),
+            local_map.descriptors.index_select(0, projection.indices),
             features.uv,
             features.octave,
             features.descriptors,
             max_hamming=self._config.max_hamming,
             max_ratio=self._config.max_ratio,
         )
-        return torch.stack([projection.rows[pairs[:, 0]], pairs[:, 1]], dim=1)
+        return torch.stack([projection.indices[pairs[:, 0]], pairs[:, 1]], dim=1)
 
-    def project(self, T_cw: Tensor, local_map: LocalMap) -> Projection:
+    def project(self, T_cw: Tensor, local_map: LocalMap) -> ProjectedLandmarks:
         """Project a local map into a camera, and select the landmarks in view.
 
         A landmark is in view if it projects into the image, its viewing direction is similar to that of its first
@@ -130,4 +132,4 @@ class ProjectionMatcher:
         rows = torch.nonzero(((predicted >= self._lower) & (predicted < self._upper)).all(dim=0))[:, 0]
         z, u, v, _, level = predicted.index_select(1, rows)
         levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
-        return Projection(rows, torch.stack([u, v], dim=1), z, levels)
+        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, levels)

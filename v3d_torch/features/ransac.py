@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import rigid
+from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.optim.pose_refinement import refine_pose
 from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, Measurements
 
@@ -121,4 +121,4 @@ def _sample_pose(points: Tensor, uv: Tensor, K: Tensor, threshold: float, iterat
     T_cw = torch.eye(4, dtype=torch.float64)
     T_cw[:3, :3] = torch.from_numpy(R)
     T_cw[:3, 3] = torch.from_numpy(t).reshape(3)
-    return rigid(T_cw) if bool(torch.isfinite(T_cw).all()) else None
+    return orthonormalise(T_cw) if bool(torch.isfinite(T_cw).all()) else None

@@ -177,7 +177,7 @@ class PinholeCamera:
         pixel = torch.tensor([1 / self.fx, 1 / self.fy], dtype=torch.float64)
         return torch.stack([extremes.min - pixel, extremes.max + pixel])
 
-    def locate(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
+    def project_to_image(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
         """Project points to distorted pixels and check which of them lie in the image.
 
         Points outside the field of view are rejected before distortion, because the distortion polynomial maps some of

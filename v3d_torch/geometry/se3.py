@@ -54,7 +54,7 @@ def invert(T: Tensor) -> Tensor:
     return _assemble(R, -(R @ T[..., :3, 3:]))
 
 
-def rigid(T: Tensor) -> Tensor:
+def orthonormalise(T: Tensor) -> Tensor:
     """Replace rotations by the nearest orthonormal matrices.
 
     `invert` assumes orthonormal rotations, so a chain of products and inverses doubles its rounding error with each

@@ -30,7 +30,7 @@ class Voxels(NamedTuple):
     means: Tensor
     valid: Tensor
     counts: Tensor
-    owner: Tensor
+    voxel_index: Tensor
 
 
 def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:

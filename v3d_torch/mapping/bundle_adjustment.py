@@ -17,8 +17,15 @@ from torch import Tensor
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
-from v3d_torch.optim.reprojection import Measurements, Whitened, chi_square, perspective, perspective_jacobian, whitened
-from v3d_torch.optim.schur import NormalEquations, columns, solve_normal_equations
+from v3d_torch.optim.reprojection import (
+    Measurements,
+    WhitenedMeasurements,
+    chi_square,
+    perspective,
+    perspective_jacobian,
+    whiten,
+)
+from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,9 +167,9 @@ class Bundle:
         self._row, self._order = row[observations.pose].sort(stable=True)
         self._counts = torch.bincount(self._row, minlength=len(self._free))[: len(self._free)].tolist()
         self._pose, self._point = observations.pose[self._order], observations.point[self._order]
-        target = whitened(observations, camera)
-        self._target = Whitened(target.scale[:, self._order], target.offset[:, self._order])
-        self._limit, self._sigma = observations.limit[self._order], observations.pixel_sigma[self._order]
+        target = whiten(observations, camera)
+        self._target = WhitenedMeasurements(target.scale[:, self._order], target.offset[:, self._order])
+        self._limit, self._sigma = observations.chi2_threshold[self._order], observations.pixel_sigma[self._order]
 
     def as_given(self, of_each: Tensor) -> Tensor:
         """Numbers of the sorted observations, (M,), in the order in which these were given."""
@@ -177,11 +184,11 @@ class Bundle:
     def errors_at(self, state: State) -> tuple[float, Errors]:
         """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""
         T_cw, points = state
-        T = columns(T_cw[:, :3].flatten(1).T, self._pose).unflatten(0, (3, 4))
-        x, y, z = columns(points.T.contiguous(), self._point)
+        T = gather_columns(T_cw[:, :3].flatten(1).T, self._pose).unflatten(0, (3, 4))
+        x, y, z = gather_columns(points.T.contiguous(), self._point)
         in_camera = T[:, 3].addcmul(T[:, 0], x).addcmul_(T[:, 1], y).addcmul_(T[:, 2], z)
         seen = perspective(in_camera)
-        residuals = self._target.errors(seen)
+        residuals = self._target.residuals(seen)
         costs, weights = huber((residuals * residuals).sum(dim=0), self._limit)
         return float(costs.sum()), Errors(in_camera, seen, T[:, :3], residuals, weights, self)
 

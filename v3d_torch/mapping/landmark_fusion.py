@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.features import measurements
+from v3d_torch.features.features import to_measurements
 from v3d_torch.features.projection_matcher import ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.optim.reprojection import chi_square, reprojection
+from v3d_torch.optim.reprojection import chi_square, reprojection_residuals
 
 
 class LandmarkFusion:
@@ -57,8 +57,10 @@ class LandmarkFusion:
         seen = self._search.project(keyframe.T_cw, local)
         row, feature = self._search(features, seen, local, config.mapping.fuse_radius).unbind(dim=1)
         in_camera = local.points[row] @ keyframe.T_cw[:3, :3].T + keyframe.T_cw[:3, 3]
-        measured = measurements(features[feature], config.tracking, config.features)
-        fits = chi_square(in_camera, reprojection(in_camera, measured, self._camera)) <= measured.limit
+        measured = to_measurements(features[feature], config.tracking, config.features)
+        fits = (
+            chi_square(in_camera, reprojection_residuals(in_camera, measured, self._camera)) <= measured.chi2_threshold
+        )
         found = torch.full_like(keyframe.landmarks, -1)
         found[feature[fits]] = local.ids[row[fits]]
         sparse_map.fuse_landmarks(keyframe, found)

@@ -10,7 +10,7 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.features.features import pixel_sigma
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import rigid
+from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.readout_calibration import calibrate_readout
@@ -100,8 +100,8 @@ def local_bundle_adjust(
     asks = keyframe.index <= config.rolling_shutter.calibration_keyframes or keyframe.index % _SELDOM == 0
     if asks and config.rolling_shutter.enabled and not readout.is_certain:
         readout = calibrate_readout(readout, *found.errors.profile(table["readout_jacobian"].index_select(0, rows)))
-    T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
-    return LocalAdjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit], readout)
+    T_cw[poses[~fixed]] = orthonormalise(found.T_cw[~fixed])
+    return LocalAdjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.chi2_threshold], readout)
 
 
 def _observations_around(sparse_map: SparseMap, window: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from v3d_torch.config import FeaturesConfig, MappingConfig
 from v3d_torch.features.features import Features, select_evenly
 from v3d_torch.features.projection_matcher import LocalMap
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, rigid
+from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe, Loop, stack_poses
 from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
@@ -202,7 +202,7 @@ class SparseMap:
         before, reference = self.T_cw, self.references
         along = reference != torch.arange(len(reference))
         T_cw = T_cw.clone()
-        T_cw[along] = rigid(before[along] @ invert(before[reference[along]]) @ T_cw[reference[along]])
+        T_cw[along] = orthonormalise(before[along] @ invert(before[reference[along]]) @ T_cw[reference[along]])
         T_new_old = (invert(T_cw) @ before)[self.landmarks["keyframe"]]
         R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
         self.landmarks["point"][:] = (R @ self.landmarks["point"][..., None])[..., 0] + t

@@ -63,7 +63,7 @@ class DepthView:
         """Return the fields without the cached images."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def moved_to(self, T_cw: Tensor) -> DepthView:
+    def with_pose(self, T_cw: Tensor) -> DepthView:
         """Return the same depth image with another pose. The cached images do not depend on the pose and are kept.
 
         Args:
@@ -119,7 +119,7 @@ def is_free_space(points: Tensor, view: DepthView, camera: PinholeCamera, config
     # One contiguous row per coordinate: the operations below are faster on it.
     in_camera = (view.T_cw[:3, :3] @ points.T + view.T_cw[:3, 3:]).T
     expected = in_camera[:, 2]
-    pixels, inside = camera.locate(in_camera, config.min_depth)
+    pixels, inside = camera.project_to_image(in_camera, config.min_depth)
     u, v = pixels.round().to(torch.int64).unbind(dim=1)
     index = torch.where(inside, v * camera.width + u, 0)
     measured = torch.where(inside, view.nearest_depth.flatten().index_select(0, index), 0.0).to(torch.float64)
@@ -183,19 +183,19 @@ class FreeSpaceCheck:
         misalignment = round(self._camera.fx * rotation_rate * self._config.depth_sync_error)
         return DepthView(stamp, depth, T_cw, misalignment)
 
-    def __call__(self, view: DepthView, *, trusted: bool = True) -> NewlyOccupied:
+    def __call__(self, view: DepthView, *, pose_known: bool = True) -> NewlyOccupied:
         """Compare a view with the stored views.
 
         Args:
             view: Current view.
-            trusted: True if the pose of the view is measured. With a guessed pose everything would seem to appear;
+            pose_known: True if the pose of the view is measured. With a guessed pose everything would seem to appear;
                 then nothing is compared.
 
         Returns:
             Newly occupied pixels, one row per baseline; no row if nothing is compared.
         """
         config = self._config
-        baselines = config.baselines if config.enabled and trusted else ()
+        baselines = config.baselines if config.enabled and pose_known else ()
         z = view.depth[0, :: self._stride, :: self._stride].to(torch.float64)
         appeared = torch.full((len(baselines), *z.shape), torch.nan, dtype=torch.float64)
         if not baselines:
@@ -210,7 +210,7 @@ class FreeSpaceCheck:
                 row[measured] = is_free_space(points, previous, self._camera, config)
         return NewlyOccupied(appeared, self._stride)
 
-    def remember(self, view: DepthView) -> None:
+    def add_view(self, view: DepthView) -> None:
         """Store a view with its final pose, and drop the views that are too old for all baselines.
 
         Args:
@@ -219,13 +219,13 @@ class FreeSpaceCheck:
         oldest = view.stamp - max(self._config.baselines, default=0.0) - _VIEW_MARGIN
         self._views = [stored for stored in self._views if stored.stamp >= oldest] + [view]
 
-    def move_world(self, T_new_old: Tensor) -> None:
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the stored views into the corrected world.
 
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
-        self._views = [view.moved_to(view.T_cw @ invert(T_new_old)) for view in self._views]
+        self._views = [view.with_pose(view.T_cw @ invert(T_new_old)) for view in self._views]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored views."""

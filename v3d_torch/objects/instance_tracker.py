@@ -113,14 +113,14 @@ class InstanceTracker(torch.nn.Module):
         self._remove_duplicates(_flatten(has_depth[::step, ::step]))
         return list(self.tracks)
 
-    def move_world(self, T_new_old: Tensor) -> None:
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform all tracks into the corrected world.
 
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
         for track in self.tracks:
-            track.move_world(T_new_old)
+            track.apply_world_correction(T_new_old)
 
     def _detection(self, stamp: float, clouds: InstanceClouds, i: int, T_wc: Tensor) -> Detection3D:
         """Return the detection of the i-th instance in the world frame."""

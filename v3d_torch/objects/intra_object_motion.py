@@ -26,25 +26,25 @@ class Deformation(NamedTuple):
 
 
 def intra_object_motion(
-    then: Tensor,
-    now: Tensor,
+    previous: Tensor,
+    current: Tensor,
     distance_threshold: float,
-    then_valid: Tensor | None = None,
-    now_valid: Tensor | None = None,
-    T_now_then: Tensor | None = None,
+    previous_valid: Tensor | None = None,
+    current_valid: Tensor | None = None,
+    T_current_previous: Tensor | None = None,
 ) -> Deformation:
     r"""Compare the cloud of every object with its own cloud at an earlier time.
 
     The camera moves in between, so both clouds must be expressed in one frame: pass both in the world frame, or each in
-    the frame of its own camera together with ``T_now_then``.
+    the frame of its own camera together with ``T_current_previous``.
 
     Args:
-        then: Clouds at the earlier time, metres, float32 or float64, shape :math:`(B, N, 3)`.
-        now: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
+        previous: Clouds at the earlier time, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        current: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
         distance_threshold: Distance from which an object is deforming, metres.
-        then_valid: Points of ``then`` that exist, bool, shape :math:`(B, N)`; all by default.
-        now_valid: Points of ``now`` that exist, bool, shape :math:`(B, M)`; all by default.
-        T_now_then: Transform from the frame of ``then`` to that of ``now``, shape :math:`(B, 4, 4)`, or
+        previous_valid: Points of ``previous`` that exist, bool, shape :math:`(B, N)`; all by default.
+        current_valid: Points of ``current`` that exist, bool, shape :math:`(B, M)`; all by default.
+        T_current_previous: Transform from the frame of ``previous`` to that of ``current``, shape :math:`(B, 4, 4)`, or
             :math:`(4, 4)` for all objects; None if the frames are the same.
 
     Returns:
@@ -54,9 +54,9 @@ def intra_object_motion(
     Raises:
         InputError: If a valid point is not finite.
     """
-    if T_now_then is not None:
-        then = _transform(T_now_then, then, then_valid)
-    mean_square = chamfer_distance(then, now, then_valid, now_valid) / 2
+    if T_current_previous is not None:
+        previous = _transform(T_current_previous, previous, previous_valid)
+    mean_square = chamfer_distance(previous, current, previous_valid, current_valid) / 2
     # torch.where evaluates both branches: the 1 keeps the gradient of the unused branch finite.
     is_zero = mean_square == 0
     distance = torch.where(is_zero, 0, torch.where(is_zero, 1, mean_square).sqrt())
@@ -85,11 +85,13 @@ class IntraObjectMotion(torch.nn.Module):
 
     def forward(
         self,
-        then: Tensor,
-        now: Tensor,
-        then_valid: Tensor | None = None,
-        now_valid: Tensor | None = None,
-        T_now_then: Tensor | None = None,
+        previous: Tensor,
+        current: Tensor,
+        previous_valid: Tensor | None = None,
+        current_valid: Tensor | None = None,
+        T_current_previous: Tensor | None = None,
     ) -> Deformation:
         """Compare clouds, metres, shape :math:`(B, N, 3)` and :math:`(B, M, 3)`; see :func:`intra_object_motion`."""
-        return intra_object_motion(then, now, self.distance_threshold, then_valid, now_valid, T_now_then)
+        return intra_object_motion(
+            previous, current, self.distance_threshold, previous_valid, current_valid, T_current_previous
+        )

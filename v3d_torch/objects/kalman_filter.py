@@ -77,7 +77,7 @@ class ConstantVelocityKalmanFilter:
         velocity = self._velocity + velocity_gain * innovation
         self._velocity = velocity * min(1.0, self._max_speed / max(float(velocity.norm()), _MIN_SPEED))
 
-    def move_world(self, T_new_old: Tensor) -> None:
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the state into the corrected world.
 
         Args:

@@ -42,7 +42,7 @@ def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float)
         return []
     # One contiguous row per coordinate is faster to project.
     points = torch.cat([cloud.T for cloud in clouds], dim=1).to(torch.float64).T
-    pixels, inside = camera.locate(points, _MIN_DEPTH)
+    pixels, inside = camera.project_to_image(points, _MIN_DEPTH)
     projected = inside.numpy()
     # Pixel centres lie at integers, so a cell begins half a pixel before its first pixel centre.
     cells = np.floor((pixels.numpy()[projected] + 0.5) / _CELL).astype(np.int64)

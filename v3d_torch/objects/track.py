@@ -188,14 +188,14 @@ class Track:
         """Record that the object deforms in the frame at ``stamp``, seconds."""
         self.last_deforming = stamp
 
-    def move_world(self, T_new_old: Tensor) -> None:
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the track into the corrected world.
 
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
-        self._filter.move_world(T_new_old)
+        self._filter.apply_world_correction(T_new_old)
         self.detections = [
             Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
         ]

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, rigid
+from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
 from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_marquardt
@@ -134,7 +134,7 @@ class DenseAligner:
         return torch.stack([gain, mean_b - gain * mean_a])
 
     def _summarise(self, problem: AlignmentProblem, result: OptimisationResult[State, System]) -> DenseAlignment:
-        T_ba, (gain, _) = rigid(result.state[0]), result.state[1]
+        T_ba, (gain, _) = orthonormalise(result.state[0]), result.state[1]
         residuals = problem.residuals(result.state)
         (brightness, inverse_depth), valid_brightness = problem.reference.values.to(torch.float64), residuals.valid[0]
         max_difference = self._MAX_DEPTH_SIGMAS * self._config.inverse_depth_sigma

@@ -32,36 +32,47 @@ class TrackedFrame:
     frame: RGBDFrame
     depth: Tensor
     features: Features
-    static: Tensor | None = None
-    landmarks: Tensor | None = None
+    static_mask: Tensor | None = None
+    landmark_ids: Tensor | None = None
 
-    def matched(self, motion: RelativeMotion | None) -> Tensor:
-        """Mask of the features that are inliers of a motion to this frame.
 
-        Args:
-            motion: Motion from another frame to this one; None if it is unknown.
+@dataclass(frozen=True)
+class CameraMotion:
+    """Motion of the camera since the previous frame.
 
-        Returns:
-            Bool, shape :math:`(N,)`; all false without a motion.
-        """
-        mask = torch.zeros(len(self.features), dtype=torch.bool)
-        if motion is not None:
-            mask[motion.pairs[:, 1]] = True
+    Attributes:
+        T_cp: Maps points from the previous camera to the current one, float64, shape :math:`(4, 4)`.
+        velocity: Mean twist per second, ``[m/s, rad/s]``, float64, shape :math:`(6,)`.
+        pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape :math:`(K, 2)`;
+            K = 0 for a motion found by dense alignment, and for a prediction.
+        is_measured: True if the frames were registered, False if the motion is only predicted.
+    """
+
+    T_cp: Tensor
+    velocity: Tensor
+    pairs: Tensor
+    is_measured: bool
+
+    def inlier_mask(self, count: int) -> Tensor:
+        """Mask of the features of the current frame that are inliers, bool, shape ``(count,)``."""
+        mask = torch.zeros(count, dtype=torch.bool)
+        mask[self.pairs[:, 1]] = True
         return mask
 
-    def carried(self, motion: RelativeMotion | None, previous: TrackedFrame | None) -> Tensor:
-        """Landmark ids of the features, propagated from another frame by the matches of a motion.
+    def propagate_landmarks(self, previous: TrackedFrame | None, count: int) -> Tensor:
+        """Landmark ids of the features of the current frame, propagated by the inlier matches.
 
         Args:
-            motion: Motion from the other frame to this one; None if it is unknown.
-            previous: The other frame; None if there is none.
+            previous: Previous frame; None if there is none.
+            count: Number of features of the current frame.
 
         Returns:
-            Landmark id of each feature, int64, shape :math:`(N,)`; -1 = none.
+            Landmark id of each feature, int64, shape ``(count,)``; -1 = none.
         """
-        if motion is None or previous is None or previous.landmarks is None:
-            return torch.full((len(self.features),), -1, dtype=torch.int64)
-        return motion.propagate_landmarks(previous.landmarks, len(self.features))
+        landmarks = torch.full((count,), -1, dtype=torch.int64)
+        if previous is not None and previous.landmark_ids is not None:
+            landmarks[self.pairs[:, 1]] = previous.landmark_ids[self.pairs[:, 0]]
+        return landmarks
 
 
 class Odometry:
@@ -78,12 +89,32 @@ class Odometry:
         self._estimate_motion = estimate_motion
         self._align = DenseAligner(config.dense_odometry, camera)
 
-    def __call__(self, previous: TrackedFrame, current: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
-        """Estimate the motion from an earlier frame "a" to the newest frame "b".
+    def __call__(
+        self, previous: TrackedFrame | None, current: TrackedFrame, T_cp: Tensor, velocity: Tensor
+    ) -> CameraMotion:
+        """Estimate the motion since the previous frame.
+
+        Args:
+            previous: Previous frame, whose static pixels are known; None for the first frame.
+            current: Current frame.
+            T_cp: Predicted motion, float64, shape :math:`(4, 4)`.
+            velocity: Predicted mean twist per second, float64, shape :math:`(6,)`.
+
+        Returns:
+            The prediction if neither features nor dense alignment give a plausible motion.
+        """
+        motion = None if previous is None else self.register(previous, current, T_cp)
+        if previous is None or motion is None:
+            return CameraMotion(T_cp, velocity, torch.zeros(0, 2, dtype=torch.int64), is_measured=False)
+        elapsed = current.frame.stamp - previous.frame.stamp
+        return CameraMotion(motion.T_ba, motion.velocity(elapsed), motion.pairs, is_measured=True)
+
+    def register(self, previous: TrackedFrame, current: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
+        """Register two frames: the motion from an earlier frame "a" to a later frame "b".
 
         Args:
             previous: Earlier frame, whose static pixels are known.
-            current: Newest frame.
+            current: Later frame.
             T_ba: Predicted motion, float64, shape :math:`(4, 4)`.
 
         Returns:
@@ -102,4 +133,4 @@ class Odometry:
     def _dense_view(self, tracked: TrackedFrame) -> DenseView:
         grey = rgb_to_grayscale(tracked.frame.image.to(torch.float32) / 255)
         all_pixels = torch.ones(grey.shape[-2:], dtype=torch.bool)
-        return self._align.view(grey, tracked.depth, all_pixels if tracked.static is None else tracked.static)
+        return self._align.view(grey, tracked.depth, all_pixels if tracked.static_mask is None else tracked.static_mask)

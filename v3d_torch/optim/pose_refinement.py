@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import rigid, se3_exp
+from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
-from v3d_torch.optim.reprojection import Measurements, chi_square, perspective, perspective_jacobian, whitened
+from v3d_torch.optim.reprojection import Measurements, chi_square, perspective, perspective_jacobian, whiten
 
 _TOLERANCE = 1e-3
 """Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
@@ -86,12 +86,12 @@ def refine_pose(
     Returns:
         The refined pose and its inliers. Without measurements, the prediction.
     """
-    target, thresholds = whitened(measured, camera), measured.limit
+    target, thresholds = whiten(measured, camera), measured.chi2_threshold
 
     def linearise(T_cw: Tensor) -> _Linearisation:
         in_camera = torch.addmm(T_cw[:3, 3:], T_cw[:3, :3], points.T)
         projected = perspective(in_camera)
-        residuals = target.errors(projected)
+        residuals = target.residuals(projected)
         return _Linearisation(T_cw, in_camera, projected, residuals, (residuals * residuals).sum(dim=0))
 
     def robust_cost(at: _Linearisation, active: Tensor, threshold: Tensor | float) -> tuple[float, Tensor]:
@@ -117,4 +117,4 @@ def refine_pose(
         inliers = chi2 <= thresholds
         if not robust and torch.equal(inliers, previous):
             break
-    return PoseRefinement(rigid(at.T_cw), inliers, chi2, partial(normal_equations, at, result.system))
+    return PoseRefinement(orthonormalise(at.T_cw), inliers, chi2, partial(normal_equations, at, result.system))

@@ -50,14 +50,14 @@ class Measurements:
     inverse_depth_sigma: float
 
     @property
-    def limit(self) -> Tensor:
+    def chi2_threshold(self) -> Tensor:
         """Chi-square threshold of an inlier, at 95 %, for each measurement, shape :math:`(M,)`."""
         thresholds = torch.full_like(self.inverse_depth, CHI2_THRESHOLD_2D)
         return thresholds.masked_fill_(self.inverse_depth > 0, _CHI2_THRESHOLD_3D)
 
 
 @dataclass(frozen=True)
-class Whitened:
+class WhitenedMeasurements:
     """Measurements in whitened form: residual = ``scale * (x/z, y/z, 1/z) + offset``.
 
     Attributes:
@@ -69,12 +69,12 @@ class Whitened:
     scale: Tensor
     offset: Tensor
 
-    def errors(self, projected: Tensor) -> Tensor:
+    def residuals(self, projected: Tensor) -> Tensor:
         """Whitened residuals of points given by `perspective`, both of shape :math:`(3, M)`."""
         return torch.addcmul(self.offset, self.scale, projected)
 
 
-def whitened(measured: Measurements, camera: PinholeCamera) -> Whitened:
+def whiten(measured: Measurements, camera: PinholeCamera) -> WhitenedMeasurements:
     """Precompute the parts of the residuals that do not depend on the pose.
 
     Args:
@@ -84,7 +84,7 @@ def whitened(measured: Measurements, camera: PinholeCamera) -> Whitened:
     u, v = measured.uv.unbind(-1)
     has_depth, sigma = measured.inverse_depth > 0, measured.pixel_sigma
     inverse_depth = torch.where(has_depth, measured.inverse_depth, 0)
-    return Whitened(
+    return WhitenedMeasurements(
         scale=torch.stack([camera.fx / sigma, camera.fy / sigma, has_depth.to(u.dtype) / measured.inverse_depth_sigma]),
         offset=torch.stack(
             [(camera.cx - u) / sigma, (camera.cy - v) / sigma, inverse_depth / -measured.inverse_depth_sigma]
@@ -130,7 +130,7 @@ def perspective_jacobian(projected: Tensor) -> Tensor:
     return jacobian
 
 
-def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
+def reprojection_residuals(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
     """Whitened reprojection residuals of (u, v, 1/z).
 
     Args:
@@ -142,7 +142,7 @@ def reprojection(points: Tensor, measured: Measurements, camera: PinholeCamera) 
         Residuals in standard deviations, shape :math:`(M, 3)`; the third is 0 if depth was not measured. A transposed
         view: the measurements are contiguous in memory.
     """
-    return whitened(measured, camera).errors(perspective(points.T)).T
+    return whiten(measured, camera).residuals(perspective(points.T)).T
 
 
 def reprojection_jacobian(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
@@ -157,7 +157,7 @@ def reprojection_jacobian(points: Tensor, measured: Measurements, camera: Pinhol
         Shape :math:`(M, 3, 6)`; the first three columns are the Jacobian by ``points``, too. A transposed view: the
         measurements are contiguous in memory.
     """
-    scale = whitened(measured, camera).scale
+    scale = whiten(measured, camera).scale
     return (perspective_jacobian(perspective(points.T)) * scale).permute(2, 1, 0)
 
 

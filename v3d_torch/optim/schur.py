@@ -41,7 +41,7 @@ class NormalEquations:
     point: Tensor
 
 
-def columns(rows: Tensor, index: Tensor) -> Tensor:
+def gather_columns(rows: Tensor, index: Tensor) -> Tensor:
     """Gather columns of a matrix; faster than indexing.
 
     Args:
@@ -72,7 +72,7 @@ def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Ten
     U, V = _damp(system.U[..., :6].permute(1, 2, 0), damping), _damp(system.V[:, :3], damping)
     L = _cholesky(V)
     h = _forward(L, system.V[:, 3])
-    blocks = _forward(columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
+    blocks = _forward(gather_columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
     # Y is dense: a local map is small, and most of its poses observe many of its points. It is stored transposed, poses
     # by points, with the points ordered by coordinate first, like h.
     index = (

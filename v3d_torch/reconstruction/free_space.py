@@ -32,4 +32,4 @@ def seen_as_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) ->
         told = is_free_space(places, DepthView(view.keyframe.stamp, view.depth[None], view.T_cw), views.camera, config)
         through += told == 1
         filled += told == 0
-    return ((through > 0) & (through >= filled))[cells.owner[0]]
+    return ((through > 0) & (through >= filled))[cells.voxel_index[0]]

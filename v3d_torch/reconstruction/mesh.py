@@ -111,7 +111,7 @@ def _colours(vertices: Tensor, views: StaticViews, config: DenseMapConfig) -> Te
     sums, weights = vertices.new_zeros(len(vertices), 3), vertices.new_zeros(len(vertices), 1)
     for view in views:
         in_camera = vertices @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
-        pixels, inside = views.camera.locate(in_camera, config.mesh.voxel_size)
+        pixels, inside = views.camera.project_to_image(in_camera, config.mesh.voxel_size)
         u, v = pixels.round().to(torch.int64).unbind(dim=1)
         u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
         z = in_camera[:, 2]

@@ -86,6 +86,6 @@ def _take_in(sums: Tensor, counts: Tensor, waiting: list[Tensor], size: float) -
     voxels = voxel_pool(places, torch.ones(places.shape[:2], dtype=torch.bool), size)
     occupied = voxels.counts.shape[1]
     return (
-        sums.new_zeros(occupied, 9).index_add_(0, voxels.owner[0], sums),
-        counts.new_zeros(occupied).index_add_(0, voxels.owner[0], counts),
+        sums.new_zeros(occupied, 9).index_add_(0, voxels.voxel_index[0], sums),
+        counts.new_zeros(occupied).index_add_(0, voxels.voxel_index[0], counts),
     )

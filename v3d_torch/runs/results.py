@@ -27,7 +27,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import fuse_points
 from v3d_torch.types import TrackingStatus, Trajectory
-from v3d_torch.viz.camera_path import camera_path
+from v3d_torch.viz.camera_path import make_camera_path
 from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
@@ -119,7 +119,12 @@ def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
     keyframes = {keyframe.frame for keyframe in slam.map.active_keyframes}
     table: list[dict[str, object]] = [
         {
-            **{"frame": row["frame"], "stamp": row["stamp"], "status": status.value, "keyframe": row["frame"] in keyframes},
+            **{
+                "frame": row["frame"],
+                "stamp": row["stamp"],
+                "status": status.value,
+                "keyframe": row["frame"] in keyframes,
+            },
             **{f"seconds_{stage}": row.get(stage, 0.0) for stage in stages},
         }
         for row, status in zip(rows, slam.poses.statuses, strict=False)  # one row less if a frame was interrupted
@@ -137,7 +142,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
     statuses = slam.poses.statuses
     frames = len(statuses)
     counts = {status.value: statuses.count(status) for status in TrackingStatus}
-    masks = run.mask_evaluation.scores()
+    masks = run.mask_evaluation.compute_scores()
     return {
         **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
         "masks": masks.to_dict() if masks is not None else None,
@@ -187,5 +192,5 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     keyframes = slam.map.active_keyframes
     frames = [keyframe.frame for keyframe in keyframes]
     statuses = [status.value for status in slam.poses.statuses]
-    path = camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
+    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

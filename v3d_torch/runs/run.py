@@ -24,10 +24,10 @@ from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runs.results import write_results
 from v3d_torch.runtime.process import set_num_threads
+from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
-from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 
 _LOG = logging.getLogger(__name__)
 

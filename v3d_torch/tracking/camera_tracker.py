@@ -47,7 +47,13 @@ class CameraTracker:
         self._local_keyframes = local_keyframes
 
     def __call__(
-        self, features: Features, depth: Tensor, T_cw: Tensor, landmarks: Tensor, motion: CameraMotion, poses: PoseHistory
+        self,
+        features: Features,
+        depth: Tensor,
+        T_cw: Tensor,
+        landmarks: Tensor,
+        motion: CameraMotion,
+        poses: PoseHistory,
     ) -> FramePose:
         """Estimate the pose of a frame.
 

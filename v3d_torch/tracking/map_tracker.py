@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, TrackingConfig
-from v3d_torch.features.features import Features, measurements, sample_depth
-from v3d_torch.features.projection_matcher import LocalMap, Projection, ProjectionMatcher
+from v3d_torch.features.features import Features, sample_depth, to_measurements
+from v3d_torch.features.projection_matcher import LocalMap, ProjectedLandmarks, ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
 
@@ -101,7 +101,7 @@ class MapTracker:
             return None
         ids = torch.full((len(features),), -1, dtype=torch.int64)
         ids[feature[refined.inliers]] = local_map.ids[landmark[refined.inliers]]
-        visible = projected.rows if depth is None else projected.rows[~self._is_occluded(projected, depth)]
+        visible = projected.indices if depth is None else projected.indices[~self._is_occluded(projected, depth)]
         return MapTracking(refined.T_cw, ids, local_map.ids[visible])
 
     def refine(self, T_cw: Tensor, points: Tensor, features: Features, *, rounds: int) -> PoseRefinement | None:
@@ -119,11 +119,13 @@ class MapTracker:
         config = self._config
         if len(features) < config.min_inliers:
             return None
-        refined = refine_pose(T_cw, points, measurements(features, config, self._features), self._camera, rounds=rounds)
+        refined = refine_pose(
+            T_cw, points, to_measurements(features, config, self._features), self._camera, rounds=rounds
+        )
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
-    def _is_occluded(self, projected: Projection, depth: Tensor) -> Tensor:
+    def _is_occluded(self, projected: ProjectedLandmarks, depth: Tensor) -> Tensor:
         """Return which landmarks lie behind the measured depth at their projection, bool, shape (V,)."""
-        pixels = self._camera.distort(projected.pixels).round().to(torch.int64)
+        pixels = self._camera.distort(projected.uv).round().to(torch.int64)
         z = sample_depth(pixels, depth, torch.inf)
         return (z > 0) & (1 / z - 1 / projected.depth > _OCCLUSION_SIGMAS * self._config.inverse_depth_sigma)

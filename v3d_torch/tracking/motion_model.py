@@ -75,7 +75,7 @@ class MotionModel:
             return
         elapsed = stamp - poses.stamp
         if pose.status is TrackingStatus.LOST and motion.is_measured:
-            self.velocity = motion.twist / elapsed
+            self.velocity = motion.velocity
         elif pose.status is TrackingStatus.LOST:
             self.velocity = self.velocity * (stamp - poses.last_found < MAX_EXTRAPOLATION)
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:

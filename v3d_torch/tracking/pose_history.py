@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import invert, rigid, se3_exp, se3_log
+from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
@@ -110,7 +110,7 @@ class PoseHistory:
             status = TrackingStatus.DISCONNECTED
         T_new_old = None
         if self.status is TrackingStatus.LOST and status is not TrackingStatus.LOST:
-            correction = rigid(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
+            correction = orthonormalise(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
             first = not self.is_located
             self._correct_lost(correction, reference, motion.is_measured, move_all=first)
             T_new_old = correction if first else None
@@ -169,7 +169,7 @@ def _pose(keyframe: Keyframe | None) -> Tensor:
 
 def _relative(T_cw: Tensor, keyframe: Keyframe | None) -> Tensor:
     """Return a pose relative to a keyframe, keyframe to camera, float64, shape :math:`(4, 4)`."""
-    return rigid(T_cw @ invert(_pose(keyframe)))
+    return orthonormalise(T_cw @ invert(_pose(keyframe)))
 
 
 def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:

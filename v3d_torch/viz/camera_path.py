@@ -12,7 +12,7 @@ from torch import Tensor
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Trajectory
 
-STATUS_COLOURS = {"odometry": "#ff7f0e", "disconnected": "#d62728", "lost": "#d62728", "earlier": "#7f7f7f"}
+PATH_COLOURS = {"odometry": "#ff7f0e", "disconnected": "#d62728", "lost": "#d62728", "earlier": "#7f7f7f"}
 """Colour of frames that are not tracked, and of keyframes of an earlier run. The colour of tracked frames changes from
 dark blue to yellow with time."""
 
@@ -41,7 +41,7 @@ class CameraPath:
     edges: Tensor
 
 
-def camera_path(
+def make_camera_path(
     trajectory: Trajectory, statuses: list[str], T_wk: Tensor, frames: list[int], camera: PinholeCamera
 ) -> CameraPath:
     """Create the mesh of a camera path.
@@ -73,6 +73,6 @@ def _colours(stamps: Tensor, statuses: list[str]) -> Tensor:
     """Return the RGB of each frame and, in the last row, of an earlier run, uint8, shape (N + 1, 3)."""
     progress = (stamps - stamps[:1]) / (stamps[-1:] - stamps[:1]).clamp(min=1e-9)
     by_time = [*(mpl.colormaps["viridis"](fraction)[:3] for fraction in progress.tolist()), (0, 0, 0)]
-    by_status = [STATUS_COLOURS.get(status) for status in [*statuses, "earlier"]]
+    by_status = [PATH_COLOURS.get(status) for status in [*statuses, "earlier"]]
     colours = [to_rgb(fixed) if fixed else timed for fixed, timed in zip(by_status, by_time, strict=True)]
     return (255 * torch.tensor(colours)).round().to(torch.uint8)

@@ -11,14 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
-from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, half, options, seq
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, set_sequence
 
 NAME = "rgbd_dataset_freiburg3_walking_xyz"
-SEQ = all_of(seq("fr3/w/xyz"), options("--data-root", "{root}/data"))
+SEQ = all_of(set_sequence("fr3/w/xyz"), add_options("--data-root", "{root}/data"))
 
 
 @contextmanager
-def served(place: Place) -> Iterator[None]:
+def served(place: Workspace) -> Iterator[None]:
     """Replace the download by a copy of the archive."""
 
     def fetch(url: str, target: Path, **_: object) -> Path:
@@ -30,10 +30,10 @@ def served(place: Place) -> Iterator[None]:
         yield
 
 
-def archive(add: Callable[[tarfile.TarFile], None] | None = None, kind: str = "w:gz") -> Make:
+def archive(add: Callable[[tarfile.TarFile], None] | None = None, kind: str = "w:gz") -> Damage:
     """Pack the sequence into an archive, with an optional extra member."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         with tarfile.open(place.root / "archive.tgz", kind) as tar:
             tar.add(place.folder, NAME)
             if add is not None:
@@ -78,10 +78,10 @@ def long_name(size: int) -> Callable[[tarfile.TarFile], None]:
     return add
 
 
-def changed(change: Callable[[bytes], bytes]) -> Make:
+def changed(change: Callable[[bytes], bytes]) -> Damage:
     """Change the bytes of the archive."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         path = place.root / "archive.tgz"
         path.write_bytes(change(path.read_bytes()))
 
@@ -94,7 +94,7 @@ def flip_byte(content: bytes) -> bytes:
     return content[:at] + bytes([content[at] ^ 255]) + content[at + 1 :]
 
 
-def content_of(content: bytes) -> Make:
+def content_of(content: bytes) -> Damage:
     """Write an archive with this content."""
     return all_of(lambda place: (place.root / "archive.tgz").write_bytes(content), SEQ)  # type: ignore[arg-type, return-value]
 
@@ -102,13 +102,13 @@ def content_of(content: bytes) -> Make:
 CASES = [
     Case(name, make, ends, served)
     for name, make, ends in (
-        ("gzip", archive(), Right()),
-        ("bzip2", archive(kind="w:bz2"), Right()),
-        ("xz", archive(kind="w:xz"), Right()),
+        ("gzip", archive(), Succeeds()),
+        ("bzip2", archive(kind="w:bz2"), Succeeds()),
+        ("xz", archive(kind="w:xz"), Succeeds()),
         (
             "file outside the folder, by ..",
             archive(member("../outside.txt")),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
                 " no plain file (...); get it from another source"
             ),
@@ -116,7 +116,7 @@ CASES = [
         (
             "file outside the folder, by an absolute path",
             archive(member("/outside.txt", size=3)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
                 " archive from another source"
             ),
@@ -124,7 +124,7 @@ CASES = [
         (
             "symlink to outside the folder",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "../../..")),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
                 " no plain file (...); get it from another source"
             ),
@@ -132,7 +132,7 @@ CASES = [
         (
             "symlink to an absolute path",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "/etc")),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
                 " no plain file (...); get it from another source"
             ),
@@ -140,7 +140,7 @@ CASES = [
         (
             "hard link to outside the folder",
             archive(member(f"{NAME}/x", tarfile.LNKTYPE, "../../etc/passwd")),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
                 " no plain file (...); get it from another source"
             ),
@@ -148,7 +148,7 @@ CASES = [
         (
             "device file",
             archive(member(f"{NAME}/zero", tarfile.CHRTYPE)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
                 " no plain file (...); get it from another source"
             ),
@@ -156,7 +156,7 @@ CASES = [
         (
             "named pipe",
             archive(member(f"{NAME}/rgb.pipe", tarfile.FIFOTYPE)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
                 " no plain file (...); get it from another source"
             ),
@@ -164,7 +164,7 @@ CASES = [
         (
             "member with a size of a petabyte",
             archive(claims(10**15)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, it unpacks to more than"
                 " 21474836480 bytes; get it from another source"
             ),
@@ -172,31 +172,31 @@ CASES = [
         (
             "header of 64 megabytes",
             archive(long_name(1 << 26)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (a header of"
                 " 67108864 bytes); download it again"
             ),
         ),
         (
             "truncated gzip",
-            all_of(archive(), changed(half)),
-            Says(
+            all_of(archive(), changed(first_half)),
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
             "truncated xz",
-            all_of(archive(kind="w:xz"), changed(half)),
-            Says(
+            all_of(archive(kind="w:xz"), changed(first_half)),
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
         ),
         (
             "truncated bzip2",
-            all_of(archive(kind="w:bz2"), changed(half)),
-            Says(
+            all_of(archive(kind="w:bz2"), changed(first_half)),
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -204,7 +204,7 @@ CASES = [
         (
             "wrong byte in gzip",
             all_of(archive(), changed(flip_byte)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -212,7 +212,7 @@ CASES = [
         (
             "wrong byte in xz",
             all_of(archive(kind="w:xz"), changed(flip_byte)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -220,7 +220,7 @@ CASES = [
         (
             "wrong byte in bzip2",
             all_of(archive(kind="w:bz2"), changed(flip_byte)),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -228,7 +228,7 @@ CASES = [
         (
             "empty file",
             content_of(b""),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -236,7 +236,7 @@ CASES = [
         (
             "web page",
             content_of(b"<html>404</html>" * 100),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -244,7 +244,7 @@ CASES = [
         (
             "gzip of an empty file",
             content_of(gzip.compress(b"")),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
                 " it again"
             ),
@@ -252,7 +252,7 @@ CASES = [
         (
             "archive without a sequence",
             all_of(lambda p: shutil.rmtree(p.folder), lambda p: p.folder.mkdir(), archive()),
-            Says(
+            Fails(
                 "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
                 " archive from another source"
             ),

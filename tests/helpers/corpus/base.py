@@ -42,7 +42,7 @@ def png(image: NDArray[np.generic]) -> bytes:
     return cv2.imencode(".png", image)[1].tobytes()
 
 
-def way(frame: int) -> tuple[int, int]:
+def camera_position(frame: int) -> tuple[int, int]:
     """Position of the camera on the wall, pixels: it moves to the right, and up and down."""
     return STEP * frame, 4 + 2 * (frame % 4)
 
@@ -53,9 +53,9 @@ def write_base(folder: Path) -> None:
     (folder / "depth").mkdir()
     T_wc = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
     for i, stamp in enumerate(STAMPS):
-        (folder / "rgb" / f"{stamp}.png").write_bytes(png(colour(*way(i))))
+        (folder / "rgb" / f"{stamp}.png").write_bytes(png(colour(*camera_position(i))))
         (folder / "depth" / f"{stamp}.png").write_bytes(png(depth()))
-        T_wc[i, :2, 3] = torch.tensor(way(i)) * DEPTH / FOCAL
+        T_wc[i, :2, 3] = torch.tensor(camera_position(i)) * DEPTH / FOCAL
         # A tiny rotation: constant orientations count as placeholders in the evaluation.
         T_wc[i, :3, :3] = se3_exp(torch.tensor([0, 0, 0, 1e-6 * i, 0, 0], dtype=torch.float64))[:3, :3]
     for kind in ("rgb", "depth"):

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from helpers.corpus.base import CAMERA, FOCAL, HEIGHT, SCALE, WIDTH
-from helpers.corpus.case import Case, Make, Right, Says, all_of, edit, options, remove, replaced, write
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, add_options, all_of, edit, remove, replace_text, write
 
 YAML = "camera.yaml"
 NUMBERS = f"{FOCAL} {FOCAL} {(WIDTH - 1) / 2} {(HEIGHT - 1) / 2} {SCALE} {WIDTH} {HEIGHT}\n"
 
 
-def field(name: str, value: str) -> Make:
+def field(name: str, value: str) -> Damage:
     """Set a field of ``camera.yaml``."""
     lines = [f"{name}: {value}" if line.startswith(f"{name}:") else line for line in CAMERA.splitlines()]
     return write(YAML, "\n".join(lines) + "\n")
 
 
-def numbers(text: str) -> Make:
+def numbers(text: str) -> Damage:
     """Replace ``camera.yaml`` by a ``K.txt``."""
     return all_of(remove(YAML), write("K.txt", text))
 
@@ -31,7 +31,7 @@ CASES = [
     Case(
         "missing camera file",
         remove(YAML),
-        Says(
+        Fails(
             "{seq}: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height, depth_scale) or"
             " pass --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
         ),
@@ -39,43 +39,43 @@ CASES = [
     Case(
         "empty file",
         write(YAML, ""),
-        Says("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Fails("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
     ),
-    Case("invalid YAML", write(YAML, "fx: {525.0\n"), Says("{seq}/camera.yaml: is not valid YAML (...); repair it")),
+    Case("invalid YAML", write(YAML, "fx: {525.0\n"), Fails("{seq}/camera.yaml: is not valid YAML (...); repair it")),
     Case(
         "YAML that runs a command",
         write(YAML, "!!python/object/apply:os.system ['touch /tmp/owned']\n"),
-        Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
         "YAML with nested aliases",
         write(YAML, bomb() + "fx: *a8\n"),
-        Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
         "YAML with an anchor",
         write(YAML, CAMERA.replace(f"fx: {FOCAL}", f"fx: &f {FOCAL}").replace(f"fy: {FOCAL}", "fy: *f")),
-        Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
         "YAML with an invalid date",
         field("fx", "2024-99-99"),
-        Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
         "deeply nested YAML",
         write(YAML, 3000 * "[" + 3000 * "]"),
-        Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
         "list instead of fields",
         write(YAML, "- 525.0\n- 525.0\n"),
-        Says("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Fails("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
     ),
     Case(
         "missing field",
-        edit(YAML, replaced("fy:", "#fy:")),
-        Says(
+        edit(YAML, replace_text("fy:", "#fy:")),
+        Fails(
             "{seq}/camera.yaml: fy: field required, got {'cx': 39.5, 'cy': 29.5, 'depth_scale': 5000, 'fx':"
             " 64.0, ...}; correct the camera"
         ),
@@ -83,17 +83,17 @@ CASES = [
     Case(
         "duplicate field",
         edit(YAML, lambda content: content + b"fx: 100\n"),
-        Says("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
     ),
     Case(
         "unknown field",
         edit(YAML, lambda content: content + b"focal: 525\n"),
-        Says("{seq}/camera.yaml: focal: extra inputs are not permitted, got 525; correct the camera"),
+        Fails("{seq}/camera.yaml: focal: extra inputs are not permitted, got 525; correct the camera"),
     ),
     Case(
         "word instead of a number",
         field("cx", "middle"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: cx: input should be a valid number, unable to parse string as a number, got"
             " 'middle'; correct the camera"
         ),
@@ -101,37 +101,37 @@ CASES = [
     Case(
         "negative focal length",
         field("fx", "-525"),
-        Says("{seq}/camera.yaml: fx: input should be greater than or equal to 1, got -525; correct the camera"),
+        Fails("{seq}/camera.yaml: fx: input should be greater than or equal to 1, got -525; correct the camera"),
     ),
     Case(
         "zero focal length",
         field("fy", "0"),
-        Says("{seq}/camera.yaml: fy: input should be greater than or equal to 1, got 0; correct the camera"),
+        Fails("{seq}/camera.yaml: fy: input should be greater than or equal to 1, got 0; correct the camera"),
     ),
     Case(
         "focal length NaN",
         field("fx", ".nan"),
-        Says("{seq}/camera.yaml: fx: input should be a finite number, got nan; correct the camera"),
+        Fails("{seq}/camera.yaml: fx: input should be a finite number, got nan; correct the camera"),
     ),
     Case(
         "tiny focal length",
         field("fx", "1e-30"),
-        Says("{seq}/camera.yaml: fx: input should be greater than or equal to 1, got '1e-30'; correct the camera"),
+        Fails("{seq}/camera.yaml: fx: input should be greater than or equal to 1, got '1e-30'; correct the camera"),
     ),
     Case(
         "huge focal length",
         field("fx", "1e300"),
-        Says("{seq}/camera.yaml: fx: input should be less than or equal to 1000000, got '1e300'; correct the camera"),
+        Fails("{seq}/camera.yaml: fx: input should be less than or equal to 1000000, got '1e300'; correct the camera"),
     ),
     Case(
         "infinite principal point",
         field("cy", ".inf"),
-        Says("{seq}/camera.yaml: cy: input should be a finite number, got inf; correct the camera"),
+        Fails("{seq}/camera.yaml: cy: input should be a finite number, got inf; correct the camera"),
     ),
     Case(
         "principal point far outside the image",
         field("cx", "1e6"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: the principal point (1e+06, 29.5) is far outside the 80x60 image; correct cx"
             " and cy, or width and height"
         ),
@@ -139,12 +139,12 @@ CASES = [
     Case(
         "zero width",
         field("width", "0"),
-        Says("{seq}/camera.yaml: width: input should be greater than 0, got 0; correct the camera"),
+        Fails("{seq}/camera.yaml: width: input should be greater than 0, got 0; correct the camera"),
     ),
     Case(
         "fractional height",
         field("height", "47.5"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: height: input should be a valid integer, got a number with a fractional"
             " part, got 47.5; correct the camera"
         ),
@@ -152,14 +152,14 @@ CASES = [
     Case(
         "width of a billion pixels",
         field("width", "1000000000"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: width: input should be less than or equal to 8192, got 1000000000; correct the camera"
         ),
     ),
     Case(
         "size of a different camera",
         field("width", "640"),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x60; pass the camera of"
             " these images with --camera"
         ),
@@ -172,7 +172,7 @@ CASES = [
                 CAMERA.replace(f"width: {WIDTH}", f"width: {HEIGHT}").replace(f"height: {HEIGHT}", f"height: {WIDTH}"),
             )
         ),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 60x80; pass the camera of"
             " these images with --camera"
         ),
@@ -180,19 +180,19 @@ CASES = [
     Case(
         "zero depth scale",
         field("depth_scale", "0"),
-        Says("{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got 0; correct the camera"),
+        Fails("{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got 0; correct the camera"),
     ),
     Case(
         "negative depth scale",
         field("depth_scale", "-5000"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got -5000; correct the camera"
         ),
     ),
     Case(
         "tiny depth scale",
         field("depth_scale", "1e-30"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got '1e-30';"
             " correct the camera"
         ),
@@ -200,29 +200,29 @@ CASES = [
     Case(
         "depth scale in metres per unit",
         field("depth_scale", "0.0002"),
-        Says(
+        Fails(
             "{seq}/camera.yaml: depth_scale: input should be greater than or equal to 1, got 0.0002; correct the camera"
         ),
     ),
     Case(
         "readout in milliseconds",
         field("readout", "33"),
-        Says("{seq}/camera.yaml: readout: input should be less than or equal to 0.05, got 33; correct the camera"),
+        Fails("{seq}/camera.yaml: readout: input should be less than or equal to 0.05, got 33; correct the camera"),
     ),
     Case(
         "distortion with four numbers",
         edit(YAML, lambda content: content + b"distortion: [0.1, 0.1, 0, 0]\n"),
-        Says("{seq}/camera.yaml: distortion.4: field required, got [0.1, 0.1, 0, 0]; correct the camera"),
+        Fails("{seq}/camera.yaml: distortion.4: field required, got [0.1, 0.1, 0, 0]; correct the camera"),
     ),
     Case(
         "distortion with NaN",
         edit(YAML, lambda content: content + b"distortion: [.nan, 0, 0, 0, 0]\n"),
-        Says("{seq}/camera.yaml: distortion.0: input should be a finite number, got nan; correct the camera"),
+        Fails("{seq}/camera.yaml: distortion.0: input should be a finite number, got nan; correct the camera"),
     ),
     Case(
         "distortion that cannot be inverted",
         edit(YAML, lambda content: content + b"distortion: [-50, 0, 0, 0, 0]\n"),
-        Says(
+        Fails(
             "{seq}: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
             " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
@@ -230,7 +230,7 @@ CASES = [
     Case(
         "huge distortion",
         edit(YAML, lambda content: content + b"distortion: [1e30, 1e30, 1e30, 1e30, 1e30]\n"),
-        Says(
+        Fails(
             "{seq}: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image corners;"
             " correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
@@ -238,23 +238,23 @@ CASES = [
     Case(
         "Latin-1",
         edit(YAML, lambda content: b"# Gr\xf6\xdfe\n" + content),
-        Says("{seq}/camera.yaml: is not a text file in UTF-8; convert it to that, a camera is a YAML file or a K.txt"),
+        Fails("{seq}/camera.yaml: is not a text file in UTF-8; convert it to that, a camera is a YAML file or a K.txt"),
     ),
     Case(
         "byte order mark and Windows line endings",
         edit(YAML, lambda content: b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n")),
-        Right(),
+        Succeeds(),
     ),
-    Case("K.txt", numbers(NUMBERS), Right()),
+    Case("K.txt", numbers(NUMBERS), Succeeds()),
     Case(
         "K.txt with commas, comments and byte order mark",
         numbers("\ufeff# fx, fy ...\r\n" + NUMBERS.replace(" ", ",\r\n")),
-        Right(),
+        Succeeds(),
     ),
     Case(
         "empty K.txt",
         numbers(""),
-        Says(
+        Fails(
             "{seq}/K.txt: contains 0 numbers that do not form a camera; write fx fy cx cy depth_scale width"
             " height, or a 3x3 camera matrix without skew"
         ),
@@ -262,7 +262,7 @@ CASES = [
     Case(
         "K.txt with three numbers",
         numbers("525 319.5 239.5\n"),
-        Says(
+        Fails(
             "{seq}/K.txt: contains 3 numbers that do not form a camera; write fx fy cx cy depth_scale width"
             " height, or a 3x3 camera matrix without skew"
         ),
@@ -270,7 +270,7 @@ CASES = [
     Case(
         "K.txt with eight numbers",
         numbers(NUMBERS + "1\n"),
-        Says(
+        Fails(
             "{seq}/K.txt: contains 8 numbers that do not form a camera; write fx fy cx cy depth_scale width"
             " height, or a 3x3 camera matrix without skew"
         ),
@@ -278,7 +278,7 @@ CASES = [
     Case(
         "K.txt with words",
         numbers("fx=525 fy=525\n"),
-        Says(
+        Fails(
             "{seq}/K.txt: contains a value that is not a number (could not convert string to float: 'fx=525');"
             " write fx fy cx cy depth_scale width height"
         ),
@@ -286,17 +286,17 @@ CASES = [
     Case(
         "K.txt with NaN",
         numbers(NUMBERS.replace(f"{FOCAL} ", "nan ", 1)),
-        Says("{seq}/K.txt: fx: input should be a finite number, got nan; correct the camera"),
+        Fails("{seq}/K.txt: fx: input should be a finite number, got nan; correct the camera"),
     ),
     Case(
         "K.txt with zero focal length",
         numbers(NUMBERS.replace(f"{FOCAL} ", "0 ", 1)),
-        Says("{seq}/K.txt: fx: input should be greater than or equal to 1, got 0.0; correct the camera"),
+        Fails("{seq}/K.txt: fx: input should be greater than or equal to 1, got 0.0; correct the camera"),
     ),
     Case(
         "K.txt with a fractional width",
         numbers(NUMBERS.replace(f" {WIDTH} ", f" {WIDTH}.5 ")),
-        Says(
+        Fails(
             "{seq}/K.txt: width: input should be a valid integer, got a number with a fractional part, got"
             " 80.5; correct the camera"
         ),
@@ -304,7 +304,7 @@ CASES = [
     Case(
         "K.txt with a matrix, for 640x480 pixels",
         numbers("525 0 319.5\n0 525 239.5\n0 0 1\n"),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
             " these images with --camera"
         ),
@@ -312,7 +312,7 @@ CASES = [
     Case(
         "K.txt with a matrix with skew",
         numbers("525 3 319.5\n0 525 239.5\n0 0 1\n"),
-        Says(
+        Fails(
             "{seq}/K.txt: contains 9 numbers that do not form a camera; write fx fy cx cy depth_scale width"
             " height, or a 3x3 camera matrix without skew"
         ),
@@ -320,45 +320,45 @@ CASES = [
     Case(
         "K.txt with a number of 5000 digits",
         numbers(5000 * "1"),
-        Says(
+        Fails(
             "{seq}/K.txt: contains 1 numbers that do not form a camera; write fx fy cx cy depth_scale width"
             " height, or a 3x3 camera matrix without skew"
         ),
     ),
     Case(
         "--camera unknown",
-        options("--camera", "kinect"),
-        Says("kinect: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
+        add_options("--camera", "kinect"),
+        Fails("kinect: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
     ),
     Case(
         "--camera misspelled",
-        options("--camera", "tum_f3"),
-        Says("tum_f3: is not a camera file or preset; did you mean tum_fr3?"),
+        add_options("--camera", "tum_f3"),
+        Fails("tum_f3: is not a camera file or preset; did you mean tum_fr3?"),
     ),
     Case(
         "--camera with another image size",
-        options("--camera", "tum_fr3"),
-        Says(
+        add_options("--camera", "tum_fr3"),
+        Fails(
             "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
             " these images with --camera"
         ),
     ),
     Case(
         "--camera is a folder",
-        options("--camera", "{seq}"),
-        Says("{seq}: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
+        add_options("--camera", "{seq}"),
+        Fails("{seq}: is not a camera file or preset; the presets are d435i, tum_fr1, tum_fr2, tum_fr3"),
     ),
     Case(
         "--camera is an image",
-        options("--camera", "{seq}/rgb/1305031102.000000.png"),
-        Says(
+        add_options("--camera", "{seq}/rgb/1305031102.000000.png"),
+        Fails(
             "{seq}/rgb/1305031102.000000.png: is not a text file in UTF-8; convert it to that, a camera is"
             " a YAML file or a K.txt"
         ),
     ),
     Case(
         "--camera instead of an invalid file",
-        all_of(write(YAML, "?"), write("other.yaml", CAMERA), options("--camera", "{seq}/other.yaml")),
-        Right(),
+        all_of(write(YAML, "?"), write("other.yaml", CAMERA), add_options("--camera", "{seq}/other.yaml")),
+        Succeeds(),
     ),
 ]

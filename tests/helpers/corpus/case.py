@@ -12,7 +12,7 @@ from helpers.corpus.base import FRAMES
 
 
 @dataclass
-class Place:
+class Workspace:
     """Folder and command line of one case.
 
     Attributes:
@@ -35,41 +35,41 @@ class Place:
         """Folder of the results, the value of ``--out``. It does not exist before the run."""
         return self.root / "out"
 
-    def filled(self, text: str) -> str:
+    def fill_paths(self, text: str) -> str:
         """Replace ``{seq}``, ``{out}`` and ``{root}`` in a text by the paths."""
         return text.replace("{seq}", str(self.folder)).replace("{out}", str(self.out)).replace("{root}", str(self.root))
 
 
-Make = Callable[[Place], None]
+Damage = Callable[[Workspace], None]
 """Function that damages the sequence, or changes the command line, of a case."""
 
 
 @dataclass(frozen=True)
-class Right:
+class Succeeds:
     """Expected end of a run: exit code 0 and a correct result."""
 
     frames: int = FRAMES
     """Number of poses in the trajectory."""
     lost: int = 0
     """Number of frames with lost tracking."""
-    ate: float | None = 0.005
+    max_ate: float | None = 0.005
     """Upper limit of the absolute trajectory error (rmse), metres; None if the run has no scores."""
     note: str = ""
     """Text in the output of the command."""
 
 
 @dataclass(frozen=True)
-class Says:
+class Fails:
     """Expected end of a run: exit code 2 and a single error message on stderr."""
 
-    sentence: str
+    message: str
     """Whole text after ``error: ``. ``{seq}``, ``{out}`` and ``{root}`` stand for paths, ``...`` for any text."""
-    kept: int | None = None
+    saved_poses: int | None = None
     """Number of poses in the results; None if the run ends before any results are written."""
 
-    def fits(self, text: str, place: Place) -> bool:
+    def fits(self, text: str, place: Workspace) -> bool:
         """Check whether a message is the expected one."""
-        parts = (re.escape(part) for part in place.filled(self.sentence).split("..."))
+        parts = (re.escape(part) for part in place.fill_paths(self.message).split("..."))
         return re.fullmatch(".*".join(parts), text) is not None
 
 
@@ -79,90 +79,90 @@ class Case:
 
     name: str
     """Short description."""
-    make: Make
+    damage: Damage
     """Function that damages the sequence or changes the command line."""
-    ends: Right | Says
+    expected: Succeeds | Fails
     """Expected end of the run."""
-    during: Callable[[Place], AbstractContextManager[object]] = lambda place: nullcontext()
+    context: Callable[[Workspace], AbstractContextManager[object]] = lambda place: nullcontext()
     """Function that returns a context manager around the run."""
 
 
 # ---------------------------------------------------------------- ways to damage a sequence
 
 
-def edit(file: str, change: Callable[[bytes], bytes]) -> Make:
+def edit(file: str, change: Callable[[bytes], bytes]) -> Damage:
     """Change the content of a file of the sequence."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         path = place.folder / file
         path.write_bytes(change(path.read_bytes()))
 
     return make
 
 
-def write(file: str, content: str | bytes) -> Make:
+def write(file: str, content: str | bytes) -> Damage:
     """Write a file of the sequence; path placeholders in a text are replaced."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         path = place.folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content if isinstance(content, bytes) else place.filled(content).encode())
+        path.write_bytes(content if isinstance(content, bytes) else place.fill_paths(content).encode())
 
     return make
 
 
-def remove(*files: str) -> Make:
+def remove(*files: str) -> Damage:
     """Remove files of the sequence."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         for file in files:
             (place.folder / file).unlink()
 
     return make
 
 
-def options(*more: str) -> Make:
+def add_options(*more: str) -> Damage:
     """Add command line options; path placeholders are replaced."""
 
-    def make(place: Place) -> None:
-        place.options += [place.filled(option) for option in more]
+    def make(place: Workspace) -> None:
+        place.options += [place.fill_paths(option) for option in more]
 
     return make
 
 
-def only(*given: str) -> Make:
+def replace_options(*given: str) -> Damage:
     """Replace the default command line options; path placeholders are replaced."""
 
-    def make(place: Place) -> None:
-        place.options = [place.filled(option) for option in given]
+    def make(place: Workspace) -> None:
+        place.options = [place.fill_paths(option) for option in given]
 
     return make
 
 
-def seq(name: str) -> Make:
+def set_sequence(name: str) -> Damage:
     """Set the value of ``--seq``; path placeholders are replaced."""
 
-    def make(place: Place) -> None:
-        place.seq = place.filled(name)
+    def make(place: Workspace) -> None:
+        place.seq = place.fill_paths(name)
 
     return make
 
 
-def all_of(*makes: Make) -> Make:
+def all_of(*makes: Damage) -> Damage:
     """Combine several changes, applied in this order."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         for each in makes:
             each(place)
 
     return make
 
 
-def replaced(old: str, new: str) -> Callable[[bytes], bytes]:
+def replace_text(old: str, new: str) -> Callable[[bytes], bytes]:
     """Return a change that replaces a text."""
     return lambda content: content.replace(old.encode(), new.encode())
 
 
-def half(content: bytes) -> bytes:
+def first_half(content: bytes) -> bytes:
     """First half of a file, as an interrupted copy leaves it."""
     return content[: len(content) // 2]

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from helpers.corpus.base import HEIGHT, STAMPS, WIDTH, colour, depth, png, way
-from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, edit, half, write
+from helpers.corpus.base import HEIGHT, STAMPS, WIDTH, camera_position, colour, depth, png
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, all_of, edit, first_half, write
 
 RGB = [f"rgb/{stamp}.png" for stamp in STAMPS]
 DEPTH = [f"depth/{stamp}.png" for stamp in STAMPS]
 
 
-def every(files: list[str], content: Callable[[int], bytes]) -> Make:
+def every(files: list[str], content: Callable[[int], bytes]) -> Damage:
     """Rewrite each of these files, by its index."""
     return all_of(*(write(file, content(i)) for i, file in enumerate(files)))
 
@@ -34,30 +34,30 @@ def saved(image: NDArray[np.generic], form: str, **settings: object) -> bytes:
 def deep_colour(frame: int) -> bytes:
     """Colour image with 16 bits per channel, of which the low bytes are random."""
     low = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3))
-    return png((colour(*way(frame)).astype(np.uint16) << 8) + low.astype(np.uint16))
+    return png((colour(*camera_position(frame)).astype(np.uint16) << 8) + low.astype(np.uint16))
 
 
 def with_alpha(frame: int) -> bytes:
     """Colour image with an alpha channel that is 0 for half of the pixels."""
     alpha = np.tile(np.array([0, 255], np.uint8), (HEIGHT, WIDTH // 2))
-    return png(np.dstack([colour(*way(frame)), alpha]))
+    return png(np.dstack([colour(*camera_position(frame)), alpha]))
 
 
 def grey(frame: int) -> bytes:
     """Greyscale image."""
-    return png(cv2.cvtColor(colour(*way(frame)), cv2.COLOR_BGR2GRAY))
+    return png(cv2.cvtColor(colour(*camera_position(frame)), cv2.COLOR_BGR2GRAY))
 
 
 def palette(frame: int) -> bytes:
     """Colour image with a palette."""
     file = BytesIO()
-    Image.fromarray(colour(*way(frame))[..., ::-1]).quantize(256).save(file, "png")
+    Image.fromarray(colour(*camera_position(frame))[..., ::-1]).quantize(256).save(file, "png")
     return file.getvalue()
 
 
 def jpeg(frame: int) -> bytes:
     """Colour image encoded as JPEG."""
-    return cv2.imencode(".jpg", colour(*way(frame)), [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+    return cv2.imencode(".jpg", colour(*camera_position(frame)), [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
 
 
 def bomb(width: int, height: int, bits: int, kind: int) -> bytes:
@@ -78,7 +78,7 @@ def flip_bit(content: bytes) -> bytes:
     return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
 
 
-def swap_lists(place: Place) -> None:
+def swap_lists(place: Workspace) -> None:
     """Swap the lists of colour and depth images."""
     colours, depths = (place.folder / name for name in ("rgb.txt", "depth.txt"))
     text = colours.read_text()
@@ -86,87 +86,87 @@ def swap_lists(place: Place) -> None:
     depths.write_text(text)
 
 
-SMALL = cv2.resize(colour(*way(0)), (WIDTH // 2, HEIGHT // 2))
+SMALL = cv2.resize(colour(*camera_position(0)), (WIDTH // 2, HEIGHT // 2))
 PAGE = "<!DOCTYPE html>\n<html><body>404 Not Found</body></html>\n"
 
 CASES = [
     Case(
         "first colour image truncated",
-        edit(RGB[0], half),
-        Says("{seq}/rgb/1305031102.000000.png: is truncated or damaged; copy or download it again"),
+        edit(RGB[0], first_half),
+        Fails("{seq}/rgb/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "first depth image truncated",
-        edit(DEPTH[0], half),
-        Says("{seq}/depth/1305031102.000000.png: is truncated or damaged; copy or download it again"),
+        edit(DEPTH[0], first_half),
+        Fails("{seq}/depth/1305031102.000000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "colour image truncated",
-        edit(RGB[5], half),
-        Says(
+        edit(RGB[5], first_half),
+        Fails(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
             " of the 5 frames before are in {out}; go on with --resume {out})",
-            kept=5,
+            saved_poses=5,
         ),
     ),
     Case(
         "depth image truncated",
-        edit(DEPTH[5], half),
-        Says(
+        edit(DEPTH[5], first_half),
+        Fails(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
             " of the 5 frames before are in {out}; go on with --resume {out})",
-            kept=5,
+            saved_poses=5,
         ),
     ),
     Case(
         "colour image with a flipped bit",
         edit(RGB[5], flip_bit),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
             " of the 5 frames before are in {out}; go on with --resume {out})",
-            kept=5,
+            saved_poses=5,
         ),
     ),
     Case(
         "depth image with a flipped bit",
         edit(DEPTH[5], flip_bit),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
             " of the 5 frames before are in {out}; go on with --resume {out})",
-            kept=5,
+            saved_poses=5,
         ),
     ),
     Case(
         "empty colour image",
         write(RGB[5], ""),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
             " results of the 5 frames before are in {out}; go on with --resume {out})",
-            kept=5,
+            saved_poses=5,
         ),
     ),
     Case(
         "empty depth image",
         write(DEPTH[5], ""),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
             " results of the 5 frames before are in {out}; go on with --resume {out})",
-            kept=5,
+            saved_poses=5,
         ),
     ),
     Case(
         "web page instead of an image",
         write(RGB[2], PAGE),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
             " results of the 2 frames before are in {out}; go on with --resume {out})",
-            kept=2,
+            saved_poses=2,
         ),
     ),
     Case(
         "colour and depth swapped in the lists",
         swap_lists,
-        Says(
+        Fails(
             "{seq}/depth/1305031102.000000.png: is a 16-bit depth image, expected a colour image; check that"
             " colour and depth are not swapped"
         ),
@@ -174,27 +174,27 @@ CASES = [
     Case(
         "depth image instead of a colour image",
         write(RGB[4], png(depth())),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image, expected a colour image; check that"
             " colour and depth are not swapped (the results of the 4 frames before are in {out}; go on with"
             " --resume {out})",
-            kept=4,
+            saved_poses=4,
         ),
     ),
     Case(
         "colour image instead of a depth image",
         write(DEPTH[4], png(colour(0))),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour"
             " and depth are not swapped (the results of the 4 frames before are in {out}; go on with --resume"
             " {out})",
-            kept=4,
+            saved_poses=4,
         ),
     ),
     Case(
         "8-bit depth",
         every(DEPTH, lambda i: png((depth() >> 8).astype(np.uint8))),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.000000.png: is an 8-bit image, depth needs 16 bits; export depth again"
             " without rescaling"
         ),
@@ -202,16 +202,16 @@ CASES = [
     Case(
         "8-bit depth in one frame",
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.400000.png: is an 8-bit image, depth needs 16 bits; export depth again"
             " without rescaling (the results of the 4 frames before are in {out}; go on with --resume {out})",
-            kept=4,
+            saved_poses=4,
         ),
     ),
     Case(
         "colour-mapped depth",
         every(DEPTH, lambda i: png(cv2.applyColorMap((depth() >> 8).astype(np.uint8), 2))),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
             " and depth are not swapped"
         ),
@@ -219,20 +219,20 @@ CASES = [
     Case(
         "16-bit depth with three channels",
         every(DEPTH, lambda i: png(np.dstack(3 * [depth()]))),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
             " and depth are not swapped"
         ),
     ),
-    Case("16-bit colour", every(RGB, deep_colour), Right()),
-    Case("colour with an alpha channel", every(RGB, with_alpha), Right()),
-    Case("greyscale images", every(RGB, grey), Right()),
-    Case("images with a palette", every(RGB, palette), Right()),
-    Case("JPEG named PNG", every(RGB, jpeg), Right()),
+    Case("16-bit colour", every(RGB, deep_colour), Succeeds()),
+    Case("colour with an alpha channel", every(RGB, with_alpha), Succeeds()),
+    Case("greyscale images", every(RGB, grey), Succeeds()),
+    Case("images with a palette", every(RGB, palette), Succeeds()),
+    Case("JPEG named PNG", every(RGB, jpeg), Succeeds()),
     Case(
         "depth as JPEG",
         every(DEPTH, jpeg),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.000000.png: is a colour image, expected a depth image; check that colour"
             " and depth are not swapped"
         ),
@@ -240,27 +240,27 @@ CASES = [
     Case(
         "floating-point depth with NaN",
         every(DEPTH, lambda i: saved(np.full((HEIGHT, WIDTH), np.nan, np.float32), "tiff")),
-        Says("{seq}/depth/1305031102.000000.png: is a floating-point image; export depth as 16-bit PNG"),
+        Fails("{seq}/depth/1305031102.000000.png: is a floating-point image; export depth as 16-bit PNG"),
     ),
     Case(
         "depth as OpenEXR",
         every(DEPTH, lambda i: b"v/1\x01\x02\0\0\0channels\0chlist\0" + bytes(300)),
-        Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
+        Fails("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "depth as a NumPy array",
         every(DEPTH, lambda i: b"\x93NUMPY\x01\0v\0{'descr': '<f4', 'fortran_order': False}" + bytes(300)),
-        Says("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
+        Fails("{seq}/depth/1305031102.000000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "32-bit depth, negative for missing depth",
         every(DEPTH, lambda i: saved(np.where(np.arange(WIDTH) % 8, depth(), -1).astype(np.int32), "tiff")),
-        Right(),
+        Succeeds(),
     ),
     Case(
         "colour smaller than depth",
-        every(RGB, lambda i: png(cv2.resize(colour(*way(i)), (WIDTH // 2, HEIGHT // 2)))),
-        Says(
+        every(RGB, lambda i: png(cv2.resize(colour(*camera_position(i)), (WIDTH // 2, HEIGHT // 2)))),
+        Fails(
             "{seq}/depth/1305031102.000000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
             " that is registered to the colour image"
         ),
@@ -268,7 +268,7 @@ CASES = [
     Case(
         "depth smaller than colour",
         every(DEPTH, lambda i: png(depth()[::2, ::2])),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.000000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
             " that is registered to the colour image"
         ),
@@ -276,7 +276,7 @@ CASES = [
     Case(
         "both images smaller than the camera",
         all_of(every(RGB, lambda i: png(SMALL)), every(DEPTH, lambda i: png(depth()[::2, ::2]))),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, but the camera has 80x60; pass the camera of"
             " these images with --camera"
         ),
@@ -284,55 +284,55 @@ CASES = [
     Case(
         "one colour image of another size",
         write(RGB[3], png(SMALL)),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
             " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
             " with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "one depth image of another size",
         write(DEPTH[3], png(depth()[::2, ::2])),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
             " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
             " with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "one rotated depth image",
         write(DEPTH[3], png(depth().T.copy())),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
             " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
             " with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "colour image with a header of 40000 x 40000 pixels",
         write(RGB[3], bomb(40000, 40000, 8, 2)),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
             " export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "depth image with a header of 40000 x 40000 pixels",
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
-        Says(
+        Fails(
             "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy"
             " or export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "first image with a header of 40000 x 40000 pixels",
         write(RGB[0], bomb(40000, 40000, 8, 2)),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.000000.png: has more than 64 million pixels according to its header; copy or"
             " export it again"
         ),

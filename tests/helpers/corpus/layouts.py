@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, colour, depth, png, way
-from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, half, options, write
+from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, camera_position, colour, depth, png
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, write
 
 MILLIMETRES = png((depth() // 5).astype(np.uint16))
 CAMERA_MATRIX = f"{FOCAL} 0 {(WIDTH - 1) / 2} 0\n0 {FOCAL} {(HEIGHT - 1) / 2} 0\n0 0 1 0\n0 0 0 1\n"
@@ -16,14 +16,14 @@ LOST = 4 * b"-inf -inf -inf -inf\n"
 
 def pose(frame: int) -> str:
     """True pose, with a tiny rotation: constant orientations count as placeholders in the evaluation."""
-    x, y = way(frame)
+    x, y = camera_position(frame)
     return f"1 0 0 {x / FOCAL}\n0 1 {-1e-6 * frame} {y / FOCAL}\n0 {1e-6 * frame} 1 0\n0 0 0 1\n"
 
 
-def take(files: dict[str, bytes]) -> Make:
+def take(files: dict[str, bytes]) -> Damage:
     """Write these files to a new folder and use it as the sequence."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         for name, content in files.items():
             path = place.root / "take" / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -38,7 +38,7 @@ def scannet() -> dict[str, bytes]:
     files = {f"intrinsic/intrinsic_{kind}.txt": CAMERA_MATRIX.encode() for kind in ("color", "depth")}
     for i in range(FRAMES):
         files |= {
-            f"color/{i}.png": png(colour(*way(i))),
+            f"color/{i}.png": png(colour(*camera_position(i))),
             f"depth/{i}.png": MILLIMETRES,
             f"pose/{i}.txt": pose(i).encode(),
         }
@@ -50,7 +50,7 @@ def seven_scenes() -> dict[str, bytes]:
     files = {"camera.yaml": CAMERA.replace("5000", "1000").encode()}
     for i in range(FRAMES):
         name = f"frame-{i:06d}"
-        files |= {f"{name}.color.png": png(colour(*way(i))), f"{name}.depth.png": MILLIMETRES}
+        files |= {f"{name}.color.png": png(colour(*camera_position(i))), f"{name}.depth.png": MILLIMETRES}
         files[f"{name}.pose.txt"] = pose(i).encode()
     return files
 
@@ -59,11 +59,11 @@ def images() -> dict[str, bytes]:
     """Images without lists, with names that are not timestamps."""
     files = {"camera.yaml": CAMERA.encode()}
     for i in range(FRAMES):
-        files |= {f"rgb/{i}.png": png(colour(*way(i))), f"depth/{i}.png": png(depth())}
+        files |= {f"rgb/{i}.png": png(colour(*camera_position(i))), f"depth/{i}.png": png(depth())}
     return files
 
 
-def changed(files: dict[str, bytes], name: str, change: Callable[[bytes], bytes]) -> Make:
+def changed(files: dict[str, bytes], name: str, change: Callable[[bytes], bytes]) -> Damage:
     """Use these files as the sequence, after a change of one of them."""
     return take(files | {name: change(files[name])})
 
@@ -78,10 +78,10 @@ def without(files: dict[str, bytes], *prefixes: str) -> dict[str, bytes]:
     return {name: content for name, content in files.items() if not name.startswith(prefixes)}
 
 
-def openloris(sensors: str | bytes) -> Make:
+def openloris(sensors: str | bytes) -> Damage:
     """Convert the sequence to an OpenLORIS package."""
 
-    def rename(place: Place) -> None:
+    def rename(place: Workspace) -> None:
         (place.folder / "rgb.txt").rename(place.folder / "color.txt")
         (place.folder / "depth.txt").rename(place.folder / "aligned_depth.txt")
         (place.folder / "camera.yaml").unlink()
@@ -89,41 +89,41 @@ def openloris(sensors: str | bytes) -> Make:
     return all_of(rename, write("sensors.yaml", sensors))
 
 
-def icl_nuim(groundtruth: str) -> Make:
+def icl_nuim(groundtruth: str) -> Damage:
     """Convert the sequence to the layout of ICL-NUIM, with frame numbers instead of timestamps."""
     listed = "".join(f"{i} depth/{stamp}.png {i} rgb/{stamp}.png\n" for i, stamp in enumerate(STAMPS))
     return all_of(write("associations.txt", listed), write("traj0.gt.freiburg", groundtruth))
 
 
 CASES = [
-    Case("ScanNet", take(scannet()), Right()),
-    Case("ScanNet, lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Right()),
-    Case("ScanNet, no poses", take(without(scannet(), "pose")), Right(ate=None)),
+    Case("ScanNet", take(scannet()), Succeeds()),
+    Case("ScanNet, lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Succeeds()),
+    Case("ScanNet, no poses", take(without(scannet(), "pose")), Succeeds(max_ate=None)),
     Case(
         "ScanNet, truncated pose",
-        changed(scannet(), "pose/3.txt", half),
-        Says(
+        changed(scannet(), "pose/3.txt", first_half),
+        Fails(
             "{root}/take/pose/3.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "ScanNet, pose that is not a rigid transform",
         changed(scannet(), "pose/3.txt", lambda content: 4 * b"1 2 3 4\n"),
-        Says(
+        Fails(
             "{root}/take/pose/3.txt: is not a valid rigid transform; copy it again (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "ScanNet, truncated camera",
-        changed(scannet(), "intrinsic/intrinsic_depth.txt", half),
-        Says("{root}/take/intrinsic/intrinsic_depth.txt: is not a 3x3 or 4x4 matrix; copy it again"),
+        changed(scannet(), "intrinsic/intrinsic_depth.txt", first_half),
+        Fails("{root}/take/intrinsic/intrinsic_depth.txt: is not a 3x3 or 4x4 matrix; copy it again"),
     ),
     Case(
         "ScanNet, camera of NaN",
         changed(scannet(), "intrinsic/intrinsic_depth.txt", lambda content: 4 * b"nan nan nan nan\n"),
-        Says(
+        Fails(
             "{root}/take/intrinsic/intrinsic_depth.txt: is not a camera matrix with focal lengths of at least 1"
             " pixel on its diagonal; copy it again"
         ),
@@ -131,7 +131,7 @@ CASES = [
     Case(
         "ScanNet, colour camera of zeros",
         changed(larger_colour(scannet()), "intrinsic/intrinsic_color.txt", lambda content: 4 * b"0 0 0 0\n"),
-        Says(
+        Fails(
             "{root}/take/intrinsic/intrinsic_color.txt: is not a camera matrix with focal lengths of at least 1"
             " pixel on its diagonal; copy it again"
         ),
@@ -139,52 +139,52 @@ CASES = [
     Case(
         "ScanNet, no depth",
         take(without(scannet(), "depth") | {"depth/x.txt": b""}),
-        Says(
+        Fails(
             "{root}/take: no colour image has the same frame number as a depth image; check that both belong to"
             " the same recording"
         ),
     ),
-    Case("7-Scenes", take(seven_scenes()), Right()),
+    Case("7-Scenes", take(seven_scenes()), Succeeds()),
     Case(
         "7-Scenes, pose of words",
         changed(seven_scenes(), "frame-000003.pose.txt", lambda content: b"lost\n"),
-        Says(
+        Fails(
             "{root}/take/frame-000003.pose.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "7-Scenes, truncated image",
-        changed(seven_scenes(), "frame-000003.depth.png", half),
-        Says(
+        changed(seven_scenes(), "frame-000003.depth.png", first_half),
+        Fails(
             "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again (the"
             " results of the 3 frames before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "7-Scenes, colour without depth",
         take(without(seven_scenes(), *(f"frame-{i:06d}.depth" for i in range(1, FRAMES)))),
-        Right(1, ate=None),
+        Succeeds(1, max_ate=None),
     ),
     Case(
         "ICL-NUIM, truncated ground truth",
         icl_nuim("1 2 3\n"),
-        Says(
+        Fails(
             "{seq}/traj0.gt.freiburg: line 1 is '1 2 3', expected timestamp tx ty tz qx qy qz qw; correct or"
             " remove it (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "OpenLORIS, invalid camera file",
         openloris("%YAML:1.0\nd400_color_optical_frame: [\n"),
-        Says("{seq}/sensors.yaml: is not valid OpenCV YAML (...); copy it again"),
+        Fails("{seq}/sensors.yaml: is not valid OpenCV YAML (...); copy it again"),
     ),
     Case(
         "OpenLORIS, no camera",
         openloris("%YAML:1.0\nt265_fisheye1_optical_frame:\n   width: 848\n"),
-        Says(
+        Fails(
             "{seq}/sensors.yaml: has no d400_color_optical_frame with width, height and intrinsics; copy it"
             " again, or pass --camera"
         ),
@@ -195,7 +195,7 @@ CASES = [
             "%YAML:1.0\nd400_color_optical_frame:\n   intrinsics: !!opencv-matrix\n      rows: 1\n      col: 4\n"
             "      dt: d\n      data: [ 1., 2. ]\n"
         ),
-        Says(
+        Fails(
             "{seq}/sensors.yaml: has no d400_color_optical_frame with width, height and intrinsics; copy it"
             " again, or pass --camera"
         ),
@@ -203,31 +203,37 @@ CASES = [
     Case(
         "OpenLORIS, camera file of random bytes",
         openloris(NOISE),
-        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it contains YAML written by OpenCV"),
+        Fails(
+            "{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it contains YAML written by OpenCV"
+        ),
     ),
     Case(
         "images without timestamps",
         take(images()),
-        Says("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
+        Fails("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
     ),
-    Case("images without timestamps, with --fps", all_of(take(images()), options("--fps", "10")), Right(ate=None)),
+    Case(
+        "images without timestamps, with --fps",
+        all_of(take(images()), add_options("--fps", "10")),
+        Succeeds(max_ate=None),
+    ),
     Case(
         "images, one without depth",
-        all_of(take(without(images(), "depth/7")), options("--fps", "10")),
-        Right(7, ate=None),
+        all_of(take(without(images(), "depth/7")), add_options("--fps", "10")),
+        Succeeds(7, max_ate=None),
     ),
     Case(
         "images that cannot be paired",
-        all_of(take(without(images(), "depth") | {"depth/a.png": png(depth())}), options("--fps", "10")),
-        Says(
+        all_of(take(without(images(), "depth") | {"depth/a.png": png(depth())}), add_options("--fps", "10")),
+        Fails(
             "{root}/take: has 8 colour and 1 depth images that cannot be paired by name; give the two images of"
             " a frame the same name"
         ),
     ),
     Case(
         "images in too many folders",
-        all_of(take(images() | {"rgb_right/0.png": png(colour(0))}), options("--fps", "10")),
-        Says(
+        all_of(take(images() | {"rgb_right/0.png": png(colour(0))}), add_options("--fps", "10")),
+        Fails(
             "{root}/take: has too many image folders (rgb, rgb_right, depth); keep one folder of colour and one"
             " of depth images"
         ),

@@ -12,7 +12,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 from helpers.corpus.base import STAMPS
-from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, options, write
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, write
 from helpers.corpus.privileges import without_root_rights
 from v3d_torch.datasets.tum import TUMSequence
 
@@ -54,17 +54,17 @@ def broke() -> None:
     raise ZeroDivisionError("an error of the program")
 
 
-def out_is_a_file(place: Place) -> None:
+def out_is_a_file(place: Workspace) -> None:
     place.out.write_text("")
 
 
-def out_below_a_file(place: Place) -> None:
+def out_below_a_file(place: Workspace) -> None:
     (place.root / "file").write_text("")
     place.options += ["--out", str(place.root / "file" / "out")]
 
 
-def closed(path_of: Callable[[Place], Path]) -> Make:
-    def make(place: Place) -> None:
+def closed(path_of: Callable[[Workspace], Path]) -> Damage:
+    def make(place: Workspace) -> None:
         path = path_of(place)
         path.mkdir(parents=True, exist_ok=True)
         path.chmod(0o500)
@@ -72,186 +72,186 @@ def closed(path_of: Callable[[Place], Path]) -> Make:
     return make
 
 
-def results_of_an_earlier_run(place: Place) -> None:
+def results_of_an_earlier_run(place: Workspace) -> None:
     """With masks of other times and a file of the user's own."""
     (place.out / "masks").mkdir(parents=True)
     for name in ("trajectory.txt", "run.log", "masks/1.000000.png", "notes.txt"):
         (place.out / name).write_text("of an earlier run")
 
 
-def same_as_the_sequence(place: Place) -> None:
+def same_as_the_sequence(place: Workspace) -> None:
     place.options += ["--out", str(place.folder)]
 
 
-def unreadable(file: str) -> Make:
-    def make(place: Place) -> None:
+def unreadable(file: str) -> Damage:
+    def make(place: Workspace) -> None:
         (place.folder / file).chmod(0)
 
     return make
 
 
-SAVE = options("--save-masks")
-SERIAL = options("--serial")
+SAVE = add_options("--save-masks")
+SERIAL = add_options("--serial")
 """A frame is read when the one before is done with, so that what happens then happens at the same place each time."""
 
 CASES = [
-    Case("a file", out_is_a_file, Says("{out}: cannot be made (File exists); choose another folder with --out")),
+    Case("a file", out_is_a_file, Fails("{out}: cannot be made (File exists); choose another folder with --out")),
     Case(
         "below a file",
         out_below_a_file,
-        Says("{root}/file/out: cannot be made (Not a directory); choose another folder with --out"),
+        Fails("{root}/file/out: cannot be made (Not a directory); choose another folder with --out"),
     ),
     Case(
         "a loop of links",
         lambda place: place.out.symlink_to(place.out),
-        Says("{out}: cannot be made (File exists); choose another folder with --out"),
+        Fails("{out}: cannot be made (File exists); choose another folder with --out"),
     ),
     Case(
         "a name of 5000 letters",
-        options("--out", "{root}/" + 5000 * "x"),
-        Says("{root}/...: cannot be made (File name too long); choose another folder with --out"),
+        add_options("--out", "{root}/" + 5000 * "x"),
+        Fails("{root}/...: cannot be made (File name too long); choose another folder with --out"),
     ),
     Case(
         "the folder of the sequence",
         same_as_the_sequence,
-        Says("{seq}/groundtruth.txt: is there and was left by no run; choose another folder with --out"),
+        Fails("{seq}/groundtruth.txt: is there and was left by no run; choose another folder with --out"),
     ),
     Case(
         "a folder with a map of somebody else's",
         write("../out/map.ply", "of somebody else"),
-        Says("{out}/map.ply: is there and was left by no run; choose another folder with --out"),
+        Fails("{out}/map.ply: is there and was left by no run; choose another folder with --out"),
     ),
-    Case("a folder with something else", write("../out/thesis.tex", ""), Right()),
+    Case("a folder with something else", write("../out/thesis.tex", ""), Succeeds()),
     Case(
         "masks that are read from where they would be written",
-        all_of(write("../out/masks/1.png", ""), options("--segmenter", "masks", "--masks", "{out}/masks")),
-        Says("{out}/masks: would be written to while it is read; choose another folder with --out"),
+        all_of(write("../out/masks/1.png", ""), add_options("--segmenter", "masks", "--masks", "{out}/masks")),
+        Fails("{out}/masks: would be written to while it is read; choose another folder with --out"),
     ),
-    Case("an empty folder", lambda place: place.out.mkdir(), Right()),
-    Case("results of an earlier run", all_of(results_of_an_earlier_run, SAVE), Right()),
+    Case("an empty folder", lambda place: place.out.mkdir(), Succeeds()),
+    Case("results of an earlier run", all_of(results_of_an_earlier_run, SAVE), Succeeds()),
     Case(
         "a folder that may not be written",
         closed(lambda place: place.out),
-        Says("{out}/run.log: cannot be written (Permission denied); choose another folder with --out"),
+        Fails("{out}/run.log: cannot be written (Permission denied); choose another folder with --out"),
         lambda place: without_root_rights(),
     ),
     Case(
         "in a folder that may not be written",
-        all_of(closed(lambda place: place.root / "closed"), options("--out", "{root}/closed/out")),
-        Says("{root}/closed/out: cannot be made (Permission denied); choose another folder with --out"),
+        all_of(closed(lambda place: place.root / "closed"), add_options("--out", "{root}/closed/out")),
+        Fails("{root}/closed/out: cannot be made (Permission denied); choose another folder with --out"),
         lambda place: without_root_rights(),
     ),
     Case(
         "the disk is full from the start",
         lambda place: None,
-        Says("{out}/config.yaml: cannot be written (File too large); free the disk or choose another folder"),
+        Fails("{out}/config.yaml: cannot be written (File too large); free the disk or choose another folder"),
         lambda place: no_file_larger_than(0),
     ),
     Case(
         "the disk becomes full",
         lambda place: None,
-        Says("{out}/...: cannot be written (File too large); free the disk or choose another folder", kept=8),
+        Fails("{out}/...: cannot be written (File too large); free the disk or choose another folder", saved_poses=8),
         lambda place: no_file_larger_than(9000),
     ),
     Case(
         "the disk becomes full while masks are saved",
         all_of(SAVE, SERIAL),
-        Says("{out}/trajectory.txt: cannot be written (File too large); free the disk or choose another folder"),
+        Fails("{out}/trajectory.txt: cannot be written (File too large); free the disk or choose another folder"),
         lambda place: full_from_frame(3),
     ),
     Case(
         "the folder is removed during the run",
         all_of(SAVE, SERIAL),
-        Right(),
+        Succeeds(),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.out)),
     ),
     Case(
         "the folder becomes a file during the run",
         all_of(SAVE, SERIAL),
-        Says("{out}/trajectory.txt: cannot be written (File exists); free the disk or choose another folder"),
+        Fails("{out}/trajectory.txt: cannot be written (File exists); free the disk or choose another folder"),
         lambda place: at_frame(4, lambda: (shutil.rmtree(place.out), place.out.write_text(""))),
     ),
     Case(
         "the sequence is removed during the run",
         lambda place: None,
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.400000.png: is listed but does not exist; copy the whole sequence again (the"
             " results of the 4 frames before are in {out}; go on with --resume {out})",
-            kept=4,
+            saved_poses=4,
         ),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.folder)),
     ),
     Case(
         "the program fails at a frame",
         lambda place: None,
-        Says(
+        Fails(
             "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
             " (the results of the 4 frames before are in {out}; go on with --resume {out})",
-            kept=4,
+            saved_poses=4,
         ),
         lambda place: at_frame(4, broke),
     ),
     Case(
         "Ctrl-C",
         SERIAL,
-        Says(
+        Fails(
             "interrupted after 5 of 8 frames (the results of the 5 frames before are in {out}; go on with --resume"
             " {out})",
-            kept=5,
+            saved_poses=5,
         ),
         lambda place: at_frame(4, lambda: os.kill(os.getpid(), signal.SIGINT)),
     ),
     Case(
         "a list that may not be read",
         unreadable("rgb.txt"),
-        Says("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and who may read it"),
+        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and who may read it"),
         lambda place: without_root_rights(),
     ),
     Case(
         "an image that may not be read",
         unreadable(f"rgb/{STAMPS[4]}.png"),
-        Says(
+        Fails(
             "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check its permissions (the"
             " results of the 4 frames before are in {out}; go on with --resume {out})",
-            kept=4,
+            saved_poses=4,
         ),
         lambda place: without_root_rights(),
     ),
     Case(
         "a folder of images that may not be read",
         unreadable("rgb"),
-        Says("{seq}/rgb/1305031102.000000.png: cannot be read (Permission denied); check its name and permissions"),
+        Fails("{seq}/rgb/1305031102.000000.png: cannot be read (Permission denied); check its name and permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
         "a sequence that may not be read",
         unreadable("."),
-        Says("{seq}/metadata.yaml: cannot be read (Permission denied); check its name and permissions"),
+        Fails("{seq}/metadata.yaml: cannot be read (Permission denied); check its name and permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
         "a camera that may not be read",
         unreadable("camera.yaml"),
-        Says("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and who may read it"),
+        Fails("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and who may read it"),
         lambda place: without_root_rights(),
     ),
     Case(
         "a ground truth that may not be read",
         unreadable("groundtruth.txt"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and who may"
             " read it (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
         lambda place: without_root_rights(),
     ),
     Case(
         "true masks of another size",
         write(f"masks/{STAMPS[3]}.png", b"\x89PNG\r\n\x1a\n"),
-        Says(
+        Fails(
             "{seq}/masks/1305031102.300000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
             " results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
 ]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from helpers.bags import DEPTH, INFO, RGB, Kind, Message, Messages
-from helpers.corpus.base import FOCAL, FRAMES, HEIGHT, NOISE, WIDTH, colour, depth, way
-from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, half, options, seq
+from helpers.corpus.base import FOCAL, FRAMES, HEIGHT, NOISE, WIDTH, camera_position, colour, depth
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, set_sequence
 
 K = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
 P = [*K[:3], 0, *K[3:6], 0, *K[6:], 0]
@@ -19,15 +19,15 @@ MILLIMETRES = (depth() // 5).astype(np.uint16)
 Change = Callable[[Messages, list[Message]], list[Message]]
 
 
-def bag(kind: Kind, change: Change | None = None) -> Make:
+def bag(kind: Kind, change: Change | None = None) -> Damage:
     """The sequence as a bag, its messages changed; of a ROS 2 bag the file, beside which its metadata stay."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         to = Messages(kind)
         messages: list[Message] = [(INFO, 10.0, to.info(WIDTH, HEIGHT, K, [], P))]
         for i in range(FRAMES):
             stamp = 10 + i / 10
-            messages.append((RGB, stamp, to.image(stamp, "bgr8", colour(*way(i)))))
+            messages.append((RGB, stamp, to.image(stamp, "bgr8", colour(*camera_position(i)))))
             messages.append((DEPTH, stamp, to.image(stamp, "16UC1", MILLIMETRES)))
         path = to.write(place.root / "take", change(to, messages) if change is not None else messages)
         place.seq = str(path if kind == "bag" else next(path.glob(f"*.{kind}")))
@@ -71,94 +71,94 @@ def with_holes(to: Messages, at: float) -> object:
     return to.image(at, "32FC1", metres)
 
 
-def cut(change: Callable[[bytes], bytes]) -> Make:
+def cut(change: Callable[[bytes], bytes]) -> Damage:
     """Change the bytes of the bag."""
 
-    def make(place: Place) -> None:
+    def make(place: Workspace) -> None:
         path = Path(place.seq)
         path.write_bytes(change(path.read_bytes()))
 
     return make
 
 
-def noise(name: str) -> Make:
+def noise(name: str) -> Damage:
     """A file of noise under a name, given as the sequence."""
-    return all_of(lambda place: (place.root / name).write_bytes(NOISE), seq("{root}/" + name))
+    return all_of(lambda place: (place.root / name).write_bytes(NOISE), set_sequence("{root}/" + name))
 
 
-def other_database(place: Place) -> None:
+def other_database(place: Workspace) -> None:
     with sqlite3.connect(place.root / "notes.db3") as database:
         database.execute("CREATE TABLE notes (text TEXT)")
     database.close()
 
 
-def without_metadata(place: Place) -> None:
+def without_metadata(place: Workspace) -> None:
     (place.root / "take" / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
 
 
 CASES = [
-    Case("bag of ROS 1", bag("bag"), Right(ate=None)),
-    Case("bag of ROS 2", bag("db3"), Right(ate=None)),
-    Case("mcap", bag("mcap"), Right(ate=None)),
+    Case("bag of ROS 1", bag("bag"), Succeeds(max_ate=None)),
+    Case("bag of ROS 2", bag("db3"), Succeeds(max_ate=None)),
+    Case("mcap", bag("mcap"), Succeeds(max_ate=None)),
     Case(
         "ROS 1 breaks off",
-        all_of(bag("bag"), cut(half)),
-        Says("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        all_of(bag("bag"), cut(first_half)),
+        Fails("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
         "ROS 2 breaks off",
-        all_of(bag("db3"), cut(half)),
-        Says("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        all_of(bag("db3"), cut(first_half)),
+        Fails("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "mcap breaks off",
-        all_of(bag("mcap"), cut(half)),
-        Says("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        all_of(bag("mcap"), cut(first_half)),
+        Fails("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
         "ROS 1 is empty",
         all_of(bag("bag"), cut(lambda content: b"")),
-        Says("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        Fails("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
         "ROS 2 is empty",
         all_of(bag("db3"), cut(lambda content: b"")),
-        Says("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Fails("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "mcap is empty",
         all_of(bag("mcap"), cut(lambda content: b"")),
-        Says("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        Fails("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
         "ROS 1 is noise",
         noise("take.bag"),
-        Says("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        Fails("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
         "ROS 2 is noise",
         noise("take.db3"),
-        Says("{root}/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Fails("{root}/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "mcap is noise",
         noise("take.mcap"),
-        Says("{root}/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        Fails("{root}/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
         "another database",
-        all_of(other_database, seq("{root}/notes.db3")),
-        Says("{root}/notes.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        all_of(other_database, set_sequence("{root}/notes.db3")),
+        Fails("{root}/notes.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "a ROS 2 folder whose metadata are broken",
-        all_of(bag("db3"), without_metadata, seq("{root}/take")),
-        Says("{root}/take: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        all_of(bag("db3"), without_metadata, set_sequence("{root}/take")),
+        Fails("{root}/take: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "no camera",
         bag("mcap", without(INFO)),
-        Says(
+        Fails(
             "{root}/take/take.mcap: has no camera beside /camera/color/image_raw; name it with"
             " --info-topic, or give --camera"
         ),
@@ -166,14 +166,14 @@ CASES = [
     Case(
         "no depth",
         bag("bag", without(DEPTH)),
-        Says(
+        Fails(
             "{root}/take.bag: no topic has the name of depth images; give --depth-topic one of /camera/color/image_raw"
         ),
     ),
     Case(
         "no colour",
         bag("mcap", without(RGB)),
-        Says(
+        Fails(
             "{root}/take/take.mcap: no topic has the name of colour images; give --rgb-topic one of"
             " /camera/aligned_depth_to_color/image_raw"
         ),
@@ -181,12 +181,12 @@ CASES = [
     Case(
         "no images",
         bag("bag", lambda to, messages: messages[:1]),
-        Says("{root}/take.bag: holds no images; record the topics of colour, of depth and of their camera"),
+        Fails("{root}/take.bag: holds no images; record the topics of colour, of depth and of their camera"),
     ),
     Case(
         "two clocks",
         bag("db3", with_all(DEPTH, lambda to, at: to.image(at + 100, "16UC1", MILLIMETRES))),
-        Says(
+        Fails(
             "{root}/take/take.db3: no image on /camera/color/image_raw lies within 0.02 s of one on"
             " /camera/aligned_depth_to_color/image_raw; choose others with --rgb-topic and --depth-topic"
         ),
@@ -194,7 +194,7 @@ CASES = [
     Case(
         "depth of 8 bits",
         bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "mono8", colour(0)[..., 0]))),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: holds mono8 images, not"
             " depth; name another with --depth-topic"
         ),
@@ -202,7 +202,7 @@ CASES = [
     Case(
         "depth for colour",
         bag("mcap", with_all(RGB, lambda to, at: to.image(at, "16UC1", MILLIMETRES))),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/color/image_raw: holds 16UC1 images, not colour; name another"
             " with --rgb-topic, or have them converted to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
             " 8UC1, bayer_rggb8, bayer_bggr8, bayer_gbrg8, bayer_grbg8, yuv422, uyvy, yuv422_yuy2, yuyv"
@@ -211,16 +211,16 @@ CASES = [
     Case(
         "depth of another size",
         bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, but its colour"
             " image has 80x60; name depth that is registered to colour with --depth-topic"
         ),
     ),
-    Case("depth with NaN", bag("mcap", with_all(DEPTH, with_holes)), Right(ate=None)),
+    Case("depth with NaN", bag("mcap", with_all(DEPTH, with_holes)), Succeeds(max_ate=None)),
     Case(
         "images shorter than they say",
         bag("mcap", with_all(RGB, too_high)),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 80x1000000"
             " pixels need; record it again"
         ),
@@ -228,12 +228,12 @@ CASES = [
     Case(
         "images without pixels",
         bag("mcap", with_all(RGB, without_size)),
-        Says("{root}/take/take.mcap: /camera/color/image_raw: an image has no pixels; record it again"),
+        Fails("{root}/take/take.mcap: /camera/color/image_raw: an image has no pixels; record it again"),
     ),
     Case(
         "an unknown encoding",
         bag("mcap", with_all(RGB, lambda to, at: to.image(at, "rgb10", colour(0)))),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/color/image_raw: holds rgb10 images, not colour; name another"
             " with --rgb-topic, or have them converted to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
             " 8UC1, bayer_rggb8, bayer_bggr8, bayer_gbrg8, bayer_grbg8, yuv422, uyvy, yuv422_yuy2, yuyv"
@@ -242,12 +242,12 @@ CASES = [
     Case(
         "broken JPEG",
         bag("mcap", with_all(RGB, lambda to, at: to.compressed(at, "jpeg", b"\xff\xd8\xff" + NOISE))),
-        Says("{root}/take/take.mcap: /camera/color/image_raw: is truncated or damaged; copy or download it again"),
+        Fails("{root}/take/take.mcap: /camera/color/image_raw: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "compressed depth breaks off",
         bag("mcap", with_all(DEPTH, lambda to, at: to.compressed(at, "16UC1; compressedDepth", b"1234"))),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is not a PNG, JPEG or TIFF image;"
             " copy or export it again"
         ),
@@ -255,7 +255,7 @@ CASES = [
     Case(
         "a camera of NaN",
         bag("mcap", camera([float("nan"), *K[1:]])),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/color/camera_info: fx: input should be a finite number, got"
             " nan; correct the camera"
         ),
@@ -263,7 +263,7 @@ CASES = [
     Case(
         "a camera that was never calibrated",
         bag("mcap", camera(9 * [0.0])),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/color/camera_info: fx: input should be greater than or equal to"
             " 1, got 0.0; correct the camera"
         ),
@@ -271,22 +271,22 @@ CASES = [
     Case(
         "a fisheye lens",
         bag("mcap", camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
-        Says(
+        Fails(
             "{root}/take/take.mcap: /camera/color/camera_info has a lens of the kind equidistant, which is"
             " not known here; record rectified images, or give --camera with k1, k2, p1, p2, k3"
         ),
     ),
     Case(
         "a topic that is not there",
-        all_of(bag("mcap"), options("--depth-topic", "/depth")),
-        Says(
+        all_of(bag("mcap"), add_options("--depth-topic", "/depth")),
+        Fails(
             "{root}/take/take.mcap: has no images on /depth; give --depth-topic one of"
             " /camera/aligned_depth_to_color/image_raw, /camera/color/image_raw"
         ),
     ),
     Case(
         "--fps",
-        all_of(bag("mcap"), options("--fps", "30")),
-        Says("{root}/take/take.mcap: is a bag, which does not support --fps; remove this option"),
+        all_of(bag("mcap"), add_options("--fps", "30")),
+        Fails("{root}/take/take.mcap: is a bag, which does not support --fps; remove this option"),
     ),
 ]

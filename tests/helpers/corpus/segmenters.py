@@ -9,14 +9,14 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from helpers.corpus.base import FRAMES, HEIGHT, STAMPS, WIDTH, png
-from helpers.corpus.case import Case, Make, Right, Says, all_of, only, options, write
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, add_options, all_of, replace_options, write
 
 MASKS = ("--segmenter", "masks", "--masks", "{seq}/ids")
 
 
-def masks(make_image: Callable[[int], bytes], names: list[str] = STAMPS) -> Make:
+def masks(make_image: Callable[[int], bytes], names: list[str] = STAMPS) -> Damage:
     """A folder of id images, made from their indices, and the options to use it."""
-    return all_of(*(write(f"ids/{name}.png", make_image(i)) for i, name in enumerate(names)), only(*MASKS))
+    return all_of(*(write(f"ids/{name}.png", make_image(i)) for i, name in enumerate(names)), replace_options(*MASKS))
 
 
 def ids(value: int, width_fraction: float = 0.25, dtype: type = np.uint8) -> bytes:
@@ -26,7 +26,7 @@ def ids(value: int, width_fraction: float = 0.25, dtype: type = np.uint8) -> byt
     return png(image)
 
 
-def network(file: str, inputs: list[int | str]) -> Make:
+def network(file: str, inputs: list[int | str]) -> Damage:
     """An ONNX network that returns its input, and the option to use it."""
     value = helper.make_tensor_value_info
     graph = helper.make_graph(
@@ -36,10 +36,10 @@ def network(file: str, inputs: list[int | str]) -> Make:
         [value("output0", TensorProto.FLOAT, inputs)],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    return all_of(write(file, model.SerializeToString()), only("--weights", "{seq}/" + file))
+    return all_of(write(file, model.SerializeToString()), replace_options("--weights", "{seq}/" + file))
 
 
-def head(value: float, cells: int | None = None) -> Make:
+def head(value: float, cells: int | None = None) -> Damage:
     """An ONNX network with constant outputs of the shapes of a segmentation head, and the option to use it."""
     height, width = 64, 96
     count = cells or sum(height * width // stride**2 for stride in (8, 16, 32))
@@ -60,163 +60,163 @@ def head(value: float, cells: int | None = None) -> Make:
         [value_info(name, TensorProto.FLOAT, shape) for name, shape in shapes.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    return all_of(write("own.onnx", model.SerializeToString()), only("--weights", "{seq}/own.onnx"))
+    return all_of(write("own.onnx", model.SerializeToString()), replace_options("--weights", "{seq}/own.onnx"))
 
 
 CASES = [
-    Case("masks of a person", masks(lambda i: ids(1)), Right()),
-    Case("masks without a person", masks(lambda i: ids(0)), Right()),
-    Case("16-bit id images", masks(lambda i: ids(1000, dtype=np.uint16)), Right()),
-    Case("masks named by number", masks(lambda i: ids(1), [f"{i:06d}" for i in range(FRAMES)]), Right()),
+    Case("masks of a person", masks(lambda i: ids(1)), Succeeds()),
+    Case("masks without a person", masks(lambda i: ids(0)), Succeeds()),
+    Case("16-bit id images", masks(lambda i: ids(1000, dtype=np.uint16)), Succeeds()),
+    Case("masks named by number", masks(lambda i: ids(1), [f"{i:06d}" for i in range(FRAMES)]), Succeeds()),
     Case(
         "people in the whole image",
         masks(lambda i: ids(1, 1.0)),
-        Says(
+        Fails(
             "seq: the camera was found in none of the 8 frames, people and what else may move cover them;"
             " see figures/masks.png, and try --segmenter none (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "a mask for every other frame",
         masks(lambda i: ids(1), STAMPS[::2]),
-        Says(
+        Fails(
             "{seq}/ids: has no id image for frame 1 at 1305031102.100000 s; add it, or name the folder that"
             " belongs to this sequence (the results of the 1 frames before are in {out}; go on with --resume {out})",
-            kept=1,
+            saved_poses=1,
         ),
     ),
     Case(
         "too few numbered id images",
         masks(lambda i: ids(1), ["0", "1", "2"]),
-        Says(
+        Fails(
             "{seq}/ids: has no id image for frame 3 at 1305031102.300000 s; add it, or name the folder that"
             " belongs to this sequence (the results of the 3 frames before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "id images of another time",
         masks(lambda i: ids(1), [f"{i}.5" for i in range(FRAMES)]),
-        Says(
+        Fails(
             "{seq}/ids: has no id image for frame 0 at 1305031102.000000 s; add it, or name the folder that"
             " belongs to this sequence (the results of the 0 frames before are in {out})",
-            kept=0,
+            saved_poses=0,
         ),
     ),
     Case(
         "masks of another size",
         masks(lambda i: png(np.zeros((HEIGHT * 2, WIDTH * 2), np.uint8))),
-        Says(
+        Fails(
             "{seq}/ids/1305031102.000000.png: has 160x120 pixels, its frame 80x60; write id images of the"
             " size of the frames (the results of the 0 frames before are in {out})",
-            kept=0,
+            saved_poses=0,
         ),
     ),
     Case(
         "masks in colour",
         masks(lambda i: png(np.zeros((HEIGHT, WIDTH, 3), np.uint8))),
-        Says(
+        Fails(
             "{seq}/ids/1305031102.000000.png: has 3 channels, expected one 8- or 16-bit channel; write it"
             " with one channel (the results of the 0 frames before are in {out})",
-            kept=0,
+            saved_poses=0,
         ),
     ),
     Case(
         "a truncated id image",
         masks(lambda i: ids(1)[: 60 if i == 3 else None]),
-        Says(
+        Fails(
             "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again (the results of"
             " the 3 frames before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "an id image that is not an image",
         masks(lambda i: b"masks" if i == 3 else ids(1)),
-        Says(
+        Fails(
             "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again (the results of"
             " the 3 frames before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "depth images in place of id images",
         masks(lambda i: png(np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH))),
-        Says(
+        Fails(
             "{seq}/ids/1305031102.000000.png: has 4799 different ids, more than 255; an id image has"
             " one value for each instance and 0 for the background, name the folder of such images with --masks (the"
             " results of the 0 frames before are in {out})",
-            kept=0,
+            saved_poses=0,
         ),
     ),
     Case(
         "no folder of masks",
-        only("--segmenter", "masks"),
-        Says("segmentation.source=masks: the folder of the id images is missing; name it with --masks"),
+        replace_options("--segmenter", "masks"),
+        Fails("segmentation.source=masks: the folder of the id images is missing; name it with --masks"),
     ),
     Case(
         "a missing folder of id images",
-        only("--masks", "{root}/none"),
-        Says("{root}/none: contains no PNG files; name the folder of the id images with --masks"),
+        replace_options("--masks", "{root}/none"),
+        Fails("{root}/none: contains no PNG files; name the folder of the id images with --masks"),
     ),
     Case(
         "a file in place of the folder of id images",
-        only("--masks", "{seq}/rgb.txt"),
-        Says("{seq}/rgb.txt: contains no PNG files; name the folder of the id images with --masks"),
+        replace_options("--masks", "{seq}/rgb.txt"),
+        Fails("{seq}/rgb.txt: contains no PNG files; name the folder of the id images with --masks"),
     ),
     Case(
         "--masks with --segmenter none",
-        options("--masks", "{seq}/rgb"),
-        Says("--masks {seq}/rgb: not used with segmentation.source=none; remove it, or add --segmenter masks"),
+        add_options("--masks", "{seq}/rgb"),
+        Fails("--masks {seq}/rgb: not used with segmentation.source=none; remove it, or add --segmenter masks"),
     ),
     Case(
         "--masks with --segmenter yolo",
-        only("--segmenter", "yolo", "--masks", "{seq}/rgb"),
-        Says("--masks {seq}/rgb: not used with segmentation.source=yolo; remove it, or add --segmenter masks"),
+        replace_options("--segmenter", "yolo", "--masks", "{seq}/rgb"),
+        Fails("--masks {seq}/rgb: not used with segmentation.source=yolo; remove it, or add --segmenter masks"),
     ),
     Case(
         "--weights with --segmenter none",
-        options("--weights", "{seq}/none.onnx"),
-        Says("--weights {seq}/none.onnx: not used with segmentation.source=none; remove it, or add --segmenter yolo"),
+        add_options("--weights", "{seq}/none.onnx"),
+        Fails("--weights {seq}/none.onnx: not used with segmentation.source=none; remove it, or add --segmenter yolo"),
     ),
     Case(
         "--weights with masks",
-        all_of(masks(lambda i: ids(1)), options("--weights", "own.onnx")),
-        Says("--weights own.onnx: not used with segmentation.source=masks; remove it, or add --segmenter yolo"),
+        all_of(masks(lambda i: ids(1)), add_options("--weights", "own.onnx")),
+        Fails("--weights own.onnx: not used with segmentation.source=masks; remove it, or add --segmenter yolo"),
     ),
     Case(
         "a missing ONNX file",
-        only("--weights", "{root}/none.onnx"),
-        Says("{root}/none.onnx: no such file; check the path given with --weights"),
+        replace_options("--weights", "{root}/none.onnx"),
+        Fails("{root}/none.onnx: no such file; check the path given with --weights"),
     ),
     Case(
         "a missing .pt file",
-        only("--weights", "{root}/none.pt"),
-        Says("{root}/none.pt: cannot be read (No such file or directory); check the path of the weights"),
+        replace_options("--weights", "{root}/none.pt"),
+        Fails("{root}/none.pt: cannot be read (No such file or directory); check the path of the weights"),
     ),
     Case(
         "weights are a folder",
-        only("--weights", "{seq}"),
-        Says("{seq}: cannot be read (Is a directory); check the path of the weights"),
+        replace_options("--weights", "{seq}"),
+        Fails("{seq}: cannot be read (Is a directory); check the path of the weights"),
     ),
     Case(
         "ONNX that is an image",
         all_of(
             lambda p: shutil.copy(p.folder / f"rgb/{STAMPS[0]}.png", p.folder / "own.onnx"),
-            only("--weights", "{seq}/own.onnx"),
+            replace_options("--weights", "{seq}/own.onnx"),
         ),
-        Says("{seq}/own.onnx: is not a network that onnxruntime can load; delete the file or export it again"),
+        Fails("{seq}/own.onnx: is not a network that onnxruntime can load; delete the file or export it again"),
     ),
     Case(
         "ONNX that is empty",
-        all_of(write("own.onnx", ""), only("--weights", "{seq}/own.onnx")),
-        Says("{seq}/own.onnx: is not a network that onnxruntime can load; delete the file or export it again"),
+        all_of(write("own.onnx", ""), replace_options("--weights", "{seq}/own.onnx")),
+        Fails("{seq}/own.onnx: is not a network that onnxruntime can load; delete the file or export it again"),
     ),
     Case(
         "ONNX of another network",
         network("own.onnx", [1, 3, 224, 224]),
-        Says(
+        Fails(
             "{seq}/own.onnx: is not a raw segmentation head with one float input (1, 3, H, W), H and W"
             " fixed multiples of 32, and outputs (1, 116, N) and (1, 32, H/4, W/4): it maps"
             " [('tensor(float)', [1, 3, 224, 224])] to [('tensor(float)', [1, 3, 224, 224])]; export it with"
@@ -226,36 +226,36 @@ CASES = [
     Case(
         "ONNX of variable size",
         network("own.onnx", [1, 3, "height", "width"]),
-        Says(
+        Fails(
             "{seq}/own.onnx: is not a raw segmentation head with one float input (1, 3, H, W), H and W"
             " fixed multiples of 32, and outputs (1, 116, N) and (1, 32, H/4, W/4): it maps"
             " [('tensor(float)', [1, 3, 'height', 'width'])] to [('tensor(float)', [1, 3, 'height',"
             " 'width'])]; export it with a fixed size and without NMS"
         ),
     ),
-    Case("ONNX that detects nothing", head(0.0), Right()),
+    Case("ONNX that detects nothing", head(0.0), Succeeds()),
     Case(
         "ONNX with NaN in its output",
         head(float("nan")),
-        Says(
+        Fails(
             "{seq}/own.onnx: network output contains NaN or infinity; train or export it again (the results of the 0"
             " frames before are in {out})",
-            kept=0,
+            saved_poses=0,
         ),
     ),
     Case(
         "ONNX with infinity in its output",
         head(float("inf")),
-        Says(
+        Fails(
             "{seq}/own.onnx: network output contains NaN or infinity; train or export it again (the results of the 0"
             " frames before are in {out})",
-            kept=0,
+            saved_poses=0,
         ),
     ),
     Case(
         "a .pt file with another checksum",
-        all_of(write("own.pt", b"PK\x03\x04" + bytes(1000)), only("--weights", "{seq}/own.pt")),
-        Says(
+        all_of(write("own.pt", b"PK\x03\x04" + bytes(1000)), replace_options("--weights", "{seq}/own.pt")),
+        Fails(
             "{seq}/own.pt: is not the published yolov8n-seg.pt (its sha256 is"
             " 586505ce151936969221b2baf9b898055e1f13ea0316557a8e9b4ac4f9c1dea0); give weights of your own"
             " as an .onnx file"

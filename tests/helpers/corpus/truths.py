@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from helpers.corpus.base import STAMPS
-from helpers.corpus.case import Case, Make, Right, Says, edit, remove, replaced, write
-from helpers.corpus.lists import folder_at, lines, loop, stamps_as
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, edit, remove, replace_text, write
+from helpers.corpus.lists import lines, make_folder, make_symlink_loop, stamps_as
 
 GROUND_TRUTH = "groundtruth.txt"
 
 
-def number(column: int, value: str, row: int = 3) -> Make:
+def number(column: int, value: str, row: int = 3) -> Damage:
     """Replace a number in a row of the ground truth."""
 
     def change(listed: list[str]) -> list[str]:
@@ -20,7 +20,7 @@ def number(column: int, value: str, row: int = 3) -> Make:
     return lines(GROUND_TRUTH, change)
 
 
-def quaternions(change: object) -> Make:
+def quaternions(change: object) -> Damage:
     """Change all numbers of all quaternions."""
 
     def rows(listed: list[str]) -> list[str]:
@@ -30,172 +30,174 @@ def quaternions(change: object) -> Make:
 
 
 CASES = [
-    Case("no ground truth", remove(GROUND_TRUTH), Right(ate=None)),
-    Case("Windows line endings", edit(GROUND_TRUTH, replaced("\n", "\r\n")), Right()),
-    Case("byte order mark", edit(GROUND_TRUTH, lambda content: b"\xef\xbb\xbf" + content), Right()),
-    Case("comments", edit(GROUND_TRUTH, lambda content: b"# ground truth trajectory\n" + content), Right()),
-    Case("commas", edit(GROUND_TRUTH, replaced(" ", ",")), Right()),
-    Case("lines in reverse order", lines(GROUND_TRUTH, lambda listed: listed[::-1]), Right()),
+    Case("no ground truth", remove(GROUND_TRUTH), Succeeds(max_ate=None)),
+    Case("Windows line endings", edit(GROUND_TRUTH, replace_text("\n", "\r\n")), Succeeds()),
+    Case("byte order mark", edit(GROUND_TRUTH, lambda content: b"\xef\xbb\xbf" + content), Succeeds()),
+    Case("comments", edit(GROUND_TRUTH, lambda content: b"# ground truth trajectory\n" + content), Succeeds()),
+    Case("commas", edit(GROUND_TRUTH, replace_text(" ", ",")), Succeeds()),
+    Case("lines in reverse order", lines(GROUND_TRUTH, lambda listed: listed[::-1]), Succeeds()),
     Case(
-        "duplicate timestamp", lines(GROUND_TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]), Right()
+        "duplicate timestamp",
+        lines(GROUND_TRUTH, lambda listed: [*listed, listed[0].replace(" ", " 9", 1)]),
+        Succeeds(),
     ),
-    Case("quaternions of length two", quaternions(lambda word: str(2 * float(word))), Right()),
+    Case("quaternions of length two", quaternions(lambda word: str(2 * float(word))), Succeeds()),
     Case(
         "timestamps in nanoseconds in NumPy's notation",
         stamps_as(lambda s: f"{s * 1e9:.18e}", (GROUND_TRUTH,)),
-        Right(),
+        Succeeds(),
     ),
     Case(
         "position NaN",
         number(1, "nan"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
             " are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "infinite position",
         number(2, "-inf"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
             " are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "position beyond float64",
         number(2, "1e999"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 4 has a number that is not finite; correct or remove it (the results"
             " are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "position far beyond the earth's radius",
         number(1, "1e200"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 4 has a position more than 1e+07 m away; correct or remove it (the"
             " results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "quaternion of NaN",
         quaternions(lambda word: "nan"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 1 has a number that is not finite; correct or remove it (the results"
             " are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "zero quaternion",
         quaternions(lambda word: "0"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
             " remove it (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "quaternion of tiny numbers",
         quaternions(lambda word: "1e-200"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
             " remove it (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "quaternion of huge numbers",
         quaternions(lambda word: "1e200"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 1 has a quaternion that is zero or far from unit length; correct or"
             " remove it (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "seven columns",
         lines(GROUND_TRUTH, lambda listed: [line.rsplit(maxsplit=1)[0] for line in listed]),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 1 is '1305031102.000000 0.000000000 0.062500000 0.000000000"
             " 0.000000000 0.000000000 0.', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the"
             " results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "word instead of a number",
         number(3, "unknown"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 4 is '1305031102.300000 0.093750000 0.156250000 unknown 0.000001500"
             " 0.000000000 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
             " are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "empty file",
         write(GROUND_TRUTH, ""),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
             " qx qy qz qw (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "comments only",
         write(GROUND_TRUTH, "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n"),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: contains no poses; copy it again, it must have lines of timestamp tx ty tz"
             " qx qy qz qw (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "truncated file",
         edit(GROUND_TRUTH, lambda content: content[:-30]),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: line 8 is '1305031102.700000 0.218750000 0.156250000 0.000000000"
             " 0.000003500 0.0000', expected timestamp tx ty tz qx qy qz qw; correct or remove it (the results"
             " are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "binary file",
         write(GROUND_TRUTH, bytes(range(256))),
-        Says(
+        Fails(
             "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines of"
             " timestamp tx ty tz qx qy qz qw (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
-    Case("folder instead of a file", folder_at(GROUND_TRUTH), Right(ate=None)),
-    Case("symlink loop", loop(GROUND_TRUTH), Right(ate=None)),
+    Case("folder instead of a file", make_folder(GROUND_TRUTH), Succeeds(max_ate=None)),
+    Case("symlink loop", make_symlink_loop(GROUND_TRUTH), Succeeds(max_ate=None)),
     Case(
         "different clock",
         stamps_as(lambda s: f"{s + 3600:.6f}", (GROUND_TRUTH,)),
-        Says(
+        Fails(
             "seq: has no scores, only 0 poses of the estimate (1305031102.00 to 1305031102.70 s) are within"
             " 0.02 s of the ground truth (1305034702.00 to 1305034702.70 s), at least 3 are needed; check that"
             " both belong to the same sequence (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "two poses",
         lines(GROUND_TRUTH, lambda listed: listed[:2]),
-        Says(
+        Fails(
             "seq: has no scores, only 2 poses of the estimate (1305031102.00 to 1305031102.70 s) are within"
             " 0.02 s of the ground truth (1305031102.00 to 1305031102.10 s), at least 3 are needed; check that"
             " both belong to the same sequence (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
-    Case("camera at rest", number(0, STAMPS[3]), Right()),
-    Case("constant orientation", quaternions(lambda word: word[:3]), Right()),
+    Case("camera at rest", number(0, STAMPS[3]), Succeeds()),
+    Case("constant orientation", quaternions(lambda word: word[:3]), Succeeds()),
 ]

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from helpers.corpus.base import CAMERA, FRAMES, NOISE, colour, depth, way
-from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, half, options
+from helpers.corpus.base import CAMERA, FRAMES, NOISE, camera_position, colour, depth
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half
 
 
 def save(path: Path, images: list[NDArray[np.generic]]) -> None:
@@ -25,18 +25,18 @@ def save(path: Path, images: list[NDArray[np.generic]]) -> None:
     writer.release()
 
 
-def videos(place: Place) -> None:
+def videos(place: Workspace) -> None:
     """The sequence as a pair of videos."""
     folder = place.root / "take"
     folder.mkdir()
     (folder / "camera.yaml").write_text(CAMERA)
-    save(folder / "colour.mkv", [colour(*way(i)) for i in range(FRAMES)])
+    save(folder / "colour.mkv", [colour(*camera_position(i)) for i in range(FRAMES)])
     save(folder / "depth.mkv", [depth() for _ in range(FRAMES)])
     place.seq = str(folder)
 
 
-def changed(file: str, change: Callable[[bytes], bytes]) -> Make:
-    def make(place: Place) -> None:
+def changed(file: str, change: Callable[[bytes], bytes]) -> Damage:
+    def make(place: Workspace) -> None:
         videos(place)
         path = place.root / "take" / file
         path.write_bytes(change(path.read_bytes()))
@@ -44,50 +44,50 @@ def changed(file: str, change: Callable[[bytes], bytes]) -> Make:
     return make
 
 
-def with_video(file: str, image: NDArray[np.generic]) -> Make:
+def with_video(file: str, image: NDArray[np.generic]) -> Damage:
     return all_of(videos, lambda place: save(place.root / "take" / file, FRAMES * [image]))
 
 
 CASES = [
-    Case("colour and depth", videos, Right(ate=None)),
+    Case("colour and depth", videos, Succeeds(max_ate=None)),
     Case(
         "colour breaks off",
-        changed("colour.mkv", half),
-        Says(
+        changed("colour.mkv", first_half),
+        Fails(
             "{root}/take/colour.mkv: breaks off at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
             " before are in {out}; go on with --resume {out})",
-            kept=3,
+            saved_poses=3,
         ),
     ),
     Case(
         "depth breaks off",
-        changed("depth.mkv", half),
-        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        changed("depth.mkv", first_half),
+        Fails("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "depth breaks off at once",
         changed("depth.mkv", lambda content: content[:300]),
-        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Fails("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "noise",
         changed("colour.mkv", lambda content: NOISE),
-        Says("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Fails("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "empty",
         changed("depth.mkv", lambda content: b""),
-        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Fails("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "text",
         changed("colour.mkv", lambda content: b"the video\n" * 100),
-        Says("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Fails("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "depth of 8 bits",
         with_video("depth.mkv", colour(0)),
-        Says(
+        Fails(
             "{root}/take/depth.mkv: has not 16 bits of grey a pixel, as depth has; export it again with"
             " ffmpeg -c:v ffv1 -pix_fmt gray16le"
         ),
@@ -95,7 +95,7 @@ CASES = [
     Case(
         "depth of another size",
         with_video("depth.mkv", depth()[::2, ::2].copy()),
-        Says(
+        Fails(
             "{root}/take/depth.mkv: has 40x30 pixels, but its colour image has 80x60; export depth that is"
             " registered to the colour image"
         ),
@@ -103,7 +103,7 @@ CASES = [
     Case(
         "two of colour",
         with_video("other.mkv", colour(0)),
-        Says(
+        Fails(
             "{root}/take: a colour and a depth video belong together, here are colour.mkv, other.mkv,"
             " depth.mkv; name them such as take.mp4 and take_depth.mkv and give the first"
         ),
@@ -111,24 +111,24 @@ CASES = [
     Case(
         "no camera",
         all_of(videos, lambda place: (place.root / "take" / "camera.yaml").unlink()),
-        Says(
+        Fails(
             "{root}/take: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height,"
             " depth_scale) or pass --camera with a file or one of d435i, tum_fr1, tum_fr2, tum_fr3"
         ),
     ),
     Case(
         "--fps 0",
-        all_of(videos, options("--fps", "0")),
-        Says("--fps 0: is out of range; pass between 0.01 and 10000 Hz"),
+        all_of(videos, add_options("--fps", "0")),
+        Fails("--fps 0: is out of range; pass between 0.01 and 10000 Hz"),
     ),
     Case(
         "--fps that is no number",
-        all_of(videos, options("--fps", "nan")),
-        Says("--fps nan: is out of range; pass between 0.01 and 10000 Hz"),
+        all_of(videos, add_options("--fps", "nan")),
+        Fails("--fps nan: is out of range; pass between 0.01 and 10000 Hz"),
     ),
     Case(
         "--fps without end",
-        all_of(videos, options("--fps", "inf")),
-        Says("--fps inf: is out of range; pass between 0.01 and 10000 Hz"),
+        all_of(videos, add_options("--fps", "inf")),
+        Fails("--fps inf: is out of range; pass between 0.01 and 10000 Hz"),
     ),
 ]

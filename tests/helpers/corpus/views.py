@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from helpers.corpus.base import HEIGHT, WIDTH, colour, depth, png, way
-from helpers.corpus.case import Case, Place, Right, Says, all_of, edit, replaced, write
+from helpers.corpus.base import HEIGHT, WIDTH, camera_position, colour, depth, png
+from helpers.corpus.case import Case, Fails, Succeeds, Workspace, all_of, edit, replace_text, write
 from helpers.corpus.images import DEPTH, RGB, every
 from helpers.corpus.lists import lines
 
@@ -20,13 +20,13 @@ def still(listed: list[str]) -> list[str]:
     return [f"{line.split()[0]} {listed[0].split(maxsplit=1)[1]}" for line in listed]
 
 
-def covered(place: Place) -> None:
+def covered(place: Workspace) -> None:
     """Write 30 frames, of which the middle 20 are black and without depth: the camera is covered."""
     for kind in ("rgb", "depth"):
         lines = []
         for i in range(30):
             stamp = f"{1305031102 + i / 10:.6f}"
-            x, y = way(min(i, 4)) if i < 25 else way(min(i - 20, 7))
+            x, y = camera_position(min(i, 4)) if i < 25 else camera_position(min(i - 20, 7))
             images = {
                 "rgb": plain(0) if 5 <= i < 25 else png(colour(x, y)),
                 "depth": png(depth(0.0 if 5 <= i < 25 else 1.0)),
@@ -41,52 +41,52 @@ CASES = [
     Case(
         "all black",
         every(RGB, lambda i: plain(0)),
-        Says(
+        Fails(
             "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
             " it again, with light and an open lens (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "all white",
         every(RGB, lambda i: plain(255)),
-        Says(
+        Fails(
             "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
             " it again, with light and an open lens (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "no depth",
         every(DEPTH, lambda i: png(depth(0.0))),
-        Says(
+        Fails(
             "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
             " depth images again (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "saturated depth",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 65535, np.uint16))),
-        Says(
+        Fails(
             "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
             " depth images again (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "black without depth",
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
-        Says(
+        Fails(
             "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
             " it again, with light and an open lens (the results are in {out})",
-            kept=8,
+            saved_poses=8,
         ),
     ),
     Case(
         "depth in metres",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1, np.uint16))),
-        Says(
+        Fails(
             "{seq}: the median depth of the first frame is 0.0002 m at 5000 units per metre; correct the"
             " camera's depth_scale (1000 if depth is in millimetres) or the depth images"
         ),
@@ -94,23 +94,23 @@ CASES = [
     Case(
         "depth in millimetres",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 1000, np.uint16))),
-        Right(ate=0.1, note="the ground truth is 5 times as large as the estimate: check depth_scale"),
+        Succeeds(max_ate=0.1, note="the ground truth is 5 times as large as the estimate: check depth_scale"),
     ),
     Case(
         "depth scale of one unit per metre",
-        edit("camera.yaml", replaced("5000", "1")),
-        Says(
+        edit("camera.yaml", replace_text("5000", "1")),
+        Fails(
             "{seq}: the median depth of the first frame is 5e+03 m at 1 units per metre; correct the camera's"
             " depth_scale (1000 if depth is in millimetres) or the depth images"
         ),
     ),
     Case(
         "identical images",
-        all_of(every(RGB, lambda i: png(colour(*way(0)))), lines("groundtruth.txt", still)),
-        Right(),
+        all_of(every(RGB, lambda i: png(colour(*camera_position(0)))), lines("groundtruth.txt", still)),
+        Succeeds(),
     ),
-    Case("one black frame", write(RGB[4], plain(0)), Right(lost=1, ate=0.03)),
-    Case("one frame without depth", write(DEPTH[4], png(depth(0.0))), Right()),
-    Case("first frame black", write(RGB[0], plain(0)), Right(lost=1, ate=0.03)),
-    Case("camera covered for two seconds", covered, Right(30, lost=20, ate=None)),
+    Case("one black frame", write(RGB[4], plain(0)), Succeeds(lost=1, max_ate=0.03)),
+    Case("one frame without depth", write(DEPTH[4], png(depth(0.0))), Succeeds()),
+    Case("first frame black", write(RGB[0], plain(0)), Succeeds(lost=1, max_ate=0.03)),
+    Case("camera covered for two seconds", covered, Succeeds(30, lost=20, max_ate=None)),
 ]
