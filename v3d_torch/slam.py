@@ -249,7 +249,7 @@ class V3DSLAM:
         restore_segmenter(self.segment, self._segmenter_state)
 
     def _stateful_components(self) -> dict[str, Stateful]:
-        components = {
+        components: dict[str, Stateful] = {
             "timer": self.timer,
             "map": self.map,
             "poses": self.poses,
