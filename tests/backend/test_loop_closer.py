@@ -83,7 +83,7 @@ class Camera:
         config = load_config(overrides=list(overrides))
         self.map = SparseMap(config.mapping, config.features, CAMERA)
         self.loop_closer = make_loop_closer(config)
-        self.true: list[Tensor] = []
+        self.true_poses: list[Tensor] = []
         self.corrections: list[Tensor | None] = []
         self._points: list[Tensor] = []  # for each keyframe, the indices of the points of its features
         self._first_tracked = 0  # first keyframe of which landmarks are tracked
@@ -102,21 +102,23 @@ class Camera:
             every: Use every n-th feature.
         """
         if guess is not None:
-            self._first_tracked = len(self.true)
-        if self.true:
-            motion = invert(self.true[-1]) @ T_wc @ se3_exp(DRIFT if guess is None else guess)
+            self._first_tracked = len(self.true_poses)
+        if self.true_poses:
+            motion = invert(self.true_poses[-1]) @ T_wc @ se3_exp(DRIFT if guess is None else guess)
             T_cw = invert(invert(self.map.keyframes[-1].T_cw) @ motion)
         else:
             T_cw = invert(T_wc)
-        features, points = room.observe(T_wc, seed=len(self.true))
+        features, points = room.observe(T_wc, seed=len(self.true_poses))
         features, points = features[torch.arange(0, len(points), every)], points[::every]
         known = torch.full((len(room.points),), -1)
         first = max(self._first_tracked, len(self._points) - 3)
         for recent_points, recent in list(zip(self._points, self.map.keyframes, strict=True))[first:]:
             known[recent_points] = torch.maximum(known[recent_points], recent.landmarks)
-        keyframe = self.map.insert_keyframe(len(self.true), len(self.true) / 3, T_cw, features, known[points])
+        keyframe = self.map.insert_keyframe(
+            len(self.true_poses), len(self.true_poses) / 3, T_cw, features, known[points]
+        )
         keyframe.disconnected = disconnected
-        self.true.append(T_wc)
+        self.true_poses.append(T_wc)
         correction = self.loop_closer.detect_loop(keyframe, self.map, self.map.T_cw)
         self.corrections.append(None if correction is None else self.loop_closer.correct_loop(correction, self.map))
         self.loop_closer.add_keyframe(keyframe)
@@ -126,11 +128,11 @@ class Camera:
     def errors(self) -> Tensor:
         """Distance of each keyframe to its true position, metres, without alignment."""
         T_cw = torch.stack([keyframe.T_cw for keyframe in self.map.keyframes])
-        return (invert(T_cw) - torch.stack(self.true))[:, :3, 3].norm(dim=1)
+        return (invert(T_cw) - torch.stack(self.true_poses))[:, :3, 3].norm(dim=1)
 
     def length(self) -> float:
         """Length of the true path, metres."""
-        return float(torch.stack(self.true)[:, :3, 3].diff(dim=0).norm(dim=1).sum())
+        return float(torch.stack(self.true_poses)[:, :3, 3].diff(dim=0).norm(dim=1).sum())
 
 
 def make_loop_closer(config: Config) -> LoopCloser:
@@ -188,7 +190,7 @@ def test_loop_correction_keeps_landmark_reprojection() -> None:
     """Landmarks move with the keyframe that created them."""
     camera, room = Camera(), Room(seed=1)
     while not any(correction is not None for correction in camera.corrections):
-        camera.step(room, lap_pose(len(camera.true)))
+        camera.step(room, lap_pose(len(camera.true_poses)))
     table, landmarks = camera.map.observations, camera.map.landmarks
     T_cw = torch.stack([keyframe.T_cw for keyframe in camera.map.keyframes])[table["keyframe"]]
     points = (T_cw[:, :3, :3] @ landmarks["point"][table["landmark"], :, None])[..., 0] + T_cw[:, :3, 3]
@@ -203,7 +205,7 @@ def test_convention_correction_maps_old_world_to_new_world() -> None:
     # Without loop closing, the newest keyframe keeps the pose that it had before the correction.
     twin = Camera("loop.enabled=false")
     while not any(correction is not None for correction in camera.corrections):
-        k = len(camera.true)
+        k = len(camera.true_poses)
         camera.step(room, lap_pose(k))
         twin.step(room, lap_pose(k))
     T_new_old = camera.corrections[-1]
@@ -221,8 +223,9 @@ def test_place_with_few_of_its_visible_landmarks_is_no_loop() -> None:
         for k in range(BEFORE_LOOP):
             camera.step(room, lap_pose(k))
         assert camera.loop_closer.loop_count == 0
-        while len(camera.true) < LAP + BEFORE_LOOP - 1:  # until places that were occluded before are visible again
-            camera.step(room, lap_pose(len(camera.true)), every=12)
+        # Until places that were occluded before are visible again.
+        while len(camera.true_poses) < LAP + BEFORE_LOOP - 1:
+            camera.step(room, lap_pose(len(camera.true_poses)), every=12)
         loop_counts[overrides] = camera.loop_closer.loop_count
     assert loop_counts[()] == 0 and loop_counts[("loop.min_inlier_ratio=0",)] > 0
 
@@ -296,7 +299,7 @@ def test_loop_joins_the_disconnected_part_of_the_map() -> None:
     assert camera.loop_closer.loop_count == 0
     assert any(keyframe.disconnected for keyframe in camera.map.keyframes)
     while camera.corrections[-1] is None:
-        camera.step(room, lap_pose(len(camera.true)), disconnected=True)
+        camera.step(room, lap_pose(len(camera.true_poses)), disconnected=True)
     assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
 
 
