@@ -183,7 +183,7 @@ class StatefulSegmenter(Protocol):
     """A segmenter whose results depend on earlier frames.
 
     The state consists of tensors and plain Python values. An identically configured segmenter that loads it continues
-    with the same results.
+    with the same results. An `nn.Module` is never treated as stateful, because its ``state_dict`` holds its weights.
     """
 
     def state_dict(self) -> dict[str, Any]:
