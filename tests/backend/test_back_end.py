@@ -1,4 +1,4 @@
-"""What is solved behind the camera: when it is taken in, by which thread it is solved, what happens when it fails."""
+"""Back end: time of application, thread, errors, saved state."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 import v3d_torch.backend.back_end
 from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
@@ -26,51 +27,53 @@ def demo() -> RGBDSequence:
     return load_sequence("demo")
 
 
-def config(*, behind: bool) -> Config:
-    """A keyframe every other frame."""
-    chosen = ("segmentation.source=none", "mapping.max_keyframe_interval=2", "mapping.redundant_ratio=1")
-    return load_config(None, (*chosen, f"prefetch={str(behind).lower()}"))
+def make_config(*, in_background: bool) -> Config:
+    """Configuration with a keyframe at every second frame."""
+    overrides = ("segmentation.source=none", "mapping.max_keyframe_interval=2", "mapping.redundant_ratio=1")
+    return load_config(None, (*overrides, f"prefetch={str(in_background).lower()}"))
 
 
 def keyframe_poses(slam: V3DSLAM) -> Tensor:
     return slam.mapper.map.T_cw
 
 
-@pytest.mark.parametrize("behind", [True, False])
-def test_it_is_taken_in_with_the_next_frame(behind: bool, demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames 0, 2 and 4 become keyframes: what is solved for them changes the map with frames 1, 3 and 5."""
-    solved: list[tuple[int, str]] = []
-    taken_in: list[int] = []
+@pytest.mark.parametrize("in_background", [True, False])
+def test_result_is_applied_with_the_next_frame(
+    in_background: bool, demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames 0, 2 and 4 become keyframes; their results are applied to the map with frames 1, 3 and 5."""
+    adjusted: list[tuple[int, str]] = []
+    applied: list[int] = []
 
     def adjust(*args: object) -> LocalAdjustment | None:
-        solved.append((args[1].frame, threading.current_thread().name))  # type: ignore[attr-defined]
+        adjusted.append((args[1].frame, threading.current_thread().name))  # type: ignore[attr-defined]
         return local_bundle_adjust(*args)  # type: ignore[arg-type]
 
-    take_in = LocalAdjustment.apply
+    original_apply = LocalAdjustment.apply
 
-    def noted(self: LocalAdjustment, *args: object) -> None:
-        taken_in.append(index)
-        take_in(self, *args)  # type: ignore[arg-type]
+    def apply(self: LocalAdjustment, *args: object) -> None:
+        applied.append(index)
+        original_apply(self, *args)  # type: ignore[arg-type]
 
     monkeypatch.setattr(v3d_torch.backend.back_end, "local_bundle_adjust", adjust)
-    monkeypatch.setattr(LocalAdjustment, "apply", noted)
-    slam = V3DSLAM(demo.camera, config=config(behind=behind))
+    monkeypatch.setattr(LocalAdjustment, "apply", apply)
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=in_background))
     poses = []
     for index in range(FRAMES):
         slam(demo[index])
         poses.append(keyframe_poses(slam))
     assert [keyframe.frame for keyframe in slam.mapper.map.keyframes] == [0, 2, 4]
-    assert [frame for frame, _ in solved] == [0, 2, 4]
-    assert taken_in == [3, 5]  # a first keyframe alone has nothing to be adjusted to
+    assert [frame for frame, _ in adjusted] == [0, 2, 4]
+    assert applied == [3, 5]  # for the first keyframe there is nothing to adjust
     assert torch.equal(poses[2][:1], poses[1]) and torch.equal(poses[4][:2], poses[3])
     assert not torch.equal(poses[3], poses[2]) and not torch.equal(poses[5], poses[4])
-    here = threading.current_thread().name
-    assert {name == here for _, name in solved} == {not behind}
+    main_thread = threading.current_thread().name
+    assert {name == main_thread for _, name in adjusted} == {not in_background}
 
 
-def test_what_is_left_is_taken_in_after_the_last_frame(demo: RGBDSequence) -> None:
-    """A second time, or before any frame, there is nothing."""
-    slam = V3DSLAM(config=config(behind=True))
+def test_flush_applies_the_pending_result_once(demo: RGBDSequence) -> None:
+    """A second flush, or one before any frame, has no effect."""
+    slam = V3DSLAM(config=make_config(in_background=True))
     slam.flush()
     for index in range(5):
         slam(demo[index])
@@ -81,24 +84,26 @@ def test_what_is_left_is_taken_in_after_the_last_frame(demo: RGBDSequence) -> No
     assert slam.back_end.keyframe is None and not torch.equal(before, after)
     slam.flush()
     assert torch.equal(keyframe_poses(slam), after)
-    assert torch.equal(slam.poses.T_cw, slam.mapper.map.keyframes[-1].T_cw)  # the last frame goes along
+    assert torch.equal(slam.poses.T_cw, slam.mapper.map.keyframes[-1].T_cw)  # the last frame moves with its keyframe
     assert slam(demo[5]).T_wc.isfinite().all()
 
 
-def test_what_breaks_behind_is_told_where_it_is_taken_in(demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*args: object) -> LocalAdjustment:
+def test_error_in_the_background_is_raised_with_the_next_frame(
+    demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object) -> LocalAdjustment:
         raise ZeroDivisionError("no good")
 
-    monkeypatch.setattr(v3d_torch.backend.back_end, "local_bundle_adjust", broken)
-    slam = V3DSLAM(demo.camera, config=config(behind=True))
+    monkeypatch.setattr(v3d_torch.backend.back_end, "local_bundle_adjust", fail)
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=True))
     slam(demo[0])
     with pytest.raises(ZeroDivisionError, match="no good"):
         slam(demo[1])
 
 
-def test_a_system_that_is_forgotten_leaves_no_thread(demo: RGBDSequence) -> None:
+def test_thread_ends_when_the_system_is_deleted(demo: RGBDSequence) -> None:
     before = set(threading.enumerate())
-    slam = V3DSLAM(demo.camera, config=config(behind=True))
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=True))
     slam(demo[0])
     slam.flush()
     (thread,) = set(threading.enumerate()) - before
@@ -108,8 +113,8 @@ def test_a_system_that_is_forgotten_leaves_no_thread(demo: RGBDSequence) -> None
     assert not thread.is_alive()
 
 
-class Short:
-    """Some frames of the demo."""
+class FirstFrames:
+    """The first frames of the demo."""
 
     name, groundtruth = "short", None
 
@@ -121,13 +126,44 @@ class Short:
         return (self._demo[index] for index in range(FRAMES))
 
 
-def test_a_run_without_gradients_gives_what_calls_with_them_give(demo: RGBDSequence) -> None:
-    pipeline = Pipeline(Short(demo), V3DSLAM(demo.camera, config=config(behind=True)))
+def test_pipeline_in_inference_mode_equals_calls_outside_of_it(demo: RGBDSequence) -> None:
+    pipeline = Pipeline(FirstFrames(demo), V3DSLAM(demo.camera, config=make_config(in_background=True)))
     assert pipeline().failure is None
     pipeline.flush()
-    slam = V3DSLAM(demo.camera, config=config(behind=False))
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=False))
     for index in range(FRAMES):
         slam(demo[index])
     slam.flush()
     assert torch.equal(slam.poses.trajectory().T_wc, pipeline.slam.poses.trajectory().T_wc)
     assert torch.equal(slam.mapper.map.landmarks["point"], pipeline.slam.mapper.map.landmarks["point"])
+
+
+@pytest.mark.parametrize("in_background", [True, False])
+def test_back_end_that_loads_a_state_gives_the_pending_result(in_background: bool, demo: RGBDSequence) -> None:
+    config = make_config(in_background=in_background)
+    slam = V3DSLAM(demo.camera, config=config)
+    for index in range(5):
+        slam(demo[index])
+    state = slam.back_end.state_dict()
+    assert state == {"keyframe": slam.mapper.map.keyframes[-1]} and state["keyframe"].frame == 4
+    loaded = BackEnd(config, slam.mapper.map.camera, slam.mapper.map, slam.loop_closer)
+    loaded.load_state_dict(state)
+    assert loaded.keyframe is state["keyframe"]
+    expected, result = slam.back_end.result(), loaded.result()
+    assert expected is not None and result is not None
+    assert result.keyframe is expected.keyframe and result.loop_correction is expected.loop_correction is None
+    assert expected.adjustment is not None and result.adjustment is not None
+    assert torch.equal(result.adjustment.T_cw, expected.adjustment.T_cw)
+    assert torch.equal(result.adjustment.points, expected.adjustment.points)
+
+
+def test_state_without_a_pending_keyframe_submits_nothing(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=True))
+    slam(demo[0])
+    pending = slam.back_end.state_dict()
+    slam.flush()
+    state = slam.back_end.state_dict()
+    assert state == {"keyframe": None}
+    slam.back_end.load_state_dict(pending)
+    slam.back_end.load_state_dict(state)
+    assert slam.back_end.keyframe is None and slam.back_end.result() is None

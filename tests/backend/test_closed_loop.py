@@ -1,4 +1,4 @@
-"""A room walked around twice: the loop stage closes the circle; without it the second round lies beside the first."""
+"""Two laps around the demo room: drift with and without loop closing."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from v3d_torch.types import RGBDFrame, TrackingStatus
 
 CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 FRAMES = 90
-"""Of a round: 4 degrees and 5 cm a frame."""
+"""Frames of one lap: 4 degrees and 5 cm per frame."""
 
 
-def walk(frame: int) -> np.ndarray:
-    """Pose ``T_wc`` on a circle through the demo's room, looking outwards, with some sway; both rounds are the same."""
+def true_pose(frame: int) -> np.ndarray:
+    """Pose ``T_wc`` on a circle through the demo room, facing outwards, with some sway; both laps are the same."""
     angle = 2 * np.pi * frame / FRAMES
     yaw, pitch = np.degrees(angle) - 90 + 6 * np.sin(3 * angle), -6 + 3 * np.sin(5 * angle)
     roll = 2 * np.sin(4 * angle)
@@ -36,32 +36,32 @@ def walk(frame: int) -> np.ndarray:
 
 
 def empty_room() -> Scene:
-    """The demo's room without the people who move, and with the wall that is behind its camera."""
+    """The demo room without moving people, and with the wall behind the demo's camera."""
     room = build_room(7)
     width, height = HIGH[0] - LOW[0], HIGH[2] - LOW[2]
     bricks = materials.bricks(np.random.default_rng(0), width, height, 330, (0.6, 0.5, 0.5))
-    behind = Rectangle((HIGH[0], LOW[1], HIGH[2]), (-width, 0, 0), (0, 0, -height), bricks)
-    return Scene([*room.rectangles, behind], [figure for figure in room.figures if figure.mover == 0])
+    back_wall = Rectangle((HIGH[0], LOW[1], HIGH[2]), (-width, 0, 0), (0, 0, -height), bricks)
+    return Scene([*room.rectangles, back_wall], [figure for figure in room.figures if figure.mover == 0])
 
 
 @pytest.fixture(scope="module")
 def frames() -> list[RGBDFrame]:
-    """Two rounds, with the noise of a sensor that is another one each time."""
+    """Frames of two laps, each with different sensor noise."""
     renderer = Renderer(empty_room(), CAMERA)
-    taken = []
+    frames = []
     for index in range(2 * FRAMES):
-        rendering = renderer(walk(index), 0.0)
+        rendering = renderer(true_pose(index), 0.0)
         noise = torch.Generator().manual_seed(index)
         colour = sense_colour(rendering.colour, noise).permute(2, 0, 1).contiguous()
         depth = sense_depth(rendering.depth, CAMERA, noise).to(torch.float32)[None]
-        taken.append(RGBDFrame(index, index / 15, colour, depth, camera=CAMERA))
-    return taken
+        frames.append(RGBDFrame(index, index / 15, colour, depth, camera=CAMERA))
+    return frames
 
 
 @pytest.fixture(scope="module")
 def drift(frames: list[RGBDFrame]) -> dict[bool, float]:
-    """Error of the way from the first to the last frame as a share of the path, with the loop stage and without."""
-    truth = torch.from_numpy(np.stack([walk(index) for index in range(2 * FRAMES)]))
+    """Error of the last position relative to the first, as a fraction of the path length, by loop closing on or off."""
+    truth = torch.from_numpy(np.stack([true_pose(index) for index in range(2 * FRAMES)]))
     path = float((truth[1:, :3, 3] - truth[:-1, :3, 3]).norm(dim=1).sum())
     drift = {}
     for enabled in (True, False):
@@ -71,15 +71,15 @@ def drift(frames: list[RGBDFrame]) -> dict[bool, float]:
             slam(frame)
         assert slam.poses.statuses == [TrackingStatus.TRACKED] * len(frames)
         assert (slam.loop_closer.loop_count > 0) is enabled
-        found = slam.poses.trajectory().T_wc
-        apart = (invert(found[0]) @ found[-1])[:3, 3] - (invert(truth[0]) @ truth[-1])[:3, 3]
-        drift[enabled] = float(apart.norm()) / path
+        estimate = slam.poses.trajectory().T_wc
+        error = (invert(estimate[0]) @ estimate[-1])[:3, 3] - (invert(truth[0]) @ truth[-1])[:3, 3]
+        drift[enabled] = float(error.norm()) / path
     return drift
 
 
-def test_with_loops_the_circle_closes(drift: dict[bool, float]) -> None:
+def test_loop_closing_removes_drift(drift: dict[bool, float]) -> None:
     assert drift[True] < 0.005
 
 
-def test_without_loops_it_does_not(drift: dict[bool, float]) -> None:
+def test_without_loop_closing_drift_remains(drift: dict[bool, float]) -> None:
     assert drift[False] > 3 * drift[True]

@@ -1,4 +1,4 @@
-"""Place recognition: scores against a plain count, real and made-up places, determinism."""
+"""Place recognition: scores against a naive count, synthetic and real places, determinism."""
 
 from __future__ import annotations
 
@@ -21,129 +21,129 @@ def descriptors(count: int, seed: int) -> Tensor:
     return torch.randint(0, 256, (count, 32), generator=generator, dtype=torch.uint8)
 
 
-def seen_again(known: Tensor, flip: float, seed: int) -> Tensor:
-    """Descriptors with each bit flipped with probability ``flip``."""
-    bits = np.random.default_rng(seed).random((known.shape[0], 256)) < flip
+def with_bit_errors(known: Tensor, probability: float, seed: int) -> Tensor:
+    """Descriptors with each bit flipped at the given probability."""
+    bits = np.random.default_rng(seed).random((known.shape[0], 256)) < probability
     return known ^ torch.from_numpy(np.packbits(bits, axis=1))
 
 
-def plain_scores(query: Tensor, keyframes: list[Tensor]) -> list[float]:
+def naive_scores(query: Tensor, keyframes: list[Tensor]) -> list[float]:
     scores = [0.0] * len(keyframes)
     for descriptor in query.numpy():
-        voted = []
+        matched = []
         for k, keyframe in enumerate(keyframes):
             same_bucket = (keyframe.numpy()[:, :2] == descriptor[:2]).all(axis=1)
             distance = np.unpackbits(keyframe.numpy() ^ descriptor, axis=1).sum(axis=1)
             if (same_bucket & (distance < 50)).any():
-                voted.append(k)
-        for k in voted:
-            scores[k] += math.log(1 + len(keyframes) / len(voted)) / query.shape[0]
+                matched.append(k)
+        for k in matched:
+            scores[k] += math.log(1 + len(keyframes) / len(matched)) / query.shape[0]
     return scores
 
 
-def test_scores_equal_a_plain_count() -> None:
+def test_scores_equal_a_naive_count() -> None:
     common = descriptors(30, seed=99)
-    keyframes = [torch.cat([descriptors(60, seed=k), seen_again(common, 0.02, seed=k)]) for k in range(6)]
-    index = KeyframeDatabase()
+    keyframes = [torch.cat([descriptors(60, seed=k), with_bit_errors(common, 0.02, seed=k)]) for k in range(6)]
+    database = KeyframeDatabase()
     for k, keyframe in enumerate(keyframes):
-        index.add(10 * k, keyframe)
-    query = torch.cat([seen_again(keyframes[3], 0.03, seed=7), seen_again(keyframes[1][:20], 0.03, seed=8)])
-    expected = plain_scores(query, keyframes)
-    found = dict(index.query(query, k=6))
+        database.add(10 * k, keyframe)
+    query = torch.cat([with_bit_errors(keyframes[3], 0.03, seed=7), with_bit_errors(keyframes[1][:20], 0.03, seed=8)])
+    expected = naive_scores(query, keyframes)
+    found = dict(database.query(query, k=6))
     assert {k: found.get(10 * k, 0.0) for k in range(6)} == pytest.approx(dict(enumerate(expected)))
     assert max(found, key=lambda k: found[k]) == 30
 
 
-def test_the_place_comes_first() -> None:
-    index = KeyframeDatabase()
+def test_keyframe_of_the_same_place_ranks_first() -> None:
+    database = KeyframeDatabase()
     keyframes = [descriptors(300, seed=k) for k in range(50)]
     for k, keyframe in enumerate(keyframes):
-        index.add(k, keyframe)
+        database.add(k, keyframe)
     for k in range(0, 50, 7):
-        (best, score), *rest = index.query(seen_again(keyframes[k][:150], 0.05, seed=k), k=3)
+        (best, score), *rest = database.query(with_bit_errors(keyframes[k][:150], 0.05, seed=k), k=3)
         assert best == k
         assert all(score > 5 * other for _, other in rest)
 
 
-def test_excluded_keyframes_do_not_come() -> None:
+def test_excluded_keyframes_are_not_returned() -> None:
     place = descriptors(200, seed=0)
-    index = KeyframeDatabase()
+    database = KeyframeDatabase()
     for k in range(5):
-        index.add(k, seen_again(place, 0.02, seed=k))
-    found = [k for k, _ in index.query(place, k=5, exclude=[1, 4, 77])]
+        database.add(k, with_bit_errors(place, 0.02, seed=k))
+    found = [k for k, _ in database.query(place, k=5, exclude=[1, 4, 77])]
     assert sorted(found) == [0, 2, 3]
-    assert index.query(place, k=5, exclude=range(5)) == []
+    assert database.query(place, k=5, exclude=range(5)) == []
 
 
-def test_what_all_keyframes_show_decides_nothing() -> None:
-    index = KeyframeDatabase()
-    everywhere = descriptors(100, seed=0)
+def test_descriptors_of_all_keyframes_do_not_decide() -> None:
+    database = KeyframeDatabase()
+    common = descriptors(100, seed=0)
     for k in range(10):
-        index.add(k, torch.cat([everywhere, descriptors(20, seed=1 + k)]))
-    # fewer descriptors, but those that only keyframe 6 has
-    query = torch.cat([everywhere, descriptors(20, seed=7)])
-    assert index.query(query, k=1)[0][0] == 6
+        database.add(k, torch.cat([common, descriptors(20, seed=1 + k)]))
+    # The query has 20 descriptors that only keyframe 6 has.
+    query = torch.cat([common, descriptors(20, seed=7)])
+    assert database.query(query, k=1)[0][0] == 6
 
 
-def test_nothing_known_nothing_seen() -> None:
-    index = KeyframeDatabase()
-    assert index.query(descriptors(10, seed=0), k=3) == []
-    index.add(0, descriptors(0, seed=0))
-    assert index.query(descriptors(10, seed=0), k=3) == []
-    index.add(1, descriptors(10, seed=0))
-    assert index.query(descriptors(0, seed=0), k=3) == []
-    assert [k for k, _ in index.query(descriptors(10, seed=0), k=3)] == [1]
-    assert len(index) == 2
+def test_empty_database_and_empty_query_give_no_keyframes() -> None:
+    database = KeyframeDatabase()
+    assert database.query(descriptors(10, seed=0), k=3) == []
+    database.add(0, descriptors(0, seed=0))
+    assert database.query(descriptors(10, seed=0), k=3) == []
+    database.add(1, descriptors(10, seed=0))
+    assert database.query(descriptors(0, seed=0), k=3) == []
+    assert [k for k, _ in database.query(descriptors(10, seed=0), k=3)] == [1]
+    assert len(database) == 2
 
 
-def test_same_answer_with_any_number_of_threads() -> None:
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
     place = descriptors(300, seed=0)
-    answers = []
+    results = []
     threads = faiss.omp_get_max_threads()
     for count in (1, 4):
         faiss.omp_set_num_threads(count)
-        index = KeyframeDatabase()
+        database = KeyframeDatabase()
         for k in range(20):
-            index.add(k, seen_again(place, 0.01 * k, seed=k))
-        answers.append(index.query(place, k=10))
+            database.add(k, with_bit_errors(place, 0.01 * k, seed=k))
+        results.append(database.query(place, k=10))
     faiss.omp_set_num_threads(threads)
-    assert answers[0] == answers[1]
+    assert results[0] == results[1]
 
 
-def test_equal_scores_oldest_first() -> None:
+def test_equal_scores_rank_in_order_of_insertion() -> None:
     place = descriptors(50, seed=0)
-    index = KeyframeDatabase()
+    database = KeyframeDatabase()
     for k in (8, 3, 5):
-        index.add(k, place)
-    assert [k for k, _ in index.query(place, k=3)] == [8, 3, 5]
+        database.add(k, place)
+    assert [k for k, _ in database.query(place, k=3)] == [8, 3, 5]
 
 
-def test_real_places(v3d_data: Path) -> None:
-    """The camera turns on the spot (fr1_rpy): views that face the same way show the same place."""
+def test_real_images_of_the_same_direction_are_recognised(v3d_data: Path) -> None:
+    """The camera of fr1_rpy rotates on the spot: images in the same direction show the same place."""
     root = v3d_data / "fr1_rpy"
     if not root.is_dir():
-        pytest.skip(f"{root} is not there")
+        pytest.skip(f"{root} is missing")
     rows = [line.split() for line in (root / "associations.txt").read_text(encoding="utf-8").splitlines()][::20]
     truth = np.loadtxt(root / "groundtruth.txt")
-    index = KeyframeDatabase()
+    database = KeyframeDatabase()
     views, forward = [], []
     for k, (stamp, colour, *_) in enumerate(rows):
         image = cv2.cvtColor(cv2.imread(str(root / colour)), cv2.COLOR_BGR2RGB)
-        found = kornia_rs.features.orb_detect_and_compute(image, n_keypoints=1000)
-        views.append(torch.from_numpy(found.descriptors.copy()))
+        orb = kornia_rs.features.orb_detect_and_compute(image, n_keypoints=1000)
+        views.append(torch.from_numpy(orb.descriptors.copy()))
         pose = truth[np.abs(truth[:, 0] - float(stamp)).argmin()]
         x, y, z, w = pose[4:]
         forward.append([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-        index.add(k, views[-1])
+        database.add(k, views[-1])
     cosine = np.array(forward) @ np.array(forward).T
     number = np.arange(len(rows))
     apart = np.abs(number[:, None] - number) > 3
     same, other = apart & (cosine > math.cos(math.radians(15))), apart & (cosine < math.cos(math.radians(60)))
-    hits, asked = 0, 0
+    hits, queries = 0, 0
     for k in number[same.any(axis=1)].tolist():
-        candidates = [c for c, _ in index.query(views[k], k=3, exclude=range(k - 3, k + 4))]
+        candidates = [c for c, _ in database.query(views[k], k=3, exclude=range(k - 3, k + 4))]
         hits += bool(same[k, candidates].any())
-        asked += 1
+        queries += 1
         assert not other[k, candidates[0]]
-    assert asked >= 20
-    assert hits / asked >= 0.85
+    assert queries >= 20
+    assert hits / queries >= 0.85

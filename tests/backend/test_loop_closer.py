@@ -1,4 +1,4 @@
-"""Loops in made-up rooms: a camera walks around twice, its poses drift, and what it sees again puts them right."""
+"""Loop closing in synthetic rooms: the camera makes two laps with drift, and recognised places correct its poses."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from v3d_torch.tracking.map_tracker import MapTracker
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 LAP = 24
-"""Keyframes of one way around."""
-OPEN = 19
-"""Keyframes until a place of the first one comes back into view."""
+"""Keyframes of one lap."""
+BEFORE_LOOP = 19
+"""Keyframes until a place of the first keyframe is visible again."""
 DRIFT = torch.tensor([0.002, 0.005, 0.002, 0.0005, 0.002, 0.0005], dtype=torch.float64)
-"""Error of the motion between two keyframes 0.26 m apart, metres and radians."""
+"""Error of the motion between two keyframes, which are 0.26 m apart: translation in metres, rotation in radians."""
 
 
 class Room:
-    """Points on the walls of a room of 5 x 5 x 2.6 m, each with its descriptor."""
+    """Points on the walls of a room of 5 x 5 x 2.6 m, each with a random descriptor."""
 
     def __init__(self, seed: int, count: int = 3000) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -42,8 +42,8 @@ class Room:
         self.points = place * torch.tensor([5.0, 2.6, 5.0])
         self.descriptors = torch.randint(0, 256, (count, 32), generator=generator, dtype=torch.uint8)
 
-    def look(self, T_wc: Tensor, seed: int) -> tuple[Features, Tensor]:
-        """Features from a pose, with noise on pixels, depth and bits, and the points behind them."""
+    def observe(self, T_wc: Tensor, seed: int) -> tuple[Features, Tensor]:
+        """Features observed from a pose, with noise on pixels, depth and bits, and the indices of their points."""
         generator = torch.Generator().manual_seed(seed)
 
         def normal(*shape: int) -> Tensor:
@@ -52,139 +52,147 @@ class Room:
         T_cw = invert(T_wc)
         points = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
         uv = CAMERA.project(torch.where(points[:, 2:] > 0.5, points, -1.0))
-        seen = ((uv >= 0) & (uv < torch.tensor([640, 480]))).all(dim=1) & (points[:, 2] > 0.5)
-        distance = points[seen].norm(dim=1)
+        visible = ((uv >= 0) & (uv < torch.tensor([640, 480]))).all(dim=1) & (points[:, 2] > 0.5)
+        distance = points[visible].norm(dim=1)
         octave = (torch.log(6.0 / distance) / math.log(1.2)).round().clamp(0, 7).long()
-        z = points[seen, 2]
+        z = points[visible, 2]
         flipped = torch.rand(len(z), 32, 8, generator=generator) < 0.02
         flips = (flipped * 2 ** torch.arange(8)).sum(dim=-1).to(torch.uint8)
-        uv = uv[seen] + 0.3 * normal(len(z), 2)
+        uv = uv[visible] + 0.3 * normal(len(z), 2)
         features = Features(
             uv=uv,
             pixel=uv.round().long().clamp(min=0).minimum(torch.tensor([639, 479])),
             depth=z + 0.002 * z**2 * normal(len(z)),
             octave=octave,
-            descriptors=self.descriptors[seen] ^ flips,
+            descriptors=self.descriptors[visible] ^ flips,
         )
-        return features, torch.nonzero(seen)[:, 0]
+        return features, torch.nonzero(visible)[:, 0]
 
 
-def on_the_way(k: int) -> Tensor:
-    """``T_wc`` of a camera on a circle of 1 m radius that looks outward, as keyframe ``k`` of a lap."""
+def lap_pose(k: int) -> Tensor:
+    """Pose ``T_wc`` of keyframe ``k``, on a circle of 1 m radius, facing outwards."""
     turn = torch.tensor([0, 0, 0, 0, 2 * math.pi * k / LAP, 0], dtype=torch.float64)
     out = torch.tensor([0, 0, 1, 0, 0, 0], dtype=torch.float64)
     return se3_exp(turn) @ se3_exp(out)
 
 
-class Walker:
-    """Makes keyframes from drifting poses, and remembers landmarks as long as the last three keyframes saw them."""
+class Camera:
+    """Camera that inserts keyframes at drifting poses and tracks landmarks of the last three keyframes."""
 
     def __init__(self, *overrides: str) -> None:
         config = load_config(overrides=list(overrides))
         self.map = SparseMap(config.mapping, config.features, CAMERA)
-        self.closer = closer(config)
-        self.true: list[Tensor] = []
+        self.loop_closer = make_loop_closer(config)
+        self.true_poses: list[Tensor] = []
         self.corrections: list[Tensor | None] = []
-        self._seen: list[Tensor] = []  # the points behind each keyframe's features
-        self._since = 0  # first keyframe of which landmarks are remembered
+        self._points: list[Tensor] = []  # for each keyframe, the indices of the points of its features
+        self._first_tracked = 0  # first keyframe of which landmarks are tracked
 
     def step(
         self, room: Room, T_wc: Tensor, *, disconnected: bool = False, guess: Tensor | None = None, every: int = 1
     ) -> Keyframe:
-        """Go to a pose, by a motion that is wrong by the drift, and make a keyframe there.
+        """Move to a pose, with drift in the estimated motion, and insert a keyframe there.
 
-        A guess that is wrong instead joins the pose of a camera that was lost; it has no landmark in view any more.
+        Args:
+            room: Room that the camera observes.
+            T_wc: True pose of the keyframe.
+            disconnected: True if only a guess joins the keyframe to the rest of the map.
+            guess: Error of the estimated motion in place of the drift, for a camera that was lost and tracks no
+                landmarks; None if the camera was not lost.
+            every: Use every n-th feature.
         """
         if guess is not None:
-            self._since = len(self.true)
-        if self.true:
-            motion = invert(self.true[-1]) @ T_wc @ se3_exp(DRIFT if guess is None else guess)
+            self._first_tracked = len(self.true_poses)
+        if self.true_poses:
+            motion = invert(self.true_poses[-1]) @ T_wc @ se3_exp(DRIFT if guess is None else guess)
             T_cw = invert(invert(self.map.keyframes[-1].T_cw) @ motion)
         else:
             T_cw = invert(T_wc)
-        features, which = room.look(T_wc, seed=len(self.true))
-        features, which = features[torch.arange(0, len(which), every)], which[::every]
+        features, points = room.observe(T_wc, seed=len(self.true_poses))
+        features, points = features[torch.arange(0, len(points), every)], points[::every]
         known = torch.full((len(room.points),), -1)
-        since = max(self._since, len(self._seen) - 3)
-        for points, recent in list(zip(self._seen, self.map.keyframes, strict=True))[since:]:
-            known[points] = torch.maximum(known[points], recent.landmarks)
-        keyframe = self.map.insert_keyframe(len(self.true), len(self.true) / 3, T_cw, features, known[which])
+        first = max(self._first_tracked, len(self._points) - 3)
+        for recent_points, recent in list(zip(self._points, self.map.keyframes, strict=True))[first:]:
+            known[recent_points] = torch.maximum(known[recent_points], recent.landmarks)
+        keyframe = self.map.insert_keyframe(
+            len(self.true_poses), len(self.true_poses) / 3, T_cw, features, known[points]
+        )
         keyframe.disconnected = disconnected
-        self.true.append(T_wc)
-        closure = self.closer.detect_loop(keyframe, self.map, self.map.T_cw)
-        self.corrections.append(None if closure is None else self.closer.correct_loop(closure, self.map))
-        self.closer.add_keyframe(keyframe)
-        self._seen.append(which)
+        self.true_poses.append(T_wc)
+        correction = self.loop_closer.detect_loop(keyframe, self.map, self.map.T_cw)
+        self.corrections.append(None if correction is None else self.loop_closer.correct_loop(correction, self.map))
+        self.loop_closer.add_keyframe(keyframe)
+        self._points.append(points)
         return keyframe
 
     def errors(self) -> Tensor:
-        """Distance of each keyframe to its true place, metres; the first is the world, nothing is aligned."""
+        """Distance of each keyframe to its true position, metres, without alignment."""
         T_cw = torch.stack([keyframe.T_cw for keyframe in self.map.keyframes])
-        return (invert(T_cw) - torch.stack(self.true))[:, :3, 3].norm(dim=1)
+        return (invert(T_cw) - torch.stack(self.true_poses))[:, :3, 3].norm(dim=1)
 
     def length(self) -> float:
-        """Of the true way, metres."""
-        return float(torch.stack(self.true)[:, :3, 3].diff(dim=0).norm(dim=1).sum())
+        """Length of the true path, metres."""
+        return float(torch.stack(self.true_poses)[:, :3, 3].diff(dim=0).norm(dim=1).sum())
 
 
-def closer(config: Config) -> LoopCloser:
+def make_loop_closer(config: Config) -> LoopCloser:
     motion = MotionEstimator(config.odometry, config.features, CAMERA, config.seed)
     tracker = MapTracker(config.tracking, config.features, CAMERA)
     return LoopCloser(config.loop, motion, tracker, config.tracking.local_keyframes)
 
 
-def walk_twice(*overrides: str) -> Walker:
-    walker, room = Walker(*overrides), Room(seed=1)
+def make_two_laps(*overrides: str) -> Camera:
+    camera, room = Camera(*overrides), Room(seed=1)
     for k in range(2 * LAP):
-        walker.step(room, on_the_way(k))
-    return walker
+        camera.step(room, lap_pose(k))
+    return camera
 
 
 @pytest.fixture(scope="module")
-def closed() -> Walker:
-    return walk_twice()
+def closed() -> Camera:
+    return make_two_laps()
 
 
 @pytest.fixture(scope="module")
-def drifted() -> Walker:
-    return walk_twice("loop.enabled=false")
+def drifted() -> Camera:
+    return make_two_laps("loop.enabled=false")
 
 
 def rmse(errors: Tensor) -> float:
     return float(errors.square().mean().sqrt())
 
 
-def test_a_loop_takes_the_drift_away(closed: Walker, drifted: Walker) -> None:
-    assert drifted.closer.loop_count == 0
+def test_loop_correction_removes_drift(closed: Camera, drifted: Camera) -> None:
+    assert drifted.loop_closer.loop_count == 0
     assert rmse(drifted.errors()) > 0.01 * drifted.length()
-    assert closed.closer.loop_count > 0
+    assert closed.loop_closer.loop_count > 0
     assert rmse(closed.errors()) < 0.005 * closed.length()
     assert rmse(closed.errors()) < 0.3 * rmse(drifted.errors())
 
 
-def test_the_loop_is_found_as_soon_as_a_place_comes_back(closed: Walker) -> None:
+def test_loop_is_detected_as_soon_as_a_place_is_visible_again(closed: Camera) -> None:
     first = next(k for k, correction in enumerate(closed.corrections) if correction is not None)
     assert LAP - 3 <= first <= LAP + 1
 
 
-def test_the_same_landmarks_are_seen_on_both_laps(closed: Walker, drifted: Walker) -> None:
+def test_loop_correction_fuses_the_landmarks_of_both_laps(closed: Camera, drifted: Camera) -> None:
     first = next(k for k, correction in enumerate(closed.corrections) if correction is not None)
 
-    def joint(walker: Walker) -> int:
-        landmarks = walker.map.keyframes[first + 1].landmarks
-        return int(walker.map.count_shared(landmarks[landmarks >= 0])[: LAP // 2].sum())
+    def shared(camera: Camera) -> int:
+        landmarks = camera.map.keyframes[first + 1].landmarks
+        return int(camera.map.count_shared(landmarks[landmarks >= 0])[: LAP // 2].sum())
 
-    assert joint(drifted) == 0
-    assert joint(closed) > 100
+    assert shared(drifted) == 0
+    assert shared(closed) > 100
 
 
-def test_landmarks_move_with_their_keyframes() -> None:
-    """After the correction, what the map says a keyframe should see is where the keyframe saw it."""
-    walker, room = Walker(), Room(seed=1)
-    while not any(correction is not None for correction in walker.corrections):
-        walker.step(room, on_the_way(len(walker.true)))
-    table, landmarks = walker.map.observations, walker.map.landmarks
-    T_cw = torch.stack([keyframe.T_cw for keyframe in walker.map.keyframes])[table["keyframe"]]
+def test_loop_correction_keeps_landmark_reprojection() -> None:
+    """Landmarks move with the keyframe that created them."""
+    camera, room = Camera(), Room(seed=1)
+    while not any(correction is not None for correction in camera.corrections):
+        camera.step(room, lap_pose(len(camera.true_poses)))
+    table, landmarks = camera.map.observations, camera.map.landmarks
+    T_cw = torch.stack([keyframe.T_cw for keyframe in camera.map.keyframes])[table["keyframe"]]
     points = (T_cw[:, :3, :3] @ landmarks["point"][table["landmark"], :, None])[..., 0] + T_cw[:, :3, 3]
     own = landmarks["keyframe"][table["landmark"]] == table["keyframe"]
     error = (CAMERA.project(points) - table["uv"]).norm(dim=1)
@@ -192,126 +200,144 @@ def test_landmarks_move_with_their_keyframes() -> None:
     assert error[own].max() < 1e-6
 
 
-def test_convention_the_correction_maps_the_old_world_to_the_new() -> None:
-    walker, room = Walker(), Room(seed=1)
-    # The same walk without the correction tells where the newest keyframe was before.
-    twin = Walker("loop.enabled=false")
-    while not any(correction is not None for correction in walker.corrections):
-        k = len(walker.true)
-        walker.step(room, on_the_way(k))
-        twin.step(room, on_the_way(k))
-    T_new_old = walker.corrections[-1]
+def test_convention_correction_maps_old_world_to_new_world() -> None:
+    camera, room = Camera(), Room(seed=1)
+    # Without loop closing, the newest keyframe keeps the pose that it had before the correction.
+    twin = Camera("loop.enabled=false")
+    while not any(correction is not None for correction in camera.corrections):
+        k = len(camera.true_poses)
+        camera.step(room, lap_pose(k))
+        twin.step(room, lap_pose(k))
+    T_new_old = camera.corrections[-1]
     assert T_new_old is not None
-    old, new = invert(twin.map.keyframes[-1].T_cw), invert(walker.map.keyframes[-1].T_cw)
+    old, new = invert(twin.map.keyframes[-1].T_cw), invert(camera.map.keyframes[-1].T_cw)
     torch.testing.assert_close(T_new_old @ old, new, rtol=0, atol=1e-9)
     assert (old[:3, 3] - new[:3, 3]).norm() > 0.05
 
 
-def test_a_place_that_shows_little_of_what_it_should_is_no_loop() -> None:
-    """On the second lap something covers eleven of twelve features; without the rule the rest makes a loop."""
-    found = {}
+def test_place_with_few_of_its_visible_landmarks_is_no_loop() -> None:
+    """On the second lap eleven of twelve features are occluded; without the minimum ratio the rest forms a loop."""
+    loop_counts = {}
     for overrides in ((), ("loop.min_inlier_ratio=0",)):
-        walker, room = Walker("loop.min_inliers=15", *overrides), Room(seed=1)
-        for k in range(OPEN):
-            walker.step(room, on_the_way(k))
-        assert walker.closer.loop_count == 0
-        while len(walker.true) < LAP + OPEN - 1:  # until places come back that were covered, too
-            walker.step(room, on_the_way(len(walker.true)), every=12)
-        found[overrides] = walker.closer.loop_count
-    assert found[()] == 0 and found[("loop.min_inlier_ratio=0",)] > 0
+        camera, room = Camera("loop.min_inliers=15", *overrides), Room(seed=1)
+        for k in range(BEFORE_LOOP):
+            camera.step(room, lap_pose(k))
+        assert camera.loop_closer.loop_count == 0
+        # Until places that were occluded before are visible again.
+        while len(camera.true_poses) < LAP + BEFORE_LOOP - 1:
+            camera.step(room, lap_pose(len(camera.true_poses)), every=12)
+        loop_counts[overrides] = camera.loop_closer.loop_count
+    assert loop_counts[()] == 0 and loop_counts[("loop.min_inlier_ratio=0",)] > 0
 
 
-def test_two_rooms_make_no_loop() -> None:
-    walker = Walker()
+def test_different_rooms_form_no_loop() -> None:
+    camera = Camera()
     for room in (Room(seed=1), Room(seed=2)):
-        for k in range(OPEN):
-            walker.step(room, on_the_way(k))
-    assert walker.closer.loop_count == 0
+        for k in range(BEFORE_LOOP):
+            camera.step(room, lap_pose(k))
+    assert camera.loop_closer.loop_count == 0
 
 
-def test_the_same_posters_on_other_places_make_no_loop() -> None:
-    """Descriptors that are all known, but in another arrangement: appearance says yes, geometry no."""
-    walker, room = Walker(), Room(seed=1)
+def test_same_descriptors_in_another_arrangement_form_no_loop() -> None:
+    """Place recognition succeeds, geometric verification fails."""
+    camera, room = Camera(), Room(seed=1)
     other = Room(seed=2)
     other.descriptors = room.descriptors
-    index = KeyframeDatabase()
-    for k in range(OPEN):
-        index.add(k, walker.step(room, on_the_way(k)).features.descriptors)
-    view, _ = other.look(on_the_way(3), seed=99)
-    assert index.query(view.descriptors, 1)[0][1] > 0.1  # appearance takes the bait
-    assert index.query(Room(seed=3).look(on_the_way(3), seed=99)[0].descriptors, 1) == []
-    for k in range(OPEN):
-        walker.step(other, on_the_way(k))
-    assert walker.closer.loop_count == 0
+    database = KeyframeDatabase()
+    for k in range(BEFORE_LOOP):
+        database.add(k, camera.step(room, lap_pose(k)).features.descriptors)
+    view, _ = other.observe(lap_pose(3), seed=99)
+    assert database.query(view.descriptors, 1)[0][1] > 0.1  # recognised by appearance
+    assert database.query(Room(seed=3).observe(lap_pose(3), seed=99)[0].descriptors, 1) == []
+    for k in range(BEFORE_LOOP):
+        camera.step(other, lap_pose(k))
+    assert camera.loop_closer.loop_count == 0
 
 
-def test_what_the_map_still_connects_is_no_loop() -> None:
-    """To and fro before the same wall for long: the places are known, but nothing has been lost sight of."""
-    walker, room = Walker("loop.min_keyframe_gap=3"), Room(seed=1)
+def test_covisible_keyframes_form_no_loop() -> None:
+    """The camera moves to and fro in front of one wall: places are recognised, but they are covisible."""
+    camera, room = Camera("loop.min_keyframe_gap=3"), Room(seed=1)
     for k in range(20):
-        walker.step(room, on_the_way(0) @ se3_exp(torch.tensor([0.05 * (k % 2), 0, 0, 0, 0, 0], dtype=torch.float64)))
-    assert walker.closer.loop_count == 0
+        camera.step(room, lap_pose(0) @ se3_exp(torch.tensor([0.05 * (k % 2), 0, 0, 0, 0, 0], dtype=torch.float64)))
+    assert camera.loop_closer.loop_count == 0
 
 
-def test_a_lost_camera_is_found_where_it_is() -> None:
-    walker, room = Walker(), Room(seed=1)
+def test_lost_camera_is_relocalised_at_its_pose() -> None:
+    camera, room = Camera(), Room(seed=1)
     for k in range(10):
-        walker.step(room, on_the_way(k))
-    # Between two keyframes, a step aside and tilted; in the world as the drifting map has it around keyframe 2.
-    aside = se3_exp(torch.tensor([0.15, -0.1, 0.1, 0.05, 0.08, 0.2], dtype=torch.float64))
-    features, _ = room.look(on_the_way(2) @ aside, seed=77)
-    place = walker.closer.relocalise(features, walker.map)
+        camera.step(room, lap_pose(k))
+    # Between two keyframes, displaced and tilted, relative to the drifting pose of keyframe 2.
+    displacement = se3_exp(torch.tensor([0.15, -0.1, 0.1, 0.05, 0.08, 0.2], dtype=torch.float64))
+    features, _ = room.observe(lap_pose(2) @ displacement, seed=77)
+    place = camera.loop_closer.relocalise(features, camera.map)
     assert place is not None
     assert place.keyframe.index in (0, 1, 2, 3, 4)
     assert place.tracking.count > 100
-    expected = invert(invert(walker.map.keyframes[2].T_cw) @ aside)
+    expected = invert(invert(camera.map.keyframes[2].T_cw) @ displacement)
     offset = se3_log(place.tracking.T_cw @ invert(expected)).abs()
-    # As exact as the map around it, which drifts by 6 mm a keyframe.
+    # As accurate as the map around the keyframe, which drifts by 6 mm per keyframe.
     assert offset[:3].max() < 0.02 and offset[3:].max() < 0.01
-    assert walker.closer.relocalise(features, walker.map, exclude=range(10)) is None
-    assert walker.closer.relocalise(Room(seed=2).look(on_the_way(2), seed=77)[0], walker.map) is None
+    assert camera.loop_closer.relocalise(features, camera.map, exclude=range(10)) is None
+    assert camera.loop_closer.relocalise(Room(seed=2).observe(lap_pose(2), seed=77)[0], camera.map) is None
 
 
-def test_too_few_landmarks_are_no_place() -> None:
-    walker, room = Walker(), Room(seed=1)
+def test_relocalisation_fails_with_too_few_features() -> None:
+    camera, room = Camera(), Room(seed=1)
     for k in range(6):
-        walker.step(room, on_the_way(k))
-    features, _ = room.look(on_the_way(2), seed=77)
-    assert walker.closer.relocalise(features[torch.arange(39)], walker.map) is None
-    assert walker.closer.relocalise(features[torch.zeros(0, dtype=torch.int64)], walker.map) is None
+        camera.step(room, lap_pose(k))
+    features, _ = room.observe(lap_pose(2), seed=77)
+    assert camera.loop_closer.relocalise(features[torch.arange(39)], camera.map) is None
+    assert camera.loop_closer.relocalise(features[torch.zeros(0, dtype=torch.int64)], camera.map) is None
     without_depth = replace(features, depth=torch.zeros_like(features.depth))
-    assert walker.closer.relocalise(without_depth, walker.map) is not None  # the map has depth enough
+    assert camera.loop_closer.relocalise(without_depth, camera.map) is not None  # the landmarks of the map have depth
 
 
-def test_what_was_disconnected_is_joined_by_the_loop() -> None:
-    walker, room = Walker(), Room(seed=1)
-    for k in range(OPEN):
-        walker.step(room, on_the_way(k), disconnected=k > 12)
-    assert walker.closer.loop_count == 0
-    assert any(keyframe.disconnected for keyframe in walker.map.keyframes)
-    while walker.corrections[-1] is None:
-        walker.step(room, on_the_way(len(walker.true)), disconnected=True)
-    assert not any(keyframe.disconnected for keyframe in walker.map.keyframes)
+def test_loop_joins_the_disconnected_part_of_the_map() -> None:
+    camera, room = Camera(), Room(seed=1)
+    for k in range(BEFORE_LOOP):
+        camera.step(room, lap_pose(k), disconnected=k > 12)
+    assert camera.loop_closer.loop_count == 0
+    assert any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    while camera.corrections[-1] is None:
+        camera.step(room, lap_pose(len(camera.true_poses)), disconnected=True)
+    assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
 
 
-def test_the_loop_puts_a_wrong_guess_right_and_bends_nothing_for_it() -> None:
-    """A camera that was lost is guessed half a metre from where it is: the loop alone says how the parts lie."""
-    walker, room = Walker(), Room(seed=1)
+def test_loop_corrects_a_wrong_guess_without_deforming_the_map() -> None:
+    """A lost camera is guessed half a metre off: only the loop determines the relative pose of the two parts."""
+    camera, room = Camera(), Room(seed=1)
     guess = torch.tensor([0.4, 0, 0.3, 0, 0.35, 0], dtype=torch.float64)
     for k in range(2 * LAP):
-        walker.step(room, on_the_way(k), disconnected=k >= 12, guess=guess if k == 12 else None)
-        if walker.corrections[-1] is not None:
+        camera.step(room, lap_pose(k), disconnected=k >= 12, guess=guess if k == 12 else None)
+        if camera.corrections[-1] is not None:
             break
         if k == 11:
-            before = walker.errors()
+            before = camera.errors()
         if k == 12:
-            assert walker.errors()[12] > 0.4
-    assert walker.closer.loop_count == 1
-    torch.testing.assert_close(walker.errors()[:12], before, rtol=0, atol=1e-3)
-    assert walker.errors()[12:].max() < 0.1  # drift from the loop back to keyframe 12
+            assert camera.errors()[12] > 0.4
+    assert camera.loop_closer.loop_count == 1
+    torch.testing.assert_close(camera.errors()[:12], before, rtol=0, atol=1e-3)
+    assert camera.errors()[12:].max() < 0.1  # drift between the loop and keyframe 12
 
 
-def test_deterministic(closed: Walker) -> None:
-    again = walk_twice()
+def test_loop_closing_is_deterministic(closed: Camera) -> None:
+    again = make_two_laps()
     for first, second in zip(closed.map.keyframes, again.map.keyframes, strict=True):
         assert torch.equal(first.T_cw, second.T_cw)
+
+
+def test_loop_closer_that_loads_a_state_and_the_map_recognises_the_same_places(closed: Camera) -> None:
+    state = closed.loop_closer.state_dict()
+    assert state == {"loop_count": closed.loop_closer.loop_count} and state["loop_count"] > 0
+    loaded = make_loop_closer(load_config())
+    loaded.add_keyframe(closed.map.keyframes[0])  # is replaced
+    loaded.load_state_dict(state)
+    loaded.rebuild(closed.map.active_keyframes)
+    assert loaded.loop_count == closed.loop_closer.loop_count
+    features, _ = Room(seed=1).observe(lap_pose(5), seed=77)
+    expected, place = (loop_closer.relocalise(features, closed.map) for loop_closer in (closed.loop_closer, loaded))
+    assert expected is not None and place is not None
+    assert place.keyframe is expected.keyframe
+    assert torch.equal(place.tracking.T_cw, expected.tracking.T_cw)
+    loaded.rebuild([])
+    assert loaded.relocalise(features, closed.map) is None

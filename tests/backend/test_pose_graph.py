@@ -1,4 +1,4 @@
-"""Pose graphs against gtsam, autograd, and graphs whose solution is known."""
+"""Pose-graph optimisation against GTSAM, autograd, and graphs with known solutions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIGMA = torch.tensor([0.01] * 3 + [0.005] * 3, dtype=torch.float64)
 
 
 class Graph:
-    """Poses on a circle walked around twice, noisy measured motions between them, and the walk as it drifts."""
+    """Poses on two laps of a circle, noisy relative poses between them, and initial poses that drift."""
 
     def __init__(self, poses: int, loops: int, noise: float = 1.0, seed: int = 0) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -39,13 +39,14 @@ class Graph:
         error = noise * SIGMA * normal(len(i), 6)
         self.T_ij = invert(self.T_wc[i]) @ self.T_wc[j] @ se3_exp(error)
         self.information = torch.diag(SIGMA**-2).expand(len(i), 6, 6)
-        walk = [self.T_wc[0]]
+        drifting = [self.T_wc[0]]
         for T in self.T_ij[: poses - 1]:
-            walk.append(walk[-1] @ T)
-        self.start = torch.stack(walk)
+            drifting.append(drifting[-1] @ T)
+        self.start = torch.stack(drifting)
 
 
-def with_gtsam(graph: Graph, information: Tensor, kernel: float | None = None) -> tuple[Tensor, float]:
+def optimise_with_gtsam(graph: Graph, information: Tensor, kernel: float | None = None) -> tuple[Tensor, float]:
+    """Optimal poses and cost according to GTSAM, with Huber's kernel if a threshold is given."""
     factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, T in enumerate(graph.start):
         start.insert(k, gtsam.Pose3(T.numpy()))
@@ -64,10 +65,10 @@ def with_gtsam(graph: Graph, information: Tensor, kernel: float | None = None) -
 
 
 @pytest.mark.parametrize(("poses", "loops"), [(30, 3), (300, 40), (1000, 100)])
-def test_same_optimum_as_gtsam(poses: int, loops: int) -> None:
+def test_optimum_equals_that_of_gtsam(poses: int, loops: int) -> None:
     graph = Graph(poses, loops)
     result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
-    expected, cost = with_gtsam(graph, graph.information)
+    expected, cost = optimise_with_gtsam(graph, graph.information)
     assert result.converged
     assert result.cost_after == pytest.approx(cost, rel=1e-6)
     assert (result.T_wc - expected).abs().max() < 1e-5
@@ -75,11 +76,11 @@ def test_same_optimum_as_gtsam(poses: int, loops: int) -> None:
     assert (result.T_wc - graph.T_wc)[:, :3, 3].norm(dim=1).max() < drift
 
 
-def test_same_robust_optimum_as_gtsam() -> None:
+def test_robust_optimum_equals_that_of_gtsam_and_resists_a_wrong_loop() -> None:
     graph = Graph(60, 15)
     graph.T_ij[-1] = graph.T_ij[-1] @ se3_exp(torch.tensor([0.5, 0.3, 0.0, 0.0, 0.4, 0.0], dtype=torch.float64))
     result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information, robust=3.0)
-    expected, cost = with_gtsam(graph, graph.information, kernel=3.0)
+    expected, cost = optimise_with_gtsam(graph, graph.information, kernel=3.0)
     assert result.cost_after == pytest.approx(cost, rel=1e-4)
     assert (result.T_wc - expected).abs().max() < 1e-3
     plain = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
@@ -93,7 +94,7 @@ def test_convention_information_orders_translation_first() -> None:
     information = torch.diag(torch.tensor([1e6, 1e2, 1e4, 1e3, 1e5, 1e4], dtype=torch.float64))
     information = information.expand(graph.edges.shape[0], 6, 6)
     result = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, information)
-    expected, cost = with_gtsam(graph, information)
+    expected, cost = optimise_with_gtsam(graph, information)
     assert result.cost_after == pytest.approx(cost, rel=1e-6)
     assert (result.T_wc - expected).abs().max() < 1e-5
 
@@ -110,13 +111,13 @@ def test_jacobians_equal_autograd() -> None:
     zeros = torch.zeros(count, 6, dtype=torch.float64)
     expected_i, expected_j = torch.autograd.functional.jacobian(errors, (zeros, zeros))
     each = torch.arange(count)
-    error, by_i, by_j = edge_errors(*(pp.mat2SE3(T, check=False) for T in (T_wi, T_wj, T_ji)))
+    error, J_i, J_j = edge_errors(*(pp.mat2SE3(T, check=False) for T in (T_wi, T_wj, T_ji)))
     torch.testing.assert_close(error, errors(zeros, zeros), rtol=0, atol=1e-10)
-    torch.testing.assert_close(by_i, expected_i[each, :, each], rtol=0, atol=1e-9)
-    torch.testing.assert_close(by_j, expected_j[each, :, each], rtol=0, atol=1e-9)
+    torch.testing.assert_close(J_i, expected_i[each, :, each], rtol=0, atol=1e-9)
+    torch.testing.assert_close(J_j, expected_j[each, :, each], rtol=0, atol=1e-9)
 
 
-def test_convention_T_ij_is_j_seen_from_i() -> None:
+def test_convention_T_ij_is_the_pose_of_j_in_i() -> None:
     step = se3_exp(torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.5], dtype=torch.float64))
     identity = torch.eye(4, dtype=torch.float64)
     result = optimise_pose_graph(torch.stack([identity, identity]), torch.tensor([[0, 1]]), step[None])
@@ -126,7 +127,7 @@ def test_convention_T_ij_is_j_seen_from_i() -> None:
 
 @st.composite
 def consistent_graphs(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
-    """Poses and the edges of a connected graph on them, in any order and direction."""
+    """Poses and the edges of a connected graph, in random order and direction."""
     count = draw(st.integers(2, 12))
     numbers = draw(st.lists(st.floats(-1.5, 1.5), min_size=6 * count, max_size=6 * count))
     T_wc = se3_exp(torch.tensor(numbers, dtype=torch.float64).reshape(count, 6))
@@ -139,29 +140,29 @@ def consistent_graphs(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
 
 @settings(deadline=None, max_examples=25)
 @given(consistent_graphs(), st.integers(0, 100))
-def test_consistent_measurements_are_met_exactly(graph: tuple[Tensor, Tensor], seed: int) -> None:
+def test_consistent_measurements_are_fitted_exactly(graph: tuple[Tensor, Tensor], seed: int) -> None:
     T_wc, edges = graph
     T_ij = invert(T_wc[edges[:, 0]]) @ T_wc[edges[:, 1]]
     generator = torch.Generator().manual_seed(seed)
-    wrong = 0.1 * torch.randn(T_wc.shape[0], 6, generator=generator, dtype=torch.float64)
-    wrong[0] = 0.0
-    result = optimise_pose_graph(T_wc @ se3_exp(wrong), edges, T_ij)
+    perturbation = 0.1 * torch.randn(T_wc.shape[0], 6, generator=generator, dtype=torch.float64)
+    perturbation[0] = 0.0
+    result = optimise_pose_graph(T_wc @ se3_exp(perturbation), edges, T_ij)
     torch.testing.assert_close(result.T_wc, T_wc, rtol=0, atol=1e-4)
     assert result.cost_after <= result.cost_before
 
 
 @settings(deadline=None, max_examples=10)
 @given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
-def test_moving_the_world_moves_the_solution(numbers: list[float]) -> None:
+def test_solution_moves_with_the_world_frame(numbers: list[float]) -> None:
     graph = Graph(20, 5)
     T_vw = se3_exp(torch.tensor(numbers, dtype=torch.float64))
-    here = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
-    there = optimise_pose_graph(T_vw @ graph.start, graph.edges, graph.T_ij, graph.information)
-    torch.testing.assert_close(there.T_wc, T_vw @ here.T_wc, rtol=0, atol=1e-6)
+    original = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
+    moved = optimise_pose_graph(T_vw @ graph.start, graph.edges, graph.T_ij, graph.information)
+    torch.testing.assert_close(moved.T_wc, T_vw @ original.T_wc, rtol=0, atol=1e-6)
 
 
-def test_exact_rotations_converge() -> None:
-    """Rotation errors of rounding size only, where PyPose's Jacobian has few digits left."""
+def test_graph_with_exact_rotations_converges() -> None:
+    """Rotation errors are of the size of rounding, at which PyPose's Jacobian has few correct digits."""
     count = 50
     T_wc = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
     T_wc[:, 0, 3] = torch.arange(count) * 0.1
@@ -174,7 +175,7 @@ def test_exact_rotations_converge() -> None:
     torch.testing.assert_close(result.T_wc, T_wc, rtol=0, atol=1e-4)
 
 
-def test_fixed_poses_stay_to_the_bit() -> None:
+def test_fixed_poses_are_bit_identical() -> None:
     graph = Graph(20, 5)
     fixed = torch.zeros(20, dtype=torch.bool)
     fixed[[3, 11]] = True
@@ -183,24 +184,24 @@ def test_fixed_poses_stay_to_the_bit() -> None:
     assert not torch.equal(result.T_wc[0], graph.start[0])
 
 
-def test_poses_without_edges_stay_where_they_are() -> None:
+def test_poses_without_edges_do_not_move() -> None:
     graph = Graph(20, 5)
-    lonely = se3_exp(torch.tensor([[9.0, 0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
-    result = optimise_pose_graph(torch.cat([graph.start, lonely]), graph.edges, graph.T_ij)
-    torch.testing.assert_close(result.T_wc[-1:], lonely, rtol=0, atol=1e-12)
+    isolated = se3_exp(torch.tensor([[9.0, 0.0, 0.0, 0.0, 0.0, 1.0]], dtype=torch.float64))
+    result = optimise_pose_graph(torch.cat([graph.start, isolated]), graph.edges, graph.T_ij)
+    torch.testing.assert_close(result.T_wc[-1:], isolated, rtol=0, atol=1e-12)
 
 
-def test_a_part_without_a_fixed_pose_keeps_its_shape() -> None:
+def test_component_without_a_fixed_pose_is_solved() -> None:
     graph = Graph(20, 0)
-    apart = graph.edges[(graph.edges != 10).all(dim=1)]
-    T_ij = graph.T_ij[(graph.edges != 10).all(dim=1)]
+    is_kept = (graph.edges != 10).all(dim=1)
+    edges, T_ij = graph.edges[is_kept], graph.T_ij[is_kept]
     start = graph.start @ se3_exp(0.05 * torch.sin(torch.arange(120.0, dtype=torch.float64)).reshape(20, 6))
-    result = optimise_pose_graph(start, apart, T_ij)
+    result = optimise_pose_graph(start, edges, T_ij)
     assert result.cost_after < 1e-6
     assert torch.isfinite(result.T_wc).all()
 
 
-def test_deterministic() -> None:
+def test_optimisation_is_deterministic() -> None:
     graph = Graph(50, 10)
     first, second = (optimise_pose_graph(graph.start, graph.edges, graph.T_ij).T_wc for _ in range(2))
     assert torch.equal(first, second)

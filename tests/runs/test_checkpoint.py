@@ -163,13 +163,8 @@ def differences(a: Any, b: Any, where: str, same: dict[int, Any]) -> Iterator[st
             return
         same[id(a)] = a, b
         cached = {name for name in dir(type(a)) if isinstance(getattr(type(a), name, None), cached_property)}
-        skipped = cached | {
-            "clock",
-            "seconds",
-            "_thread",
-            "_executor",
-            "_get_result",
-        }  # one solves behind, the other does not
+        # One optimises in the background, the other does not.
+        skipped = cached | {"clock", "seconds", "_thread", "_executor", "_get_result"}
         first, second = ({key: value for key, value in vars(x).items() if key not in skipped} for x in (a, b))
         yield from differences(dict(sorted(first.items())), dict(sorted(second.items())), where, same)
     elif not (a == b or (a != a and b != b)):
