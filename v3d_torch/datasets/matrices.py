@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from v3d_torch.errors import InputError
-from v3d_torch.io.files import numbered_lines
+from v3d_torch.io.text import numbered_lines
 from v3d_torch.types import Trajectory
 
 _ROUNDED = 0.01

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3d_torch.errors import InputError
-from v3d_torch.io.files import read_text
 from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.text import read_text
 
 _DIALECT, _MATRIX = "%YAML:1.0", "!!opencv-matrix"
 """Its first line, which is no directive of YAML; and the tag of a matrix, which is a mapping."""
