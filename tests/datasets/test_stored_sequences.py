@@ -189,7 +189,7 @@ def swap_lists(folder: Path) -> None:
         (lambda f: (f / "rgb.txt").write_text("10 rgb/0.png\nnow rgb/1.png"), "line 2 has 'now' where a stamp"),
         (lambda f: (f / "rgb.txt").write_text("nan rgb/1.png"), "line 1 has 'nan' where a stamp"),
         (lambda f: (f / "rgb.txt").write_text("rgb/1.png"), "line 1 is 'rgb/1.png' where a stamp and a file"),
-        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe1\x000"), "not a text file"),
+        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe1\x000"), "not a UTF-8 text file"),
         (lambda f: (f / "associations.txt").write_text("10 rgb/0.png depth/0.png"), "stamp, file, stamp, file"),
         (lambda f: (f / "depth.txt").write_text("10.5 depth/0.png"), "no stamp in rgb.txt lies within 0.02 s"),
         (lambda f: (f / "rgb" / "0.png").unlink(), "rgb/0.png: is listed but not there .1 such"),

@@ -14,13 +14,13 @@ import torch
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import openloris
-from v3d_torch.datasets.bag import BagSequence
-from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.encodings import COLOURS
 from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour, read_depth
 from v3d_torch.datasets.lists import read_associations, read_image_list
 from v3d_torch.datasets.matrices import read_matrix, read_poses
+from v3d_torch.datasets.ros import BagSequence
+from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
+from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -52,7 +52,7 @@ def as_overrides(content: bytes, folder: Path) -> object:
 def message(content: bytes) -> SimpleNamespace:
     """A ROS image whose first bytes say its encoding and its size, and the rest of which are its pixels."""
     head = content[:8].ljust(8, b"\0")
-    encodings = [*COLOURS, "16UC1", "mono16", "32FC1", "", "8UC4"]
+    encodings = [*COLOUR_ENCODINGS, "16UC1", "mono16", "32FC1", "", "8UC4"]
     return SimpleNamespace(
         encoding=encodings[head[0] % len(encodings)],
         is_bigendian=head[1] & 1,
@@ -99,10 +99,10 @@ PARSERS: dict[str, Parser] = {
     "depth file": from_file("image.png", lambda path: read_depth(path, 5000.0)),
     "colour in a message": lambda content, folder: decode_colour(content, "topic"),
     "depth in a message": lambda content, folder: decode_depth(content, "topic"),
-    "colour message": lambda content, folder: colour_from(message(content), "topic"),
-    "depth message": lambda content, folder: depth_from(message(content), 1000.0, "topic"),
-    "compressed colour message": lambda content, folder: colour_from(compressed(content), "topic"),
-    "compressed depth message": lambda content, folder: depth_from(compressed(content), 1000.0, "topic"),
+    "colour message": lambda content, folder: decode_colour_message(message(content), "topic"),
+    "depth message": lambda content, folder: decode_depth_message(message(content), 1000.0, "topic"),
+    "compressed colour message": lambda content, folder: decode_colour_message(compressed(content), "topic"),
+    "compressed depth message": lambda content, folder: decode_depth_message(compressed(content), 1000.0, "topic"),
     "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
     "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
     "ROS 1 bag": from_file("take.bag", frames_of),

@@ -18,7 +18,7 @@ from PIL import Image
 from helpers.bags import DEPTH, INFO, RGB, Kind, Messages
 from helpers.parsers import CAMERA
 from v3d_torch.config import Config
-from v3d_torch.datasets.encodings import COLOURS
+from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.features.orb import Features
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.map_io import save_map
@@ -143,8 +143,8 @@ SEEDS: dict[str, list[bytes]] = {
     "depth file": _RASTERS,
     "colour in a message": _RASTERS,
     "depth in a message": _RASTERS,
-    "colour message": [_message(i, COLOURS[encoding][0]) for i, encoding in enumerate(COLOURS)],
-    "depth message": [_message(len(COLOURS), 2), _message(len(COLOURS) + 2, 4)],
+    "colour message": [_message(i, COLOUR_ENCODINGS[encoding][0]) for i, encoding in enumerate(COLOUR_ENCODINGS)],
+    "depth message": [_message(len(COLOUR_ENCODINGS), 2), _message(len(COLOUR_ENCODINGS) + 2, 4)],
     "compressed colour message": [b"\0" + image for image in _RASTERS],
     "compressed depth message": [bytes([i]) + struct.pack("<iff", 0, 1.0, 0.0) + _PNGS[-1] for i in (2, 3)]
     + [b"\1" + _PNGS[-1]],

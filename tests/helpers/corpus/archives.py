@@ -103,8 +103,8 @@ CASES = [
             "a file outside by ..",
             archive(member("../outside.txt")),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
@@ -119,47 +119,47 @@ CASES = [
             "a link outside",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "../../..")),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "a link to an absolute path",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "/etc")),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "a hard link outside",
             archive(member(f"{NAME}/x", tarfile.LNKTYPE, "../../etc/passwd")),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "a device",
             archive(member(f"{NAME}/zero", tarfile.CHRTYPE)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "a pipe",
             archive(member(f"{NAME}/rgb.pipe", tarfile.FIFOTYPE)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "a member of a petabyte",
             archive(claims(10**15)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, it unpacks to more than"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, it extracts to more than"
                 " 21474836480 bytes; get it from another source"
             ),
         ),
@@ -167,7 +167,7 @@ CASES = [
             "a header of 64 megabytes",
             archive(long_name(1 << 26)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (a header of"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (a header of"
                 " 67108864 bytes); download it again"
             ),
         ),
@@ -175,7 +175,7 @@ CASES = [
             "breaks off",
             all_of(archive(), changed(half)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -183,7 +183,7 @@ CASES = [
             "xz breaks off",
             all_of(archive(kind="w:xz"), changed(half)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -191,7 +191,7 @@ CASES = [
             "bzip2 breaks off",
             all_of(archive(kind="w:bz2"), changed(half)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -199,7 +199,7 @@ CASES = [
             "a wrong byte",
             all_of(archive(), changed(flipped)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -207,7 +207,7 @@ CASES = [
             "a wrong byte in xz",
             all_of(archive(kind="w:xz"), changed(flipped)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -215,7 +215,7 @@ CASES = [
             "a wrong byte in bzip2",
             all_of(archive(kind="w:bz2"), changed(flipped)),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -223,7 +223,7 @@ CASES = [
             "empty",
             text(b""),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -231,7 +231,7 @@ CASES = [
             "a web page",
             text(b"<html>404</html>" * 100),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -239,7 +239,7 @@ CASES = [
             "gzip of nothing",
             text(gzip.compress(b"")),
             Says(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),

@@ -203,7 +203,7 @@ CASES = [
     Case(
         "OpenLORIS, a camera of noise",
         openloris(NOISE),
-        Says("{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it is YAML as OpenCV writes it"),
+        Says("{seq}/sensors.yaml: is not a UTF-8 text file; convert it to UTF-8 (it is YAML as OpenCV writes it)"),
     ),
     Case(
         "images without times",

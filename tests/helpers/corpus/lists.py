@@ -229,17 +229,17 @@ CASES = [
     Case(
         "a list in Latin-1",
         edit("rgb.txt", lambda content: b"# Gr\xfc\xdfe\n" + content),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says("{seq}/rgb.txt: is not a UTF-8 text file; convert it to UTF-8 (a list has lines of a stamp and a file)"),
     ),
     Case(
         "a list in UTF-16",
         edit("rgb.txt", lambda content: content.decode().encode("utf-16")),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says("{seq}/rgb.txt: is not a UTF-8 text file; convert it to UTF-8 (a list has lines of a stamp and a file)"),
     ),
     Case(
         "an image for a list",
         lambda place: (place.folder / FIRST).rename(place.folder / "rgb.txt"),
-        Says("{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has lines of a stamp and a file"),
+        Says("{seq}/rgb.txt: is not a UTF-8 text file; convert it to UTF-8 (a list has lines of a stamp and a file)"),
     ),
     Case("associations", associated("T C T D"), Right()),
     Case("associations, depth first", associated("T D T C"), Right()),

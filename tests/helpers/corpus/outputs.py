@@ -204,7 +204,7 @@ CASES = [
     Case(
         "a list that may not be read",
         unreadable("rgb.txt"),
-        Says("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and who may read it"),
+        Says("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and that you may read it"),
         lambda place: without_root_rights(),
     ),
     Case(
@@ -232,15 +232,15 @@ CASES = [
     Case(
         "a camera that may not be read",
         unreadable("camera.yaml"),
-        Says("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and who may read it"),
+        Says("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and that you may read it"),
         lambda place: without_root_rights(),
     ),
     Case(
         "a ground truth that may not be read",
         unreadable("groundtruth.txt"),
         Says(
-            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and who may"
-            " read it (the results are in {out})",
+            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and that you"
+            " may read it (the results are in {out})",
             kept=8,
         ),
         lambda place: without_root_rights(),

@@ -103,92 +103,92 @@ CASES = [
     Case(
         "ROS 1 breaks off",
         all_of(bag("bag"), cut(half)),
-        Says("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        Says("{root}/take.bag: is damaged or not a bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
         "ROS 2 breaks off",
         all_of(bag("db3"), cut(half)),
-        Says("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Says("{root}/take/take.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "mcap breaks off",
         all_of(bag("mcap"), cut(half)),
-        Says("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        Says("{root}/take/take.mcap: is damaged or not a bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
         "ROS 1 is empty",
         all_of(bag("bag"), cut(lambda content: b"")),
-        Says("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        Says("{root}/take.bag: is damaged or not a bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
         "ROS 2 is empty",
         all_of(bag("db3"), cut(lambda content: b"")),
-        Says("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Says("{root}/take/take.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "mcap is empty",
         all_of(bag("mcap"), cut(lambda content: b"")),
-        Says("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        Says("{root}/take/take.mcap: is damaged or not a bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
         "ROS 1 is noise",
         noise("take.bag"),
-        Says("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        Says("{root}/take.bag: is damaged or not a bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
         "ROS 2 is noise",
         noise("take.db3"),
-        Says("{root}/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Says("{root}/take.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "mcap is noise",
         noise("take.mcap"),
-        Says("{root}/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        Says("{root}/take.mcap: is damaged or not a bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
         "another database",
         all_of(other_database, seq("{root}/notes.db3")),
-        Says("{root}/notes.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Says("{root}/notes.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "a ROS 2 folder whose metadata are broken",
         all_of(bag("db3"), without_metadata, seq("{root}/take")),
-        Says("{root}/take: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Says("{root}/take: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "no camera",
         bag("mcap", without(INFO)),
         Says(
-            "{root}/take/take.mcap: has no camera beside /camera/color/image_raw; name it with"
-            " --info-topic, or give --camera"
+            "{root}/take/take.mcap: has no CameraInfo topic for /camera/color/image_raw; name it"
+            " with --info-topic, or give --camera"
         ),
     ),
     Case(
         "no depth",
         bag("bag", without(DEPTH)),
         Says(
-            "{root}/take.bag: no topic has the name of depth images; give --depth-topic one of /camera/color/image_raw"
+            "{root}/take.bag: no topic is named like depth images; set --depth-topic to one of /camera/color/image_raw"
         ),
     ),
     Case(
         "no colour",
         bag("mcap", without(RGB)),
         Says(
-            "{root}/take/take.mcap: no topic has the name of colour images; give --rgb-topic one of"
+            "{root}/take/take.mcap: no topic is named like colour images; set --rgb-topic to one of"
             " /camera/aligned_depth_to_color/image_raw"
         ),
     ),
     Case(
         "no images",
         bag("bag", lambda to, messages: messages[:1]),
-        Says("{root}/take.bag: holds no images; record the topics of colour, of depth and of their camera"),
+        Says("{root}/take.bag: contains no images; record the colour, depth and CameraInfo topics"),
     ),
     Case(
         "two clocks",
         bag("db3", with_all(DEPTH, lambda to, at: to.image(at + 100, "16UC1", MILLIMETRES))),
         Says(
-            "{root}/take/take.db3: no image on /camera/color/image_raw lies within 0.02 s of one on"
-            " /camera/aligned_depth_to_color/image_raw; choose others with --rgb-topic and --depth-topic"
+            "{root}/take/take.db3: no image on /camera/color/image_raw is within 0.02 s of an image on"
+            " /camera/aligned_depth_to_color/image_raw; choose other topics with --rgb-topic and --depth-topic"
         ),
     ),
     Case(
@@ -196,15 +196,15 @@ CASES = [
         bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "mono8", colour(0)[..., 0]))),
         Says(
             "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: holds mono8 images, not"
-            " depth; name another with --depth-topic"
+            " depth; choose another topic with --depth-topic"
         ),
     ),
     Case(
         "depth for colour",
         bag("mcap", with_all(RGB, lambda to, at: to.image(at, "16UC1", MILLIMETRES))),
         Says(
-            "{root}/take/take.mcap: /camera/color/image_raw: holds 16UC1 images, not colour; name another"
-            " with --rgb-topic, or have them converted to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
+            "{root}/take/take.mcap: /camera/color/image_raw: holds 16UC1 images, not colour; choose another"
+            " topic with --rgb-topic, or convert the images to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
             " 8UC1, bayer_rggb8, bayer_bggr8, bayer_gbrg8, bayer_grbg8, yuv422, uyvy, yuv422_yuy2, yuyv"
         ),
     ),
@@ -213,7 +213,7 @@ CASES = [
         bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
         Says(
             "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, its colour"
-            " image 80x60; name depth that is registered to colour with --depth-topic"
+            " image 80x60; choose depth registered to colour with --depth-topic"
         ),
     ),
     Case("depth with NaN", bag("mcap", with_all(DEPTH, with_holes)), Right(ate=None)),
@@ -222,20 +222,20 @@ CASES = [
         bag("mcap", with_all(RGB, too_high)),
         Says(
             "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 80x1000000"
-            " pixels need; record it again"
+            " pixels need; record the bag again"
         ),
     ),
     Case(
         "images without pixels",
         bag("mcap", with_all(RGB, without_size)),
-        Says("{root}/take/take.mcap: /camera/color/image_raw: an image has no pixels; record it again"),
+        Says("{root}/take/take.mcap: /camera/color/image_raw: an image has no pixels; record the bag again"),
     ),
     Case(
         "an unknown encoding",
         bag("mcap", with_all(RGB, lambda to, at: to.image(at, "rgb10", colour(0)))),
         Says(
-            "{root}/take/take.mcap: /camera/color/image_raw: holds rgb10 images, not colour; name another"
-            " with --rgb-topic, or have them converted to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
+            "{root}/take/take.mcap: /camera/color/image_raw: holds rgb10 images, not colour; choose another"
+            " topic with --rgb-topic, or convert the images to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
             " 8UC1, bayer_rggb8, bayer_bggr8, bayer_gbrg8, bayer_grbg8, yuv422, uyvy, yuv422_yuy2, yuyv"
         ),
     ),
@@ -272,15 +272,15 @@ CASES = [
         "a fisheye lens",
         bag("mcap", camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
         Says(
-            "{root}/take/take.mcap: /camera/color/camera_info has a lens of the kind equidistant, which is"
-            " not known here; record rectified images, or give --camera with k1, k2, p1, p2, k3"
+            "{root}/take/take.mcap: /camera/color/camera_info has the unsupported distortion model"
+            " equidistant; record rectified images, or give --camera with k1, k2, p1, p2, k3"
         ),
     ),
     Case(
         "a topic that is not there",
         all_of(bag("mcap"), options("--depth-topic", "/depth")),
         Says(
-            "{root}/take/take.mcap: has no images on /depth; give --depth-topic one of"
+            "{root}/take/take.mcap: has no images on /depth; set --depth-topic to one of"
             " /camera/aligned_depth_to_color/image_raw, /camera/color/image_raw"
         ),
     ),

@@ -163,8 +163,8 @@ CASES = [
         "binary",
         write(TRUTH, bytes(range(256))),
         Says(
-            "{seq}/groundtruth.txt: is not a text file in UTF-8; convert it to that, a trajectory has lines"
-            " of stamp tx ty tz qx qy qz qw (the results are in {out})",
+            "{seq}/groundtruth.txt: is not a UTF-8 text file; convert it to UTF-8 (a trajectory has lines"
+            " of stamp tx ty tz qx qy qz qw) (the results are in {out})",
             kept=8,
         ),
     ),

@@ -54,7 +54,7 @@ CASES = [
         "colour breaks off",
         changed("colour.mkv", half),
         Says(
-            "{root}/take/colour.mkv: breaks off at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
+            "{root}/take/colour.mkv: is truncated at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
             " before are in {out}; go on with --resume {out})",
             kept=3,
         ),
@@ -62,33 +62,33 @@ CASES = [
     Case(
         "depth breaks off",
         changed("depth.mkv", half),
-        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Says("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "depth breaks off at once",
         changed("depth.mkv", lambda content: content[:300]),
-        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Says("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "noise",
         changed("colour.mkv", lambda content: NOISE),
-        Says("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Says("{root}/take/colour.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "empty",
         changed("depth.mkv", lambda content: b""),
-        Says("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Says("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "text",
         changed("colour.mkv", lambda content: b"the video\n" * 100),
-        Says("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        Says("{root}/take/colour.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
         "depth of 8 bits",
         with_video("depth.mkv", colour(0)),
         Says(
-            "{root}/take/depth.mkv: has not 16 bits of grey a pixel, as depth has; export it again with"
+            "{root}/take/depth.mkv: depth is not one channel of 16 bits; export it again with"
             " ffmpeg -c:v ffv1 -pix_fmt gray16le"
         ),
     ),
@@ -104,8 +104,8 @@ CASES = [
         "two of colour",
         with_video("other.mkv", colour(0)),
         Says(
-            "{root}/take: a colour and a depth video belong together, here are colour.mkv, other.mkv,"
-            " depth.mkv; name them such as take.mp4 and take_depth.mkv and give the first"
+            "{root}/take: expected one colour and one depth video, found colour.mkv, other.mkv,"
+            " depth.mkv; name them like take.mp4 and take_depth.mkv and give the first"
         ),
     ),
     Case(
