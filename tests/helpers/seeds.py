@@ -1,4 +1,4 @@
-"""Bytes that the doors of `parsers` take, for searches to begin with."""
+"""Valid inputs of all parsers in `parsers`, from which fuzzing starts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from v3d_torch.mapping.static_views import StaticViews
 
 
 def _map() -> bytes:
-    """Two keyframes of 8x6 pixels that see the same two landmarks."""
+    """Map with two keyframes of 8x6 pixels that observe the same two landmarks."""
     config = Config()
     sparse_map, views = SparseMap(config.mapping, config.features, CAMERA), StaticViews(CAMERA, stride=2)
     uv = torch.tensor([[1.0, 2.0], [5.0, 3.0]], dtype=torch.float64)
@@ -52,17 +52,17 @@ def _table() -> bytes:
 
 
 def _bag(kind: Kind) -> bytes:
-    """A frame of 8x6 pixels."""
-    to = Messages(kind)
+    """Bag with one frame of 8x6 pixels."""
+    make_message = Messages(kind)
     matrix = [8.0, 0, 3.5, 0, 8.0, 2.5, 0, 0, 1]
     pixels = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
     messages = [
-        (INFO, 1.0, to.info(8, 6, matrix, [], [*matrix[:3], 0, *matrix[3:6], 0, *matrix[6:], 0])),
-        (RGB, 1.0, to.image(1.0, "mono8", pixels.astype(np.uint8))),
-        (DEPTH, 1.0, to.image(1.0, "16UC1", pixels)),
+        (INFO, 1.0, make_message.info(8, 6, matrix, [], [*matrix[:3], 0, *matrix[3:6], 0, *matrix[6:], 0])),
+        (RGB, 1.0, make_message.image(1.0, "mono8", pixels.astype(np.uint8))),
+        (DEPTH, 1.0, make_message.image(1.0, "16UC1", pixels)),
     ]
     with tempfile.TemporaryDirectory() as folder:
-        path = to.write(Path(folder) / "take", messages)
+        path = make_message.write(Path(folder) / "take", messages)
         return (path if kind == "bag" else next(path.glob(f"*.{kind}"))).read_bytes()
 
 
@@ -76,15 +76,15 @@ def _tar(mode: str) -> bytes:
     return file.getvalue()
 
 
-def _image(form: str, mode: str) -> bytes:
+def _image(file_format: str, mode: str) -> bytes:
     file = BytesIO()
     pixels = np.arange(48, dtype=np.uint16 if mode == "I;16" else np.uint8).reshape(6, 8)
-    Image.fromarray(pixels).convert(mode if mode != "I;16" else None).save(file, form)
+    Image.fromarray(pixels).convert(mode if mode != "I;16" else None).save(file, file_format)
     return file.getvalue()
 
 
 def _message(encoding: int, pixel: int) -> bytes:
-    """An 8x6 image as `message` reads it."""
+    """Image of 8x6 pixels in the format of `image_message`."""
     return struct.pack("<BBHHH", encoding, 0, 8, 6, 8 * pixel) + bytes(range(48 * pixel))
 
 
@@ -158,4 +158,4 @@ SEEDS: dict[str, list[bytes]] = {
     "table": [_table()],
     "archive": [_tar(mode) for mode in ("w", "w:gz", "w:bz2", "w:xz")],
 }
-"""Bytes that a parser takes, to begin with."""
+"""Valid inputs of each parser."""

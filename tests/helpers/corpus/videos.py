@@ -1,4 +1,4 @@
-"""Pairs of videos."""
+"""Cases with pairs of a colour video and a depth video."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from helpers.corpus.case import Case, Make, Place, Right, Says, all_of, half, op
 
 
 def save(path: Path, images: list[NDArray[np.generic]]) -> None:
-    """Without loss, at 10 frames a second, in 16 bits where the images have so many."""
+    """Write a lossless video at 10 Hz, with the bit depth of the images."""
     first = images[0]
     bits = cv2.CV_16U if first.dtype == np.uint16 else cv2.CV_8U
-    kind = [cv2.VIDEOWRITER_PROP_DEPTH, bits, cv2.VIDEOWRITER_PROP_IS_COLOR, int(first.ndim == 3)]
+    writer_options = [cv2.VIDEOWRITER_PROP_DEPTH, bits, cv2.VIDEOWRITER_PROP_IS_COLOR, int(first.ndim == 3)]
     size = (first.shape[1], first.shape[0])
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size, kind)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size, writer_options)
     for image in images:
         writer.write(image)
     writer.release()
 
 
 def videos(place: Place) -> None:
-    """The sequence as a pair of videos."""
+    """Write the sequence as a pair of videos."""
     folder = place.root / "take"
     folder.mkdir()
     (folder / "camera.yaml").write_text(CAMERA)
@@ -35,7 +35,7 @@ def videos(place: Place) -> None:
     place.seq = str(folder)
 
 
-def changed(file: str, change: Callable[[bytes], bytes]) -> Make:
+def change_bytes(file: str, change: Callable[[bytes], bytes]) -> Make:
     def make(place: Place) -> None:
         videos(place)
         path = place.root / "take" / file
@@ -44,15 +44,15 @@ def changed(file: str, change: Callable[[bytes], bytes]) -> Make:
     return make
 
 
-def with_video(file: str, image: NDArray[np.generic]) -> Make:
+def replace_video(file: str, image: NDArray[np.generic]) -> Make:
     return all_of(videos, lambda place: save(place.root / "take" / file, FRAMES * [image]))
 
 
 CASES = [
-    Case("colour and depth", videos, Right(ate=None)),
+    Case("valid pair", videos, Right(ate=None)),
     Case(
-        "colour breaks off",
-        changed("colour.mkv", half),
+        "truncated colour",
+        change_bytes("colour.mkv", half),
         Says(
             "{root}/take/colour.mkv: is truncated at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
             " before are in {out}; go on with --resume {out})",
@@ -60,33 +60,33 @@ CASES = [
         ),
     ),
     Case(
-        "depth breaks off",
-        changed("depth.mkv", half),
+        "truncated depth",
+        change_bytes("depth.mkv", half),
         Says("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "depth breaks off at once",
-        changed("depth.mkv", lambda content: content[:300]),
+        "depth truncated in its header",
+        change_bytes("depth.mkv", lambda content: content[:300]),
         Says("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "noise",
-        changed("colour.mkv", lambda content: NOISE),
+        "random bytes",
+        change_bytes("colour.mkv", lambda content: NOISE),
         Says("{root}/take/colour.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "empty",
-        changed("depth.mkv", lambda content: b""),
+        "empty file",
+        change_bytes("depth.mkv", lambda content: b""),
         Says("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "text",
-        changed("colour.mkv", lambda content: b"the video\n" * 100),
+        "text file",
+        change_bytes("colour.mkv", lambda content: b"the video\n" * 100),
         Says("{root}/take/colour.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "depth of 8 bits",
-        with_video("depth.mkv", colour(0)),
+        "8-bit depth",
+        replace_video("depth.mkv", colour(0)),
         Says(
             "{root}/take/depth.mkv: depth is not one channel of 16 bits; export it again with"
             " ffmpeg -c:v ffv1 -pix_fmt gray16le"
@@ -94,15 +94,15 @@ CASES = [
     ),
     Case(
         "depth of another size",
-        with_video("depth.mkv", depth()[::2, ::2].copy()),
+        replace_video("depth.mkv", depth()[::2, ::2].copy()),
         Says(
             "{root}/take/depth.mkv: has 40x30 pixels, its colour image 80x60; export the depth that is"
             " registered to colour, pixel by pixel"
         ),
     ),
     Case(
-        "two of colour",
-        with_video("other.mkv", colour(0)),
+        "two colour videos",
+        replace_video("other.mkv", colour(0)),
         Says(
             "{root}/take: expected one colour and one depth video, found colour.mkv, other.mkv,"
             " depth.mkv; name them like take.mp4 and take_depth.mkv and give the first"
@@ -120,12 +120,12 @@ CASES = [
         "--fps 0", all_of(videos, options("--fps", "0")), Says("--fps 0: give frames a second, between 0.01 and 10000")
     ),
     Case(
-        "--fps that is no number",
+        "--fps nan",
         all_of(videos, options("--fps", "nan")),
         Says("--fps nan: give frames a second, between 0.01 and 10000"),
     ),
     Case(
-        "--fps without end",
+        "--fps inf",
         all_of(videos, options("--fps", "inf")),
         Says("--fps inf: give frames a second, between 0.01 and 10000"),
     ),
