@@ -35,12 +35,12 @@ _DAMAGE_ERRORS = (
 """Exceptions that a damaged archive or damaged objects in it raise while loading."""
 
 
-def write_state(path: Path, about: Mapping[str, Any], state: object) -> None:
+def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:
     """Write a state file atomically and durably: after a power failure the old or the new state is there.
 
     Args:
         path: File to write.
-        about: Plain values that `read_state` returns next to the state.
+        metadata: Plain values that `read_state` returns next to the state.
         state: Tensors, containers and objects; objects that are shared stay shared after loading.
 
     Raises:
@@ -49,7 +49,7 @@ def write_state(path: Path, about: Mapping[str, Any], state: object) -> None:
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(_FIRST_LINE.format(version=_VERSION, digest=_PLACEHOLDER_DIGEST).encode())
         hashed = _HashingWriter(file)
-        hashed.write(json.dumps({"v3d-torch": version("v3d-torch"), **about}).encode() + b"\n")
+        hashed.write(json.dumps({"v3d-torch": version("v3d-torch"), **metadata}).encode() + b"\n")
         torch.save(state, cast("IO[bytes]", hashed))  # torch.save only calls write and flush
         hashed.raise_error()
         file.seek(0)
@@ -66,7 +66,7 @@ def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any
         classes: Classes of the objects in the state, except tensors and Python's plain types.
 
     Returns:
-        The metadata (``about`` of `write_state`) and the state.
+        The metadata and the state.
 
     Raises:
         InputError: If the file is missing, damaged, not a state file, or written by another version of this program.
@@ -74,14 +74,14 @@ def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any
     try:
         with path.open("rb") as file:
             _verify(path, file)
-            about = json.loads(file.readline())
-            if about["v3d-torch"] != version("v3d-torch"):
+            metadata = json.loads(file.readline())
+            if metadata["v3d-torch"] != version("v3d-torch"):
                 raise InputError(
-                    f"{path}: was written by v3d-torch {about['v3d-torch']}, this is {version('v3d-torch')}; continue"
+                    f"{path}: was written by v3d-torch {metadata['v3d-torch']}, this is {version('v3d-torch')}; continue"
                     " with that version, or start a new run"
                 )
             with torch.serialization.safe_globals(list(classes)):
-                return about, torch.load(file, weights_only=True)
+                return metadata, torch.load(file, weights_only=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check that you may read it") from error
     except _DAMAGE_ERRORS as error:
