@@ -19,9 +19,9 @@ def renderer() -> Renderer:
     return Renderer(build_room(SEED), SMALL)
 
 
-def visible_centroid(renderer: Renderer, time: float, mover: int) -> np.ndarray:
+def visible_centroid(renderer: Renderer, time: float, mask_id: int) -> np.ndarray:
     result = render_at(renderer, time)
-    return world_points(result.depth, camera_pose(time))[result.mover.numpy() == mover].mean(0)
+    return world_points(result.depth, camera_pose(time))[result.motion_mask.numpy() == mask_id].mean(0)
 
 
 def test_walker_moves_and_centroid_of_swayer_stays(renderer: Renderer) -> None:
@@ -36,8 +36,8 @@ def test_walker_moves_and_centroid_of_swayer_stays(renderer: Renderer) -> None:
 
 
 def test_walker_starts_out_of_view(renderer: Renderer) -> None:
-    assert not (render_at(renderer, 0.3).mover == 1).any()
-    fractions = [float((render_at(renderer, t).mover == 1).float().mean()) for t in (1.8, 2.4, 2.8)]
+    assert not (render_at(renderer, 0.3).motion_mask == 1).any()
+    fractions = [float((render_at(renderer, t).motion_mask == 1).float().mean()) for t in (1.8, 2.4, 2.8)]
     assert all(0.10 < fraction < 0.25 for fraction in fractions)
     assert walk(2.0).shift[0] > walk(1.0).shift[0]
 

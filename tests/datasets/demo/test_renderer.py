@@ -24,12 +24,12 @@ def renderer() -> Renderer:
 def test_static_points_of_one_frame_lie_on_the_surfaces_of_another(renderer: Renderer) -> None:
     """Points are transformed by the true poses of both frames."""
     (first, T_w1), (second, T_w2) = ((render_at(renderer, t), camera_pose(t)) for t in (0.3, 0.8))
-    points = world_points(first.depth, T_w1)[first.mover.numpy() == 0]
+    points = world_points(first.depth, T_w1)[first.motion_mask.numpy() == 0]
     points_2 = (points - T_w2[:3, 3]) @ T_w2[:3, :3]
     uv = SMALL.project(torch.from_numpy(points_2)).round().long()
     inside = (uv >= 0).all(1) & (uv < torch.tensor([160, 120])).all(1)
     u, v = uv[inside].T
-    error = (second.depth[v, u].numpy() - points_2[inside.numpy(), 2])[second.mover[v, u].numpy() == 0]
+    error = (second.depth[v, u].numpy() - points_2[inside.numpy(), 2])[second.motion_mask[v, u].numpy() == 0]
     assert abs(np.median(error)) < 1e-3
     assert np.percentile(np.abs(error), 80) < 0.03  # depth is that of the nearest pixel
 
@@ -60,11 +60,11 @@ def test_motion_masks_contain_all_changed_pixels(renderer: Renderer) -> None:
     T_wc = camera_pose(2.0)
     first, second = renderer(T_wc, 2.0), renderer(T_wc, 2.1)
     changed = (first.colour - second.colour).abs().amax(-1) > 0.02
-    moving = (first.mover > 0) | (second.mover > 0)
+    moving = (first.motion_mask > 0) | (second.motion_mask > 0)
     dilated = torch.nn.functional.max_pool2d(moving[None].float(), 3, 1, 1)[0] > 0  # antialiased edges
     assert not (changed & ~dilated).any()
     assert float((changed & moving).sum() / moving.sum()) > 0.5
-    assert {1, 2} <= set(first.mover.unique().tolist())
+    assert {1, 2} <= set(first.motion_mask.unique().tolist())
 
 
 def test_figure_leans_about_its_pivot() -> None:
@@ -77,8 +77,8 @@ def test_figure_leans_about_its_pivot() -> None:
     mean_columns = []
     for lean in (0.0, 0.4):
         leaning = replace(figure, motion=lambda t, lean=lean: FigurePose(lean=lean))
-        mover = Renderer(Scene([wall], [leaning]), SMALL)(T_wc, 0.0).mover
-        mean_columns.append([float(torch.nonzero(mover[row] == 7).float().mean()) for row in (30, 59, 88)])
+        motion_mask = Renderer(Scene([wall], [leaning]), SMALL)(T_wc, 0.0).motion_mask
+        mean_columns.append([float(torch.nonzero(motion_mask[row] == 7).float().mean()) for row in (30, 59, 88)])
     top, middle, bottom = np.subtract(mean_columns[1], mean_columns[0])
     expected = 0.4 * 29.5 / SMALL.fy * 2.0 * SMALL.fx / 2.0
     assert top == pytest.approx(expected, abs=1.0) and bottom == pytest.approx(-expected, abs=1.0)

@@ -35,12 +35,12 @@ class Rendering:
     Attributes:
         colour: RGB in [0, 1], float32, shape :math:`(H, W, 3)`.
         depth: Depth, metres, float32, shape :math:`(H, W)`.
-        mover: Id of the moving figure at each pixel, 0 = static, uint8, shape :math:`(H, W)`.
+        motion_mask: Id of the moving figure at each pixel, 0 = static, uint8, shape :math:`(H, W)`.
     """
 
     colour: Tensor
     depth: Tensor
-    mover: Tensor
+    motion_mask: Tensor
 
 
 class Renderer:
@@ -57,7 +57,7 @@ class Renderer:
         densities = [r.texture.shape[1] / float(np.linalg.norm(r.across)) for r in surfaces]
         self.textures = TextureAtlas([r.texture for r in surfaces], densities)
         self.displacements = [displacement_map(figure) for figure in scene.figures]
-        self.movers = torch.tensor([0] * len(scene.rectangles) + [f.mover for f in scene.figures], dtype=torch.uint8)
+        self.mask_ids = torch.tensor([0] * len(scene.rectangles) + [f.mover for f in scene.figures], dtype=torch.uint8)
         self.rays = RayGrid.from_camera(camera)
 
     def __call__(self, T_wc: NDArray[np.float64], time: float) -> Rendering:
@@ -127,7 +127,7 @@ class Renderer:
         # The samples of a plane are symmetric about the pixel centre and 1/z is linear, so their mean is exact.
         is_nearest = (inverse_depth > _LAYER_RATIO * nearest).to(torch.float32)
         depth = is_nearest.sum(0) / (inverse_depth * is_nearest).sum(0)
-        return Rendering(colour.mean(0), depth, self.movers[surface.gather(0, nearest_sample)[0]])
+        return Rendering(colour.mean(0), depth, self.mask_ids[surface.gather(0, nearest_sample)[0]])
 
 
 def _linear_forms(rectangle: Rectangle, view: View) -> NDArray[np.float64] | None:

@@ -24,7 +24,7 @@ FRAMES = 120
 """Number of frames."""
 RATE = 30.0
 """Frame rate, Hz."""
-START = 1.0
+START_STAMP = 1.0
 """Timestamp of the first frame, seconds."""
 SEED = 7
 """Seed of textures and sensor noise."""
@@ -65,7 +65,7 @@ def _single_thread() -> Iterator[None]:
 
 
 def _stamp(index: int) -> str:
-    return f"{START + index / RATE:.6f}"
+    return f"{START_STAMP + index / RATE:.6f}"
 
 
 def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:
@@ -77,7 +77,7 @@ def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:
     stamp = _stamp(index)
     _write_image(folder / "rgb" / f"{stamp}.jpg", np.ascontiguousarray(colour[..., ::-1]))
     _write_image(folder / "depth" / f"{stamp}.png", (depth * CAMERA.depth_scale).round().astype(np.uint16))
-    _write_image(folder / "masks" / f"{stamp}.png", rendering.mover.numpy())
+    _write_image(folder / "masks" / f"{stamp}.png", rendering.motion_mask.numpy())
 
 
 def _write_image(path: Path, image: Image) -> None:
