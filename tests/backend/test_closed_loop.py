@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from v3d_torch import V3DSLAM
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.demo import materials
-from v3d_torch.datasets.demo.geometry import Rectangle, Scene
-from v3d_torch.datasets.demo.path import LEVEL
-from v3d_torch.datasets.demo.render import Renderer
+from v3d_torch.datasets.demo.camera_trajectory import LEVEL
+from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.room import HIGH, LOW, build_room
-from v3d_torch.datasets.demo.sensor import sense_colour, sense_depth
+from v3d_torch.datasets.demo.scene import Rectangle, Scene
+from v3d_torch.datasets.demo.sensor_model import sense_colour, sense_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.types import RGBDFrame, TrackingStatus

@@ -287,9 +287,9 @@ def test_a_damaged_checkpoint_or_one_of_another_version(out: Path) -> None:
     path = out / CHECKPOINT
     whole = path.read_bytes()
     path.write_bytes(whole[:-10])
-    assert_one_sentence(call("--resume", out), f"{path}: is no state of a run, or a damaged one; begin anew")
+    assert_one_sentence(call("--resume", out), f"{path}: is damaged or not a state of a run; start a new run")
     path.write_bytes(whole.replace(b"state 8", b"state 9", 1))
-    assert_one_sentence(call("--resume", out), f"{path}: is a state in version 9 of its format")
+    assert_one_sentence(call("--resume", out), f"{path}: has state format 9, this program reads format 8")
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 
 

@@ -63,7 +63,7 @@ def test_camera_file_is_read(tmp_path: Path, name: str, text: str) -> None:
         ("K.txt", "1 9 3 0 2 4 0 0 1", "3x3 camera matrix without skew"),
         ("K.txt", "1 2 3 4 5000 640.5 480", "width: .*got 640.5"),
         ("K.txt", "one two", "not a number"),
-        ("K.txt", "\udcff", "not a text file"),
+        ("K.txt", "\udcff", "not a UTF-8 text file"),
     ],
 )
 def test_invalid_camera_file_is_rejected(tmp_path: Path, name: str, text: str, message: str) -> None:

@@ -331,7 +331,7 @@ def test_damaged_archive_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return target
 
     monkeypatch.setattr(locate, "fetch", serve)
-    with pytest.raises(InputError, match="not a whole tar archive"):
+    with pytest.raises(InputError, match="not a complete tar archive"):
         load_sequence("fr3/w/xyz")
     assert [path.name for path in (tmp_path / "cache").iterdir() if not path.name.startswith(".")] == []
 

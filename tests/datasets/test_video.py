@@ -1,4 +1,4 @@
-"""A pair of videos: times from the files, 16 bits of depth without loss."""
+"""Pairs of a colour video and a 16-bit depth video: timestamps, pairing and invalid files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZE = (WIDTH, HEIGHT)
 
 
 def write_colour(path: Path, fps: float, frames: int) -> None:
-    """Without loss, so that pixels can be compared."""
+    """Write a lossless colour video, so that pixels can be compared."""
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), fps, SIZE)
     assert writer.isOpened()
     for i in range(frames):
@@ -27,8 +27,8 @@ def write_colour(path: Path, fps: float, frames: int) -> None:
 
 
 def write_depth(path: Path, fps: float, images: list[NDArray[np.uint16]]) -> None:
-    deep = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), fps, SIZE, deep)
+    options = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), fps, SIZE, options)
     assert writer.isOpened()
     for image in images:
         writer.write(image)
@@ -37,7 +37,7 @@ def write_depth(path: Path, fps: float, images: list[NDArray[np.uint16]]) -> Non
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Six colour frames at 30 a second and three depth frames at 15."""
+    """Folder with six colour frames at 30 Hz and three depth frames at 15 Hz."""
     root = tmp_path / "take"
     root.mkdir()
     (root / "camera.yaml").write_text(CAMERA_YAML)
@@ -53,7 +53,7 @@ def assert_frame(sequence: VideoSequence, index: int, colour: int, depth: int) -
 
 
 @pytest.mark.parametrize("given", ["", "rgb.avi"])
-def test_frames_in_any_order(folder: Path, given: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_frames_can_be_read_in_any_order(folder: Path, given: str, capfd: pytest.CaptureFixture[str]) -> None:
     sequence = load_sequence(str(folder / given))
     assert isinstance(sequence, VideoSequence)
     assert sequence.name == ("rgb" if given else "take")
@@ -65,50 +65,63 @@ def test_frames_in_any_order(folder: Path, given: str, capfd: pytest.CaptureFixt
     assert capfd.readouterr().err == ""
 
 
-def test_frames_a_second_of_the_user(folder: Path) -> None:
+def test_fps_of_the_user_sets_the_timestamps(folder: Path) -> None:
     sequence = load_sequence(str(folder), options=SourceOptions(fps=10))
     assert isinstance(sequence, VideoSequence)
     assert sequence.stamps.tolist() == pytest.approx([0, 0.1, 0.2])
     assert_frame(sequence, 2, 2, 2)
 
 
-def test_several_takes_side_by_side(folder: Path) -> None:
+def test_pair_is_found_by_name_among_several_videos(folder: Path) -> None:
     write_colour(folder / "second.mkv", 15, 2)
     write_depth(folder / "second_depth.mkv", 15, [depth_of(7), depth_of(8)])
     sequence = load_sequence(str(folder / "second.mkv"))
     assert isinstance(sequence, VideoSequence)
     assert_frame(sequence, 1, 1, 8)
-    with pytest.raises(InputError, match=r"here are rgb\.avi, second\.mkv, depth\.mkv, second_depth\.mkv; name them"):
+    with pytest.raises(InputError, match=r"found rgb\.avi, second\.mkv, depth\.mkv, second_depth\.mkv; name them"):
         load_sequence(str(folder))
 
 
-def test_the_bar_is_told_of_every_frame(folder: Path) -> None:
-    told: list[tuple[int, int | None]] = []
-    load_sequence(str(folder), progress=lambda done, total: told.append((done, total)))
-    assert told == [(i, 6) for i in range(1, 7)]
+def test_progress_is_reported_for_every_colour_frame(folder: Path) -> None:
+    reports: list[tuple[int, int | None]] = []
+    load_sequence(str(folder), progress=lambda done, total: reports.append((done, total)))
+    assert reports == [(i, 6) for i in range(1, 7)]
 
 
-def test_depth_of_8_bits(folder: Path) -> None:
+def test_8_bit_depth_is_an_input_error(folder: Path) -> None:
     (folder / "depth.mkv").unlink()
     write_colour(folder / "depth.mkv", 15, 3)
-    with pytest.raises(InputError, match=r"depth\.mkv: has not 16 bits of grey"):
+    with pytest.raises(InputError, match=r"depth\.mkv: depth is not one channel of 16 bits"):
         load_sequence(str(folder))
 
 
 @pytest.mark.parametrize("name", ["rgb.avi", "depth.mkv"])
-def test_no_video(folder: Path, name: str) -> None:
+def test_undecodable_video_is_an_input_error(folder: Path, name: str) -> None:
     (folder / name).write_bytes(b"no video" * 100)
-    with pytest.raises(InputError, match=rf"{name}: is no video that can be decoded"):
+    with pytest.raises(InputError, match=rf"{name}: cannot be decoded as a video"):
         load_sequence(str(folder))
 
 
-def test_depth_is_missing(folder: Path) -> None:
+def test_missing_depth_video_is_an_input_error(folder: Path) -> None:
     (folder / "depth.mkv").unlink()
-    with pytest.raises(InputError, match=r"rgb\.avi: a colour and a depth video belong together, here are rgb\.avi;"):
+    with pytest.raises(InputError, match=r"rgb\.avi: expected one colour and one depth video, found rgb\.avi;"):
         load_sequence(str(folder / "rgb.avi"))
 
 
-def test_other_size_than_the_cameras(folder: Path) -> None:
+def test_video_of_another_size_than_the_camera_is_an_input_error(folder: Path) -> None:
     (folder / "camera.yaml").write_text(CAMERA_YAML.replace("width: 32", "width: 64"))
     with pytest.raises(InputError, match=r"rgb\.avi: has 32x24 pixels, but the camera has 64x24"):
         load_sequence(str(folder))[0]
+
+
+def test_truncated_video_raises_after_its_last_frame(folder: Path) -> None:
+    write_colour(folder / "rgb.avi", 30, 90)
+    write_depth(folder / "depth.mkv", 30, [depth_of(i) for i in range(90)])
+    content = (folder / "rgb.avi").read_bytes()
+    (folder / "rgb.avi").write_bytes(content[: len(content) // 2])
+    sequence = load_sequence(str(folder))
+    frames = iter(sequence)
+    for _ in range(len(sequence)):
+        next(frames)
+    with pytest.raises(InputError, match=r"rgb\.avi: is truncated at \d\.\d of 3\.0 s; copy it again$"):
+        next(frames)

@@ -1,4 +1,4 @@
-"""Writes bags of ROS 1, ROS 2 and mcap with images, for the tests of what reads them."""
+"""Writer of bags of ROS 1, ROS 2 and mcap with images, for tests of the bag reader."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ KINDS: tuple[Kind, ...] = ("bag", "db3", "mcap")
 RGB, DEPTH, INFO = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw", "/camera/color/camera_info"
 
 Message = tuple[str, float, Any]
-"""Topic, time of arrival in seconds, content from `Messages`."""
+"""Topic, arrival time (seconds), and message made by `Messages`."""
 
 
 class Messages:
-    """Makes messages for one kind of bag, and writes them."""
+    """Factory of the messages of one kind of bag, and writer of such bags."""
 
     def __init__(self, kind: Kind) -> None:
         self.kind = kind
@@ -34,8 +34,8 @@ class Messages:
     def header(self, stamp: float, frame: str) -> Any:
         nanoseconds = round(stamp * 1e9)
         time = self.store.types["builtin_interfaces/msg/Time"](nanoseconds // 10**9, nanoseconds % 10**9)
-        number = (0,) if self.kind == "bag" else ()
-        return self.store.types["std_msgs/msg/Header"](*number, time, frame)
+        sequence_number = (0,) if self.kind == "bag" else ()
+        return self.store.types["std_msgs/msg/Header"](*sequence_number, time, frame)
 
     def image(
         self,
@@ -44,32 +44,34 @@ class Messages:
         pixels: NDArray[Any],
         *,
         pad: int = 0,
-        big: bool = False,
+        big_endian: bool = False,
         frame: str = "optical",
     ) -> Any:
-        """An image message of pixels (H, W) or (H, W, C), with ``pad`` bytes behind each row."""
+        """Make an image message from pixels (H, W) or (H, W, C), with ``pad`` bytes after each row."""
         height, width = pixels.shape[:2]
-        if big:
+        if big_endian:
             pixels = pixels.astype(pixels.dtype.newbyteorder(">"))
         rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
         data = np.concatenate([rows, np.full((height, pad), 99, np.uint8)], axis=1)
-        make = self.store.types["sensor_msgs/msg/Image"]
-        return make(self.header(stamp, frame), height, width, encoding, int(big), data.shape[1], data.reshape(-1))
+        message_type = self.store.types["sensor_msgs/msg/Image"]
+        return message_type(
+            self.header(stamp, frame), height, width, encoding, int(big_endian), data.shape[1], data.reshape(-1)
+        )
 
-    def compressed(self, stamp: float, form: str, content: bytes) -> Any:
-        make = self.store.types["sensor_msgs/msg/CompressedImage"]
-        return make(self.header(stamp, "optical"), form, np.frombuffer(content, np.uint8))
+    def compressed(self, stamp: float, compression: str, content: bytes) -> Any:
+        message_type = self.store.types["sensor_msgs/msg/CompressedImage"]
+        return message_type(self.header(stamp, "optical"), compression, np.frombuffer(content, np.uint8))
 
     def info(
         self, width: int, height: int, k: list[float], d: list[float], p: list[float], model: str = "plumb_bob"
     ) -> Any:
         roi = self.store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        numbers = [np.array(values, np.float64) for values in (d, k, np.eye(3).reshape(-1), p)]
-        make = self.store.types["sensor_msgs/msg/CameraInfo"]
-        return make(self.header(0, "optical"), height, width, model, *numbers, 0, 0, roi)
+        arrays = [np.array(values, np.float64) for values in (d, k, np.eye(3).reshape(-1), p)]
+        message_type = self.store.types["sensor_msgs/msg/CameraInfo"]
+        return message_type(self.header(0, "optical"), height, width, model, *arrays, 0, 0, roi)
 
     def write(self, path: Path, messages: Iterable[Message]) -> Path:
-        """Write a ``.bag`` file, or a ROS 2 bag's folder; what was written comes back."""
+        """Write a ``.bag`` file or the folder of a ROS 2 bag, and return its path."""
         if self.kind == "bag":
             path = path.with_suffix(".bag")
             writer: Any = Writer1(path)
@@ -81,19 +83,20 @@ class Messages:
         with writer:
             connections: dict[str, Any] = {}
             for topic, arrival, message in messages:
-                kind = message.__msgtype__
+                type_name = message.__msgtype__
                 if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(connections[topic], round(arrival * 1e9), bytes(serialize(message, kind)))
+                    connections[topic] = writer.add_connection(topic, type_name, typestore=self.store)
+                writer.write(connections[topic], round(arrival * 1e9), bytes(serialize(message, type_name)))
         return path
 
 
 def png(pixels: NDArray[Any]) -> bytes:
+    """Encode pixels as PNG."""
     file = BytesIO()
     Image.fromarray(pixels).save(file, "png")
     return file.getvalue()
 
 
 def compressed_depth(units: NDArray[np.uint16], a: float = 0.0, b: float = 0.0) -> bytes:
-    """As compressed_depth_image_transport writes it: an enumeration, two numbers, a PNG."""
+    """Encode depth as compressed_depth_image_transport does: an enumeration, two quantisation parameters, a PNG."""
     return struct.pack("<iff", 0, a, b) + png(units)

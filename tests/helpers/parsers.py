@@ -1,4 +1,4 @@
-"""The doors at which bytes come in, for tests that push any bytes through them: parsed, or refused as `V3DError`."""
+"""All parsers of input files, for tests with arbitrary bytes: they return a result or raise `V3DError`."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import torch
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import openloris
-from v3d_torch.datasets.bag import BagSequence
-from v3d_torch.datasets.bag_images import colour_from, depth_from
 from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.encodings import COLOURS
 from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour, read_depth
 from v3d_torch.datasets.lists import read_associations, read_image_list
 from v3d_torch.datasets.matrix_files import read_matrix, read_poses
+from v3d_torch.datasets.ros import BagSequence
+from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
+from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -30,11 +30,11 @@ from v3d_torch.runs import stored_run
 from v3d_torch.types import Trajectory
 
 Parser = Callable[[bytes, Path], object]
-"""Parses bytes, in a folder for files that it needs."""
+"""Parser of bytes, with a folder for temporary files."""
 
 
 def from_file(name: str, read: Callable[[Path], object]) -> Parser:
-    """A parser that reads a file of this name."""
+    """Make a parser that writes the bytes to a file and reads it."""
 
     def parse(content: bytes, folder: Path) -> object:
         path = folder / name
@@ -44,42 +44,43 @@ def from_file(name: str, read: Callable[[Path], object]) -> Parser:
     return parse
 
 
-def as_overrides(content: bytes, folder: Path) -> object:
-    """A line for each ``--set``."""
+def parse_overrides(content: bytes, folder: Path) -> object:
+    """Parse each line as the value of an option ``--set``."""
     return load_config(None, content.decode("utf-8", "surrogateescape").splitlines())
 
 
-def message(content: bytes) -> SimpleNamespace:
-    """A ROS image whose first bytes say its encoding and its size, and the rest of which are its pixels."""
-    head = content[:8].ljust(8, b"\0")
-    encodings = [*COLOURS, "16UC1", "mono16", "32FC1", "", "8UC4"]
+def image_message(content: bytes) -> SimpleNamespace:
+    """Make a ROS image: the first eight bytes give its encoding and size, the others are its pixels."""
+    header = content[:8].ljust(8, b"\0")
+    encodings = [*COLOUR_ENCODINGS, "16UC1", "mono16", "32FC1", "", "8UC4"]
     return SimpleNamespace(
-        encoding=encodings[head[0] % len(encodings)],
-        is_bigendian=head[1] & 1,
-        width=int.from_bytes(head[2:4], "little"),
-        height=int.from_bytes(head[4:6], "little"),
-        step=int.from_bytes(head[6:8], "little"),
+        encoding=encodings[header[0] % len(encodings)],
+        is_bigendian=header[1] & 1,
+        width=int.from_bytes(header[2:4], "little"),
+        height=int.from_bytes(header[4:6], "little"),
+        step=int.from_bytes(header[6:8], "little"),
         data=np.frombuffer(content[8:], np.uint8),
     )
 
 
-def compressed(content: bytes) -> SimpleNamespace:
-    forms = ["jpeg", "png", "16UC1; compressedDepth", "32FC1; compressedDepth", "16UC1; compressedDepth rvl", ""]
-    form = forms[content[0] % len(forms)] if content else ""
-    return SimpleNamespace(format=form, data=np.frombuffer(content[1:], np.uint8))
+def compressed_message(content: bytes) -> SimpleNamespace:
+    """Make a compressed ROS image: the first byte gives its format, the others are its data."""
+    formats = ["jpeg", "png", "16UC1; compressedDepth", "32FC1; compressedDepth", "16UC1; compressedDepth rvl", ""]
+    message_format = formats[content[0] % len(formats)] if content else ""
+    return SimpleNamespace(format=message_format, data=np.frombuffer(content[1:], np.uint8))
 
 
-def frames_of(bag: Path) -> object:
-    """Every frame of a bag, of which the index or a message may be broken."""
-    return list(BagSequence(bag))
+def read_bag(path: Path) -> object:
+    """Read all frames of a bag."""
+    return list(BagSequence(path))
 
 
-def unpack(path: Path) -> object:
-    folder = path.with_name("unpacked")
+def extract_archive(path: Path) -> object:
+    folder = path.with_name("extracted")
     try:
         return extract_tar(path, folder, max_bytes=1 << 20)
     finally:
-        shutil.rmtree(folder, ignore_errors=True)  # what is there is not unpacked again
+        shutil.rmtree(folder, ignore_errors=True)  # an existing folder is an error
 
 
 CAMERA = PinholeCamera(fx=8.0, fy=8.0, cx=3.5, cy=2.5, width=8, height=6)
@@ -93,34 +94,36 @@ PARSERS: dict[str, Parser] = {
     "camera.yaml": from_file("camera.yaml", load_camera),
     "K.txt": from_file("K.txt", load_camera),
     "configuration": from_file("config.yaml", load_config),
-    "--set": as_overrides,
+    "--set": parse_overrides,
     "colour file": from_file("image.png", read_colour),
     "JPEG file": from_file("image.jpg", read_colour),
     "depth file": from_file("image.png", lambda path: read_depth(path, 5000.0)),
     "colour in a message": lambda content, folder: decode_colour(content, "topic"),
     "depth in a message": lambda content, folder: decode_depth(content, "topic"),
-    "colour message": lambda content, folder: colour_from(message(content), "topic"),
-    "depth message": lambda content, folder: depth_from(message(content), 1000.0, "topic"),
-    "compressed colour message": lambda content, folder: colour_from(compressed(content), "topic"),
-    "compressed depth message": lambda content, folder: depth_from(compressed(content), 1000.0, "topic"),
+    "colour message": lambda content, folder: decode_colour_message(image_message(content), "topic"),
+    "depth message": lambda content, folder: decode_depth_message(image_message(content), 1000.0, "topic"),
+    "compressed colour message": lambda content, folder: decode_colour_message(compressed_message(content), "topic"),
+    "compressed depth message": lambda content, folder: decode_depth_message(
+        compressed_message(content), 1000.0, "topic"
+    ),
     "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
-    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_transforms),
-    "ROS 1 bag": from_file("take.bag", frames_of),
-    "ROS 2 bag": from_file("take.db3", frames_of),
-    "mcap": from_file("take.mcap", frames_of),
-    "archive": from_file("archive.tgz", unpack),
+    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
+    "ROS 1 bag": from_file("take.bag", read_bag),
+    "ROS 2 bag": from_file("take.db3", read_bag),
+    "mcap": from_file("take.mcap", read_bag),
+    "archive": from_file("archive.tgz", extract_archive),
     "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
     "metrics.json": from_file("metrics.json", stored_run.read_metrics),
     "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
 }
 
 
-def outcome(parser: str, content: bytes, folder: Path) -> object | V3DError:
-    """What a parser makes of bytes, or how it refuses them.
+def parse(parser: str, content: bytes, folder: Path) -> object | V3DError:
+    """Return the result of a parser or its V3DError.
 
     Raises:
-        AssertionError: the refusal is no sentence.
-        Exception: anything else, which is what the tests look for.
+        AssertionError: If the error has no message.
+        Exception: Any other exception of the parser, which is a defect.
     """
     try:
         return PARSERS[parser](content, folder)
@@ -129,8 +132,8 @@ def outcome(parser: str, content: bytes, folder: Path) -> object | V3DError:
         return error
 
 
-def assert_sound(result: object) -> None:
-    """What has been taken for an input makes sense."""
+def assert_valid(result: object) -> None:
+    """Check the invariants of a parsed result."""
     if isinstance(result, V3DError):
         assert str(result).strip()
     elif isinstance(result, Trajectory):

@@ -1,4 +1,4 @@
-"""Bytes that the doors of `parsers` take, for searches to begin with."""
+"""Valid inputs of all parsers in `parsers`, from which fuzzing starts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from PIL import Image
 from helpers.bags import DEPTH, INFO, RGB, Kind, Messages
 from helpers.parsers import CAMERA
 from v3d_torch.config import Config
-from v3d_torch.datasets.encodings import COLOURS
+from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.map_io import save_map
@@ -27,7 +27,7 @@ from v3d_torch.mapping.static_views import StaticViews
 
 
 def _map() -> bytes:
-    """Two keyframes of 8x6 pixels that see the same two landmarks."""
+    """Map with two keyframes of 8x6 pixels that observe the same two landmarks."""
     config = Config()
     sparse_map, views = SparseMap(config.mapping, config.features, CAMERA), StaticViews(CAMERA, stride=2)
     uv = torch.tensor([[1.0, 2.0], [5.0, 3.0]], dtype=torch.float64)
@@ -52,17 +52,17 @@ def _table() -> bytes:
 
 
 def _bag(kind: Kind) -> bytes:
-    """A frame of 8x6 pixels."""
-    to = Messages(kind)
+    """Bag with one frame of 8x6 pixels."""
+    make_message = Messages(kind)
     matrix = [8.0, 0, 3.5, 0, 8.0, 2.5, 0, 0, 1]
     pixels = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
     messages = [
-        (INFO, 1.0, to.info(8, 6, matrix, [], [*matrix[:3], 0, *matrix[3:6], 0, *matrix[6:], 0])),
-        (RGB, 1.0, to.image(1.0, "mono8", pixels.astype(np.uint8))),
-        (DEPTH, 1.0, to.image(1.0, "16UC1", pixels)),
+        (INFO, 1.0, make_message.info(8, 6, matrix, [], [*matrix[:3], 0, *matrix[3:6], 0, *matrix[6:], 0])),
+        (RGB, 1.0, make_message.image(1.0, "mono8", pixels.astype(np.uint8))),
+        (DEPTH, 1.0, make_message.image(1.0, "16UC1", pixels)),
     ]
     with tempfile.TemporaryDirectory() as folder:
-        path = to.write(Path(folder) / "take", messages)
+        path = make_message.write(Path(folder) / "take", messages)
         return (path if kind == "bag" else next(path.glob(f"*.{kind}"))).read_bytes()
 
 
@@ -76,15 +76,15 @@ def _tar(mode: str) -> bytes:
     return file.getvalue()
 
 
-def _image(form: str, mode: str) -> bytes:
+def _image(file_format: str, mode: str) -> bytes:
     file = BytesIO()
     pixels = np.arange(48, dtype=np.uint16 if mode == "I;16" else np.uint8).reshape(6, 8)
-    Image.fromarray(pixels).convert(mode if mode != "I;16" else None).save(file, form)
+    Image.fromarray(pixels).convert(mode if mode != "I;16" else None).save(file, file_format)
     return file.getvalue()
 
 
 def _message(encoding: int, pixel: int) -> bytes:
-    """An 8x6 image as `message` reads it."""
+    """Image of 8x6 pixels in the format of `image_message`."""
     return struct.pack("<BBHHH", encoding, 0, 8, 6, 8 * pixel) + bytes(range(48 * pixel))
 
 
@@ -143,8 +143,8 @@ SEEDS: dict[str, list[bytes]] = {
     "depth file": _RASTERS,
     "colour in a message": _RASTERS,
     "depth in a message": _RASTERS,
-    "colour message": [_message(i, COLOURS[encoding][0]) for i, encoding in enumerate(COLOURS)],
-    "depth message": [_message(len(COLOURS), 2), _message(len(COLOURS) + 2, 4)],
+    "colour message": [_message(i, COLOUR_ENCODINGS[encoding][0]) for i, encoding in enumerate(COLOUR_ENCODINGS)],
+    "depth message": [_message(len(COLOUR_ENCODINGS), 2), _message(len(COLOUR_ENCODINGS) + 2, 4)],
     "compressed colour message": [b"\0" + image for image in _RASTERS],
     "compressed depth message": [bytes([i]) + struct.pack("<iff", 0, 1.0, 0.0) + _PNGS[-1] for i in (2, 3)]
     + [b"\1" + _PNGS[-1]],
@@ -158,4 +158,4 @@ SEEDS: dict[str, list[bytes]] = {
     "table": [_table()],
     "archive": [_tar(mode) for mode in ("w", "w:gz", "w:bz2", "w:xz")],
 }
-"""Bytes that a parser takes, to begin with."""
+"""Valid inputs of each parser."""

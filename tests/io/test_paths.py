@@ -1,4 +1,4 @@
-"""``~`` in paths, also where no shell has put the home folder in its place."""
+"""Expansion of ``~`` in paths that no shell has expanded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAMERA = "fx: 30\nfy: 30\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale
 
 @pytest.fixture(autouse=True)
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """With a folder ``desk`` of three images and a camera beside it."""
+    """Home folder with a sequence ``desk`` of three frames and a camera file."""
     for name in ("HOME", "USERPROFILE"):
         monkeypatch.setenv(name, str(tmp_path))
     for i in range(3):
@@ -30,7 +30,9 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("variable", [None, "V3D_DATA"])
-def test_sequences_and_cameras(home: Path, monkeypatch: pytest.MonkeyPatch, variable: str | None) -> None:
+def test_home_is_expanded_in_sequence_and_camera_paths(
+    home: Path, monkeypatch: pytest.MonkeyPatch, variable: str | None
+) -> None:
     if variable is not None:
         monkeypatch.setenv(variable, "~")
     root = "~" if variable is None else None
@@ -38,25 +40,25 @@ def test_sequences_and_cameras(home: Path, monkeypatch: pytest.MonkeyPatch, vari
     assert len(load_sequence("~/desk", camera=Path("~/camera.yaml"))) == 3
 
 
-def test_the_cache(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_home_is_expanded_in_the_cache_path(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("V3D_CACHE", "~/cache")
     assert cache_dir() == home / "cache"
 
 
-def test_a_command_writes_there(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_home_is_expanded_in_the_options_of_a_command(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(home / "desk")
     (record,) = (module for module in COMMANDS if module.__name__.endswith("record"))
-    asked = ["--seq=~/desk", "--camera=~/camera.yaml", "--out=~/copy"]
-    done = CliRunner().invoke(record.app, asked)
+    arguments = ["--seq=~/desk", "--camera=~/camera.yaml", "--out=~/copy"]
+    done = CliRunner().invoke(record.app, arguments)
     assert done.exit_code == 0, done.stderr
     assert len(load_sequence(home / "copy")) == 3 and not (home / "desk" / "~").exists()
 
 
 @pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__)
-def test_so_do_all(module: ModuleType) -> None:
+def test_every_command_expands_home(module: ModuleType) -> None:
     (command,) = module.app.registered_commands
     assert command.callback.__wrapped__.__module__ == module.__name__
 
 
-def test_somebody_who_is_not_known_here_is_a_name() -> None:
+def test_home_of_an_unknown_user_stays_unchanged() -> None:
     assert expand_user("~nobody-of-that-name/x") == Path("~nobody-of-that-name/x")

@@ -22,9 +22,9 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import NumericsError
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.runs.numerics_check import STAGES, CheckedSLAM, CheckedStage, check_finite
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.run import Run
-from v3d_torch.runs.numerics_check import STAGES, CheckedSLAM, CheckedStage, check_finite
 from v3d_torch.runs.state import OF_SLAM, gather, put_back, refresh
 from v3d_torch.segmentation.mask_files import MaskFolder
 from v3d_torch.types import Instances, TrackingStatus

@@ -15,9 +15,9 @@ from pydantic import ValidationError
 from v3d_torch.config import Config, Section
 from v3d_torch.config.validation import first_error
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.io.files import StrPath, read_text
-from v3d_torch.io.paths import expand_user
+from v3d_torch.io.paths import StrPath, expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.text import read_text
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""

@@ -16,8 +16,7 @@ from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import GroundTruthWarning, InputError
 from v3d_torch.io.download import Progress, cache_dir
-from v3d_torch.io.files import StrPath
-from v3d_torch.io.paths import expand_user
+from v3d_torch.io.paths import StrPath, expand_user
 
 __all__ = [
     "PAPER_SEQUENCES",

@@ -15,9 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from v3d_torch.config.validation import first_error
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
-from v3d_torch.io.files import read_text
 from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.text import read_text
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
 PRESETS: tuple[str, ...] = tuple(

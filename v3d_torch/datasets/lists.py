@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from v3d_torch.datasets.images import is_depth
 from v3d_torch.errors import InputError
-from v3d_torch.io.files import numbered_lines
+from v3d_torch.io.text import numbered_lines
 from v3d_torch.io.timestamps import associate, parse_timestamp
 
 _T = TypeVar("_T")

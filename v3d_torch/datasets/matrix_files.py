@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from v3d_torch.errors import InputError
-from v3d_torch.io.files import numbered_lines, read_text
 from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.text import numbered_lines, read_text
 from v3d_torch.types import Trajectory
 
 _ROTATION_TOLERANCE = 0.01

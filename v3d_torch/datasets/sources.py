@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from v3d_torch.datasets.bag import BagSequence, is_bag
 from v3d_torch.datasets.base import RGBDStream
 from v3d_torch.datasets.bonn import BonnSequence, is_bonn
 from v3d_torch.datasets.cameras import CameraChoice
@@ -14,6 +13,7 @@ from v3d_torch.datasets.icl_nuim import ICLNUIMSequence, is_icl_nuim
 from v3d_torch.datasets.image_folder import ImageFolder, is_image_folder
 from v3d_torch.datasets.openloris import OpenLORISSequence, is_openloris
 from v3d_torch.datasets.realsense import is_recording, open_recording
+from v3d_torch.datasets.ros import BagSequence, is_bag
 from v3d_torch.datasets.scannet import ScanNetSequence, is_scannet
 from v3d_torch.datasets.seven_scenes import SevenScenesSequence, is_seven_scenes
 from v3d_torch.datasets.tum import TUMSequence, is_tum

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import InputError
-from v3d_torch.io.files import StrPath, numbered_lines, write_text
+from v3d_torch.io.files import write_text
+from v3d_torch.io.paths import StrPath
+from v3d_torch.io.text import numbered_lines
 from v3d_torch.io.timestamps import parse_timestamp
 from v3d_torch.types import Trajectory
 

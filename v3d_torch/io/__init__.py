@@ -1,1 +1,1 @@
-"""Files on disk and on the web: text, PLY, YAML, archives, downloads, timestamps."""
+"""Input and output: text, YAML, PLY and state files, paths, timestamps, downloads, archives."""

@@ -1,4 +1,4 @@
-"""Downloads that resume, are checked and arrive whole or not at all."""
+"""Downloads over https that resume after an interruption, are verified, and appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from v3d_torch.errors import DownloadError, OutputError
 from v3d_torch.io.paths import expand_user
 
 Progress = Callable[[int, int | None], None]
-"""Called with the bytes that are here and the bytes that there will be (None: the server does not say)."""
+"""Called with the amount done and the total amount (None if unknown), both in bytes for downloads."""
 
-_CHUNK = 1 << 18
-_LOOPBACK = ("localhost", "127.0.0.1", "::1")
+_CHUNK_SIZE = 1 << 18
+_LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
 def cache_dir() -> Path:
-    """Folder for what is downloaded or made once: ``$V3D_CACHE``, else the user's cache of this platform."""
+    """Return the cache folder for downloads and generated files: ``$V3D_CACHE``, else the platform's user cache."""
     return expand_user(os.environ.get("V3D_CACHE") or user_cache_path("v3d_torch"))
 
 
@@ -40,123 +40,122 @@ def fetch(
     progress: Progress | None = None,
     timeout: float = 5.0,
 ) -> Path:
-    """Download ``url`` to ``target``, replacing it only when everything has arrived and is right.
+    """Download ``url`` to ``target``; an existing ``target`` is replaced only after the download is verified.
 
-    Bytes gather in ``target`` + ``.part``; when a download breaks off, the next one goes on from there.
+    Data is collected in ``target`` + ``.part``, from which an interrupted download resumes.
 
     Args:
-        url: https; plain http is allowed for the own machine only. Redirects are followed to https only.
-        target: file to write; missing parent folders are made.
-        sha256: hexadecimal checksum that the file must have.
-        size: bytes that the file must have; what the server announces is checked in any case.
-        progress: told after every chunk.
-        timeout: longest wait for the connection and for each chunk, seconds.
+        url: Address with https, or with http on the local machine. Only redirects to https are followed.
+        target: File to write; missing parent folders are created.
+        sha256: Expected checksum, hexadecimal.
+        size: Expected size, bytes; the size that the server announces is checked in any case.
+        progress: Called after every chunk.
+        timeout: Longest wait for the connection and for each chunk, seconds.
 
     Returns:
         ``target``.
 
     Raises:
-        DownloadError: no network, an answer other than the file, a connection that breaks off, wrong size or checksum.
-        OutputError: the file cannot be written.
+        DownloadError: If the server cannot be reached, does not return the file, or the connection is lost; or if the
+            size or checksum is wrong.
+        OutputError: If the file cannot be written.
     """
-    parts = urlsplit(url)
-    if parts.scheme != "https" and not (parts.scheme == "http" and parts.hostname in _LOOPBACK):
-        raise DownloadError(f"{url}: only https addresses are downloaded")
+    address = urlsplit(url)
+    if address.scheme != "https" and not (address.scheme == "http" and address.hostname in _LOOPBACK_HOSTS):
+        raise DownloadError(f"{url}: only https addresses can be downloaded")
     part = target.with_name(f"{target.name}.part")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        _complete(url, part, size, progress, timeout)
-        _check(url, part, sha256, size)
+        _complete_part(url, part, size, progress, timeout)
+        _verify_part(url, part, sha256, size)
         part.replace(target)
     except OSError as error:
         raise OutputError(f"{target}: cannot be written ({error.strerror or error}); choose another folder") from error
     return target
 
 
-def _complete(url: str, part: Path, size: int | None, progress: Progress | None, timeout: float) -> None:
-    """Bring ``part`` to its full length, from where it stands if the server can."""
+def _complete_part(url: str, part: Path, size: int | None, progress: Progress | None, timeout: float) -> None:
+    """Download the rest of ``part``, or all of it if the server cannot resume."""
     done = part.stat().st_size if part.exists() else 0
     try:
         response = _open(url, done, timeout)
     except urllib.error.HTTPError as error:
         if error.code != 416 or not done:
             raise DownloadError(f"{url}: the server answers {error.code} {error.reason}") from error
-        if _whole(error.headers) == done:
+        # 416: no bytes after `done`. The part is complete, or longer than the file.
+        if _total_length(error.headers) == done:
             return
         part.unlink()
-        _complete(url, part, size, progress, timeout)
+        _complete_part(url, part, size, progress, timeout)
         return
     except (OSError, http.client.HTTPException) as error:
-        raise DownloadError(f"{url}: cannot be reached ({_reason(error)})") from error
+        raise DownloadError(f"{url}: cannot be reached ({_cause(error)})") from error
     with response:
-        if response.status != 206:
+        if response.status != 206:  # not partial content: the server sends the file from its start
             done = 0
-        total = _whole(response.headers) if done else _length(response.headers)
+        total = _total_length(response.headers) if done else _content_length(response.headers)
         if size is not None and total not in (size, None):
             part.unlink(missing_ok=True)
-            raise DownloadError(f"{url}: the server offers {total} bytes where {size} are expected")
+            raise DownloadError(f"{url}: the server offers {total} bytes, expected {size}")
         with part.open("ab" if done else "wb") as file:
-            while chunk := _read(response, url):
+            while chunk := _read_chunk(response, url):
                 file.write(chunk)
                 done += len(chunk)
                 if progress is not None:
                     progress(done, total if total is not None else size)
     if total is not None and done < total:
-        raise DownloadError(
-            f"{url}: the connection broke off after {done} of {total} bytes; try again to go on from there"
-        )
+        raise DownloadError(f"{url}: the connection was lost after {done} of {total} bytes; try again to resume")
 
 
 def _open(url: str, start: int, timeout: float) -> http.client.HTTPResponse:
     headers = {"User-Agent": "v3d_torch"} | ({"Range": f"bytes={start}-"} if start else {})
     opener = urllib.request.build_opener(_HttpsRedirects)
-    request = urllib.request.Request(url, headers=headers)  # noqa: S310 - `fetch` lets nothing but https through
+    request = urllib.request.Request(url, headers=headers)  # noqa: S310 - `fetch` accepts only https
     response: http.client.HTTPResponse = opener.open(request, timeout=timeout)
     return response
 
 
-def _read(response: http.client.HTTPResponse, url: str) -> bytes:
+def _read_chunk(response: http.client.HTTPResponse, url: str) -> bytes:
     try:
-        return response.read(_CHUNK)
+        return response.read(_CHUNK_SIZE)
     except (OSError, http.client.HTTPException) as error:
-        raise DownloadError(f"{url}: the connection broke off ({_reason(error)}); try again to go on") from error
+        raise DownloadError(f"{url}: the connection was lost ({_cause(error)}); try again to resume") from error
 
 
-def _whole(headers: Message) -> int | None:
-    """Length of the whole file, from an answer to a request for a part of it."""
+def _total_length(headers: Message) -> int | None:
+    """Length of the whole file, from the response to a range request."""
     match = re.fullmatch(r"bytes (?:\d+-\d+|\*)/(\d+)", headers.get("Content-Range", "").strip())
     return int(match[1]) if match else None
 
 
-def _length(headers: Message) -> int | None:
-    """Length of the answer."""
+def _content_length(headers: Message) -> int | None:
     length = headers.get("Content-Length", "")
     return int(length) if length.isdigit() else None
 
 
-def _check(url: str, part: Path, sha256: str | None, size: int | None) -> None:
-    """Refuse, and remove, a file that is not what it should be: going on from it would never help."""
+def _verify_part(url: str, part: Path, sha256: str | None, size: int | None) -> None:
+    """Raise DownloadError and remove the part if its size or checksum is wrong, because resuming cannot repair it."""
     actual_size = part.stat().st_size
     if size is not None and actual_size != size:
         part.unlink()
-        raise DownloadError(f"{url}: {actual_size} bytes arrived where {size} are expected")
+        raise DownloadError(f"{url}: {actual_size} bytes were received, expected {size}")
     if sha256 is None:
         return
     with part.open("rb") as file:
         actual = hashlib.file_digest(file, "sha256").hexdigest()
     if actual != sha256.lower():
         part.unlink()
-        raise DownloadError(f"{url}: the file that arrived has the sha256 {actual}, expected is {sha256}")
+        raise DownloadError(f"{url}: the downloaded file has sha256 {actual}, expected {sha256}")
 
 
-def _reason(error: BaseException) -> str:
-    """The cause in a few words, without urllib's wrapping."""
+def _cause(error: BaseException) -> str:
+    """Short cause of an error, without the text that urllib adds."""
     cause = getattr(error, "reason", error)
     return str(getattr(cause, "strerror", None) or cause or type(error).__name__)
 
 
 class _HttpsRedirects(urllib.request.HTTPRedirectHandler):
-    """Follows redirects to https and refuses all others."""
+    """Redirect handler that rejects redirects to anything but https."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Message, newurl: str

@@ -1,4 +1,4 @@
-"""Unpacking of downloaded archives: nothing leaves the folder, nothing half-unpacked stays."""
+"""Extraction of downloaded tar archives: confined to the target folder, bounded in size, all or nothing."""
 
 from __future__ import annotations
 
@@ -12,98 +12,100 @@ from typing import Self
 from v3d_torch.errors import InputError, OutputError
 
 MAX_BYTES = 20 * 2**30
-"""Most bytes that an archive may unpack to: three times the largest TUM sequence."""
+"""Largest total size of the files in an archive, bytes: three times the largest TUM sequence."""
 
 _MAX_MEMBERS = 1_000_000
-"""Most files, also empty ones: a file system has room for so many names, and no sequence has."""
+"""Largest number of members: also empty files fill up a file system, and no sequence has so many."""
 
-_MAX_HEADER = 1 << 20
-"""Most bytes of a header before a member, which is read into memory as a whole: it holds a name."""
+_MAX_HEADER_BYTES = 1 << 20
+"""Largest extension header of a member, bytes: tarfile reads it into memory whole, and it only holds a name."""
 
-_NAMES = (
+_EXTENSION_HEADERS = (
     *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK),
     *(tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE),
 )
-"""Kinds of such headers."""
+"""Types of extension headers: long names, and PAX records."""
 
-_CHUNK = 1 << 20
+_CHUNK_SIZE = 1 << 20
 
 
 def extract_tar(archive: Path, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
-    """Unpack a tar archive (any compression) so that ``folder`` appears whole or not at all.
+    """Extract a tar archive (any compression) so that ``folder`` appears complete or not at all.
 
-    When all that is in the archive lies in one top folder, that folder's contents become ``folder``'s.
+    If the archive contains only one top-level folder, its contents become the contents of ``folder``.
 
     Args:
-        archive: file to unpack.
-        folder: folder to make; must not exist.
-        max_bytes: refuse archives that unpack to more.
+        archive: Archive to extract.
+        folder: Folder to create; must not exist.
+        max_bytes: Largest total size of the extracted files, bytes.
 
     Raises:
-        InputError: the archive is broken, holds paths or links that lead outside, special files, or too much.
-        OutputError: the folder exists or cannot be written.
+        InputError: If the archive is damaged, too large, or contains special files or paths that lead outside.
+        OutputError: If the folder exists or cannot be written.
     """
     if folder.exists():
-        raise OutputError(f"{folder}: is already there; remove it to unpack {archive.name} again")
+        raise OutputError(f"{folder}: already exists; remove it to extract {archive.name} again")
     scratch: Path | None = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        # Beside the target, so that the rename at the end stays on one file system.
+        # Next to the target, so that the final rename stays on one file system.
         scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-        with tarfile.open(archive, tarinfo=_Header) as tar:
-            tar.extractall(scratch, members=_limited(tar, archive, max_bytes), filter="data")
-            _read_to_the_end(tar, max_bytes)
-        _top(scratch).replace(folder)
+        with tarfile.open(archive, tarinfo=_StrictTarInfo) as tar:
+            tar.extractall(scratch, members=_limit_members(tar, archive, max_bytes), filter="data")
+            _read_to_end(tar, max_bytes)
+        _top_folder(scratch).replace(folder)
     except InputError:
         raise
     except tarfile.FilterError as error:
-        why = "a member leads outside or is no plain file"
-        raise InputError(f"{archive}: is refused, {why} ({error}); get it from another source") from error
-    except Exception as error:  # every compression has its own, some of which are an OSError without a number
+        cause = f"a member leads outside or is not a plain file ({error})"
+        raise InputError(f"{archive}: is unsafe, {cause}; get it from another source") from error
+    except Exception as error:  # each compression raises its own errors, some of them OSError without errno
         if isinstance(error, OSError) and error.errno is not None:
-            raise OutputError(f"{folder}: cannot be unpacked ({error.strerror}); choose another --data-root") from error
-        why = (str(error).splitlines() or [type(error).__name__])[0].removesuffix(":")
-        raise InputError(f"{archive}: is not a whole tar archive ({why}); download it again") from error
+            raise OutputError(
+                f"{folder}: cannot be extracted ({error.strerror}); choose another --data-root"
+            ) from error
+        cause = (str(error).splitlines() or [type(error).__name__])[0].removesuffix(":")
+        raise InputError(f"{archive}: is not a complete tar archive ({cause}); download it again") from error
     finally:
         if scratch is not None:
             shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _limited(tar: tarfile.TarFile, archive: Path, max_bytes: int) -> Iterator[tarfile.TarInfo]:
-    """The members, stopping with an error before more than ``max_bytes`` are written."""
+def _limit_members(tar: tarfile.TarFile, archive: Path, max_bytes: int) -> Iterator[tarfile.TarInfo]:
+    """Yield the members; raise before their total size or number exceeds the limit."""
     total = 0
     for count, member in enumerate(tar):
         total += member.size
         if total > max_bytes or count >= _MAX_MEMBERS:
-            most = f"{max_bytes} bytes" if total > max_bytes else f"{_MAX_MEMBERS} files"
-            raise InputError(f"{archive}: is refused, it unpacks to more than {most}; get it from another source")
+            limit = f"{max_bytes} bytes" if total > max_bytes else f"{_MAX_MEMBERS} files"
+            raise InputError(f"{archive}: is unsafe, it extracts to more than {limit}; get it from another source")
         yield member
 
 
-def _read_to_the_end(tar: tarfile.TarFile, max_bytes: int) -> None:
-    """Read what is behind the last member: only then do gzip and its like compare their checksum."""
-    left = max_bytes
-    while left > 0 and tar.fileobj is not None and (chunk := tar.fileobj.read(_CHUNK)):
-        left -= len(chunk)
+def _read_to_end(tar: tarfile.TarFile, max_bytes: int) -> None:
+    """Read the rest of the archive: gzip, bzip2 and xz verify their checksums only at the end."""
+    remaining = max_bytes
+    while remaining > 0 and tar.fileobj is not None and (chunk := tar.fileobj.read(_CHUNK_SIZE)):
+        remaining -= len(chunk)
 
 
-class _Header(tarfile.TarInfo):
-    """A header that is broken, which `tarfile` takes for the end of the archive, or too large, is an error."""
+class _StrictTarInfo(tarfile.TarInfo):
+    """Member header that raises an error if it is damaged or too large; tarfile treats a damaged one as the end."""
 
     @classmethod
     def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
         try:
             header = super().frombuf(buf, encoding, errors)
-        except (tarfile.EmptyHeaderError, tarfile.EOFHeaderError):  # type: ignore[attr-defined]  # the end
+        except (tarfile.EmptyHeaderError, tarfile.EOFHeaderError):  # type: ignore[attr-defined]  # regular end
             raise
         except tarfile.HeaderError as error:
             raise tarfile.ReadError(str(error)) from error
-        if header.type in _NAMES and header.size > _MAX_HEADER:
+        if header.type in _EXTENSION_HEADERS and header.size > _MAX_HEADER_BYTES:
             raise tarfile.ReadError(f"a header of {header.size} bytes")
         return header
 
 
-def _top(scratch: Path) -> Path:
-    """The only folder in ``scratch``, else ``scratch`` itself."""
+def _top_folder(scratch: Path) -> Path:
+    """Return the only entry of ``scratch`` if it is a folder, else ``scratch`` itself."""
     entries = list(scratch.iterdir())
     return entries[0] if len(entries) == 1 and entries[0].is_dir() else scratch

@@ -1,18 +1,22 @@
-"""``~`` in paths: shells put the home folder in its place in ``--out ~/x``, but not in ``--out=~/x``, nor in Python."""
+"""Paths as users write them, with ``~`` for the home folder.
+
+Shells expand ``~`` in ``--out ~/x``, but not in ``--out=~/x``, in environment variables in quotes, or in Python.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from v3d_torch.io.files import StrPath  # whose libraries take long to load, and help is instant
+StrPath = str | os.PathLike[str]
+"""A path as a string or as a path object."""
 
 
 def expand_user(path: StrPath) -> Path:
-    """The path, from the user's home where it begins with ``~``; as it is where that is somebody not known here."""
+    """Expand a leading ``~`` to the home folder; a path of an unknown user stays unchanged."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -20,7 +24,7 @@ def expand_user(path: StrPath) -> Path:
 
 
 def expand_user_paths(command: Callable[..., None]) -> Callable[..., None]:
-    """Let the paths among the options of a command begin with ``~``."""
+    """Decorate a command so that a leading ``~`` is expanded in all its options of type `Path`."""
 
     @wraps(command)
     def expanded(**options: Any) -> None:

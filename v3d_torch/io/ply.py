@@ -1,4 +1,4 @@
-"""Points, meshes and line sets as binary PLY files, which MeshLab, CloudCompare, Blender and Open3D open."""
+"""Point clouds, meshes and line sets as binary PLY files, for MeshLab, CloudCompare, Blender and Open3D."""
 
 from __future__ import annotations
 
@@ -10,6 +10,12 @@ from torch import Tensor
 
 from v3d_torch.io.files import atomic_write
 
+_CORNER_COUNT = "corner_count"
+"""Field of the number of corners, which a PLY list stores before the vertex indices of a face."""
+
+_PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
+"""PLY name of each NumPy type."""
+
 
 def write_ply(
     path: Path,
@@ -20,54 +26,48 @@ def write_ply(
     faces: Tensor | None = None,
     edges: Tensor | None = None,
 ) -> None:
-    """Write coloured vertices, and what joins them.
+    """Write coloured vertices, and optionally faces and edges between them, atomically.
 
     Args:
-        path: of the file.
-        points: metres, shape :math:`(N, 3)`, written in float32.
-        colours: RGB, uint8, shape :math:`(N, 3)`.
-        normals: unit vectors, shape :math:`(N, 3)`.
-        faces: triangles of vertices, shape :math:`(F, 3)`.
-        edges: lines between vertices, shape :math:`(E, 2)`.
+        path: File to write.
+        points: Positions of the vertices, metres, shape :math:`(N, 3)`; written as float32.
+        colours: RGB of the vertices, uint8, shape :math:`(N, 3)`.
+        normals: Unit normals of the vertices, shape :math:`(N, 3)`.
+        faces: Vertex indices of the triangles, shape :math:`(F, 3)`.
+        edges: Vertex indices of the lines, shape :math:`(E, 2)`.
 
     Raises:
-        OutputError: when the file cannot be written.
+        OutputError: If the file cannot be written.
     """
-    named = [(("x", "y", "z"), "<f4", points)]
-    named += [] if normals is None else [(("nx", "ny", "nz"), "<f4", normals)]
-    named += [(("red", "green", "blue"), "u1", colours)]
-    vertices = np.empty(len(points), dtype=[(name, kind) for names, kind, _ in named for name in names])
-    for names, _, columns in named:
-        for name, column in zip(names, columns.numpy().T, strict=True):
+    groups = [(("x", "y", "z"), "<f4", points)]
+    groups += [] if normals is None else [(("nx", "ny", "nz"), "<f4", normals)]
+    groups += [(("red", "green", "blue"), "u1", colours)]
+    vertices = np.empty(len(points), dtype=[(name, dtype) for names, dtype, _ in groups for name in names])
+    for names, _, values in groups:
+        for name, column in zip(names, values.numpy().T, strict=True):
             vertices[name] = column
     elements = {"vertex": vertices}
     if faces is not None:
-        elements["face"] = triangles = np.empty(len(faces), dtype=[(_CORNERS, "u1"), ("vertex_indices", "<i4", 3)])
-        triangles[_CORNERS], triangles["vertex_indices"] = 3, faces.numpy()
+        triangles = np.empty(len(faces), dtype=[(_CORNER_COUNT, "u1"), ("vertex_indices", "<i4", 3)])
+        triangles[_CORNER_COUNT], triangles["vertex_indices"] = 3, faces.numpy()
+        elements["face"] = triangles
     if edges is not None:
-        elements["edge"] = lines = np.empty(len(edges), dtype=[("vertex1", "<i4"), ("vertex2", "<i4")])
+        lines = np.empty(len(edges), dtype=[("vertex1", "<i4"), ("vertex2", "<i4")])
         lines["vertex1"], lines["vertex2"] = edges.numpy().T
+        elements["edge"] = lines
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         file.write(_header(elements).encode("ascii"))
         for rows in elements.values():
             file.write(rows.tobytes())
 
 
-_CORNERS = "corners"
-"""How many vertices a face has, which stands before them in the file."""
-
-_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
-"""Names of number types in PLY."""
-
-
 def _header(elements: dict[str, NDArray[np.void]]) -> str:
-    """What the rows that follow are: an element with a property per column, or a list of vertices."""
+    """Return the PLY header: each element with one property per field, or with one list of vertices."""
     lines = ["ply", "format binary_little_endian 1.0"]
     for element, rows in elements.items():
         names = rows.dtype.names or ()
         lines.append(f"element {element} {len(rows)}")
-        for name in names:
-            if name != _CORNERS:
-                several = "list uchar " if _CORNERS in names else ""
-                lines.append(f"property {several}{_TYPES[rows.dtype[name].base.str[1:]]} {name}")
+        list_type = "list uchar " if _CORNER_COUNT in names else ""
+        types = {name: _PLY_TYPES[rows.dtype[name].base.str[1:]] for name in names if name != _CORNER_COUNT}
+        lines += [f"property {list_type}{ply_type} {name}" for name, ply_type in types.items()]
     return "\n".join([*lines, "end_header", ""])

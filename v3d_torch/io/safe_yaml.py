@@ -1,4 +1,4 @@
-"""YAML that somebody else may have written: plain values, small, and no more in memory than in the text."""
+"""YAML from untrusted files: plain values only, of bounded size, without aliases and duplicate keys."""
 
 from __future__ import annotations
 
@@ -8,40 +8,50 @@ from typing import Any
 import yaml
 
 _MAX_LENGTH = 100_000
-"""Letters; what is read here has a few thousand, and the parser takes a second for this."""
+"""Largest YAML text, characters: more than any file that is read here, and little enough for a slow parser."""
 
 
 def parse_yaml(text: str) -> Any:
-    """The value that a YAML text stands for.
+    """Parse a YAML text.
 
-    Tags for objects are refused, as `yaml.safe_load` does; so are aliases, with which a few lines can stand for
-    gigabytes, and a key that is given twice, of which YAML would silently take the last.
+    Like `yaml.safe_load` this rejects tags that create Python objects. It also rejects aliases, with which a few lines
+    can expand to gigabytes, and duplicate keys, of which PyYAML silently keeps the last.
+
+    Args:
+        text: YAML text, at most 100000 characters.
+
+    Returns:
+        The parsed value; None for an empty text.
 
     Raises:
-        ValueError: it is no such YAML; the message says why in a few words, with the line where it can.
+        ValueError: If the text is not such YAML; the message is a short cause, with the line number if known.
     """
     if len(text) > _MAX_LENGTH:
-        raise ValueError(f"it has {len(text)} letters, more than {_MAX_LENGTH}")
+        raise ValueError(f"it has {len(text)} characters, more than {_MAX_LENGTH}")
     try:
-        return yaml.load(text, _PlainLoader)  # noqa: S506 - a safe loader
+        return yaml.load(text, _StrictLoader)  # noqa: S506 - derived from the safe loader
     except yaml.MarkedYAMLError as error:
-        where = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
-        raise ValueError(f"{where}{error.problem}") from error
+        line = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
+        raise ValueError(f"{line}{error.problem}") from error
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    except Exception as error:  # of the many that dates, Booleans and numbers raise that are none
+    except Exception as error:  # PyYAML converts dates, Booleans and numbers without checks: any error can result
         raise ValueError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
 
 
-class _PlainLoader(yaml.SafeLoader):
+class _StrictLoader(yaml.SafeLoader):
+    """Safe loader that rejects aliases and duplicate keys."""
+
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
             alias = self.peek_event()
-            raise yaml.MarkedYAMLError(problem=f"write *{alias.anchor} out", problem_mark=alias.start_mark)
+            raise yaml.MarkedYAMLError(
+                problem=f"alias *{alias.anchor} is not allowed, write its value", problem_mark=alias.start_mark
+            )
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        if twice := [key for key, count in keys.items() if count > 1]:
-            raise yaml.MarkedYAMLError(problem=f"{twice[0]!r} is given twice", problem_mark=node.start_mark)
+        if duplicates := [key for key, count in keys.items() if count > 1]:
+            raise yaml.MarkedYAMLError(problem=f"duplicate key {duplicates[0]!r}", problem_mark=node.start_mark)
         return super().construct_mapping(node, deep)

@@ -1,7 +1,7 @@
-"""State as a file: Python objects and tensors in one graph, without code, and told apart from a damaged one.
+"""State files: Python objects and tensors in one file, verified by a checksum and loaded without running code.
 
-A line with format, version and checksum, a line of JSON about the state, and an archive of ``torch.save``. Reading
-makes objects of the classes that the reader names and of no others (``weights_only``): it runs no code of the file.
+A file has three parts: a line with format, version and checksum; a line of JSON metadata; an archive of
+``torch.save``. Loading creates objects of the classes that the caller allows and of no others (``weights_only``).
 """
 
 from __future__ import annotations
@@ -23,94 +23,98 @@ from v3d_torch.io.files import atomic_write
 
 _FORMAT, _VERSION = "v3d_torch state", 8
 
-_HEADER = f"{_FORMAT} {{version}} sha256 {{digest}}\n"
-_NO_DIGEST = "0" * hashlib.sha256().digest_size * 2
+_FIRST_LINE = f"{_FORMAT} {{version}} sha256 {{digest}}\n"
+_PLACEHOLDER_DIGEST = "0" * hashlib.sha256().digest_size * 2
 
-_BLOCK = 1 << 20
+_BLOCK_SIZE = 1 << 20
 
-_DAMAGE = (UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, TypeError, AttributeError, MemoryError)
-"""What an archive and the objects in it raise when they are not what they should be."""
+_DAMAGE_ERRORS = (
+    *(UnpicklingError, RuntimeError, EOFError, ValueError),
+    *(LookupError, TypeError, AttributeError, MemoryError),
+)
+"""Exceptions that a damaged archive or damaged objects in it raise while loading."""
 
 
-def write_state(path: Path, about: Mapping[str, Any], state: object) -> None:
-    """Write a state whole or not at all; it stays also where the machine itself breaks down.
+def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:
+    """Write a state file atomically and durably: after a power failure the old or the new state is there.
 
     Args:
-        path: of the file.
-        about: plain values that `read_state` gives back with the state.
-        state: of tensors, containers and objects; objects that are shared in it are shared when it is read.
+        path: File to write.
+        metadata: Plain values that `read_state` returns next to the state.
+        state: Tensors, containers and objects; objects that are shared stay shared after loading.
 
     Raises:
-        OutputError: when the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_HEADER.format(version=_VERSION, digest=_NO_DIGEST).encode())
-        hashed = _Hashed(file)
-        hashed.write(json.dumps({"v3d-torch": version("v3d-torch"), **about}).encode() + b"\n")
-        torch.save(state, cast("IO[bytes]", hashed))  # it asks for no more than to write
-        hashed.finish()
+        file.write(_FIRST_LINE.format(version=_VERSION, digest=_PLACEHOLDER_DIGEST).encode())
+        hashed = _HashingWriter(file)
+        hashed.write(json.dumps({"v3d-torch": version("v3d-torch"), **metadata}).encode() + b"\n")
+        torch.save(state, cast("IO[bytes]", hashed))  # torch.save only calls write and flush
+        hashed.raise_error()
         file.seek(0)
-        file.write(_HEADER.format(version=_VERSION, digest=hashed.digest).encode())
+        file.write(_FIRST_LINE.format(version=_VERSION, digest=hashed.digest).encode())
         file.flush()
-        os.fsync(file.fileno())  # or a loss of power after the renaming leaves neither this state nor the one before
+        os.fsync(file.fileno())  # the rename can reach the disk before the content otherwise
 
 
 def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any]:
-    """Read a state.
+    """Read a state file.
 
     Args:
-        path: of a file that `write_state` wrote.
-        classes: that objects in it may have, beside tensors and Python's plain ones.
+        path: File that `write_state` wrote.
+        classes: Classes of the objects in the state, except tensors and Python's plain types.
 
     Returns:
-        What was said about it, and the state.
+        The metadata and the state.
 
     Raises:
-        InputError: the file is not there, no state, damaged, or of another version of this program.
+        InputError: If the file is missing, damaged, not a state file, or written by another version of this program.
     """
     try:
         with path.open("rb") as file:
-            _check(path, file)
-            about = json.loads(file.readline())
-            if about["v3d-torch"] != version("v3d-torch"):
+            _verify(path, file)
+            metadata = json.loads(file.readline())
+            if metadata["v3d-torch"] != version("v3d-torch"):
                 raise InputError(
-                    f"{path}: was written by v3d-torch {about['v3d-torch']}, and this is {version('v3d-torch')}; go on"
-                    " with that version, or begin anew"
+                    f"{path}: was written by v3d-torch {metadata['v3d-torch']}, this is {version('v3d-torch')}; continue"
+                    " with that version, or start a new run"
                 )
             with torch.serialization.safe_globals(list(classes)):
-                return about, torch.load(file, weights_only=True)
+                return metadata, torch.load(file, weights_only=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check who may read it") from error
-    except _DAMAGE as error:
-        raise _damaged(path) from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check that you may read it") from error
+    except _DAMAGE_ERRORS as error:
+        raise _damage_error(path) from error
 
 
-def _check(path: Path, file: IO[bytes]) -> None:
-    """Raise InputError unless the rest of a file is as it was written; leave the file behind its first line."""
+def _verify(path: Path, file: IO[bytes]) -> None:
+    """Check format, version and checksum; leave the file positioned after its first line."""
     match = re.fullmatch(rf"{_FORMAT} (\d+) sha256 ([0-9a-f]{{64}})\n", file.readline(200).decode("ascii", "replace"))
     if match is None:
-        raise _damaged(path)
+        raise _damage_error(path)
     if int(match[1]) != _VERSION:
         raise InputError(
-            f"{path}: is a state in version {match[1]} of its format, of which this program knows version {_VERSION};"
-            " go on with the program that wrote it, or begin anew"
+            f"{path}: has state format {match[1]}, this program reads format {_VERSION}; continue with the program"
+            " that wrote it, or start a new run"
         )
-    begin, digest = file.tell(), hashlib.sha256()
-    while block := file.read(_BLOCK):
+    start, digest = file.tell(), hashlib.sha256()
+    while block := file.read(_BLOCK_SIZE):
         digest.update(block)
     if digest.hexdigest() != match[2]:
-        raise _damaged(path)
-    file.seek(begin)
+        raise _damage_error(path)
+    file.seek(start)
 
 
-def _damaged(path: Path) -> InputError:
-    return InputError(f"{path}: is no state of a run, or a damaged one; begin anew")
+def _damage_error(path: Path) -> InputError:
+    return InputError(f"{path}: is damaged or not a state of a run; start a new run")
 
 
-class _Hashed:
-    """Passes on what is written, and adds up its checksum.
+class _HashingWriter:
+    """Writable file object that passes data on and computes its checksum.
 
-    What is raised meanwhile is kept until `finish`: torch's archives make a RuntimeError of it that says nothing.
+    An error while writing is stored until `raise_error`, because torch replaces errors of its output file by a
+    RuntimeError without the cause.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -119,24 +123,24 @@ class _Hashed:
         self._error: BaseException | None = None
 
     def write(self, content: bytes) -> int:
-        """Write all of it, or take no notice."""
+        """Write all of the content; do nothing after an error."""
         if self._error is None:
             try:
                 self._file.write(content)
                 self._digest.update(content)
-            except BaseException as error:  # Ctrl-C among them
+            except BaseException as error:  # also KeyboardInterrupt
                 self._error = error
         return len(content)
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: this object has no buffer."""
 
-    def finish(self) -> None:
-        """Raise the first error that there was."""
+    def raise_error(self) -> None:
+        """Raise the first error that occurred while writing, if any."""
         if self._error is not None:
             raise self._error
 
     @property
     def digest(self) -> str:
-        """Of all that was written."""
+        """SHA-256 checksum of all content written so far, hexadecimal."""
         return self._digest.hexdigest()

@@ -1,4 +1,4 @@
-"""Timestamps: parsing, and association of two clocks."""
+"""Timestamps: parsing, and association of two lists."""
 
 from __future__ import annotations
 
@@ -6,43 +6,51 @@ from collections.abc import Sequence
 
 import numpy as np
 
+_UNITS_SINCE_1970 = ((1e18, 1e9), (1e15, 1e6), (1e12, 1e3))
+"""Smallest value of nanosecond, microsecond and millisecond counts since 1970, and their units per second.
 
-def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
-    """Pair two sorted lists of stamps one to one, the nearest first, as the TUM benchmark's ``associate.py`` does.
+As seconds since 1970, all these values are more than thirty thousand years ahead.
+"""
+
+
+def parse_timestamp(text: str) -> float:
+    """Parse a timestamp.
 
     Args:
-        first: seconds, increasing.
-        second: seconds, increasing.
-        max_difference: farther stamps are no pair, seconds.
+        text: Seconds since any origin, or milliseconds, microseconds or nanoseconds since 1970.
 
     Returns:
-        (index in ``first``, index in ``second``), in order of the former.
+        Timestamp, seconds.
+
+    Raises:
+        ValueError: If the text is not a number.
+    """
+    value = float(text)
+    return next((value / units for min_value, units in _UNITS_SINCE_1970 if value >= min_value), value)
+
+
+def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
+    """Pair two lists of timestamps one to one, nearest pairs first, as the TUM benchmark's ``associate.py`` does.
+
+    Args:
+        first: Timestamps, seconds, increasing.
+        second: Timestamps, seconds, increasing.
+        max_difference: Largest difference of a pair, seconds.
+
+    Returns:
+        Pairs (index in ``first``, index in ``second``), sorted by the first index.
     """
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     start = np.searchsorted(b, a - max_difference, side="left")
     count = np.searchsorted(b, a + max_difference, side="right") - start
+    # All candidate pairs (i, j): each i with count[i] consecutive j from start[i] on.
     i = np.repeat(np.arange(len(a)), count)
     j = np.arange(len(i)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(start, count)
     nearest_first = np.lexsort((j, i, np.abs(a[i] - b[j])))
-    partner: dict[int, int] = {}
-    taken: set[int] = set()
-    for here, there in zip(i[nearest_first].tolist(), j[nearest_first].tolist(), strict=True):
-        if here not in partner and there not in taken:
-            partner[here] = there
-            taken.add(there)
-    return sorted(partner.items())
-
-
-_CLOCKS = ((1e18, 1e9), (1e15, 1e6), (1e12, 1e3))
-"""Counts since 1970 from here on are nanoseconds, microseconds, milliseconds; and their units a second. As seconds they
-would lie thirty thousand years ahead."""
-
-
-def parse_timestamp(written: str) -> float:
-    """A stamp in seconds, from seconds of any origin, or from milli-, micro- or nanoseconds since 1970.
-
-    Raises:
-        ValueError: what is written is no number.
-    """
-    value = float(written)
-    return next((value / units for least, units in _CLOCKS if value >= least), value)
+    second_of: dict[int, int] = {}
+    used_second: set[int] = set()
+    for index_first, index_second in zip(i[nearest_first].tolist(), j[nearest_first].tolist(), strict=True):
+        if index_first not in second_of and index_second not in used_second:
+            second_of[index_first] = index_second
+            used_second.add(index_second)
+    return sorted(second_of.items())

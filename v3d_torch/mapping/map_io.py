@@ -21,7 +21,8 @@ import torch
 from v3d_torch.config import Config
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.io.files import StrPath, atomic_write
+from v3d_torch.io.files import atomic_write
+from v3d_torch.io.paths import StrPath
 from v3d_torch.mapping.map_columns import fill_from_columns, find_inconsistency, to_columns
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews

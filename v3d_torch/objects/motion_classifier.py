@@ -26,7 +26,7 @@ from v3d_torch.objects.motion_evidence import (
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.track import Track
-from v3d_torch.segmentation.coco import LIVING, PERSON, THINGS
+from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import Instances
 
 _STATIC_FRACTION = 0.1
@@ -162,7 +162,7 @@ class MotionClassifier:
             return MotionState.STATIC
         # Gaits pause, but a rigid thing that is at rest over all known baselines has stopped.
         known = [rest for rest, fraction in zip(at_rest, appeared, strict=True) if not isnan(fraction)]
-        if track.label in THINGS and known and all(known):
+        if track.label in RIGID and known and all(known):
             return MotionState.STATIC
         if self._is_held_dynamic(track, stamp):
             return MotionState.DYNAMIC

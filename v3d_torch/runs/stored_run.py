@@ -17,7 +17,7 @@ from v3d_torch.config.validation import first_error
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import Evaluation, evaluate
-from v3d_torch.io.files import read_text
+from v3d_torch.io.text import read_text
 from v3d_torch.types import TrackingStatus, Trajectory
 
 _METRICS = "metrics.json"

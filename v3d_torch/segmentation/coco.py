@@ -24,7 +24,7 @@ UNLABELLED = -1
 LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
 """Class indices of people and animals, which deform by themselves."""
 
-THINGS = frozenset(range(len(COCO_NAMES))) - LIVING
+RIGID = frozenset(range(len(COCO_NAMES))) - LIVING
 """Class indices of all other objects, which are rigid: they move as a whole or not at all. `UNLABELLED` is in neither
 set, because an unlabelled object can be a person."""
 

@@ -109,8 +109,8 @@ CASES = [
             "file outside the folder, by ..",
             archive(member("../outside.txt")),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
@@ -125,47 +125,47 @@ CASES = [
             "symlink to outside the folder",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "../../..")),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "symlink to an absolute path",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "/etc")),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "hard link to outside the folder",
             archive(member(f"{NAME}/x", tarfile.LNKTYPE, "../../etc/passwd")),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "device file",
             archive(member(f"{NAME}/zero", tarfile.CHRTYPE)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "named pipe",
             archive(member(f"{NAME}/rgb.pipe", tarfile.FIFOTYPE)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, a member leads outside or is"
-                " no plain file (...); get it from another source"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
+                " not a plain file (...); get it from another source"
             ),
         ),
         (
             "member with a size of a petabyte",
             archive(claims(10**15)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is refused, it unpacks to more than"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, it extracts to more than"
                 " 21474836480 bytes; get it from another source"
             ),
         ),
@@ -173,7 +173,7 @@ CASES = [
             "header of 64 megabytes",
             archive(long_name(1 << 26)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (a header of"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (a header of"
                 " 67108864 bytes); download it again"
             ),
         ),
@@ -181,7 +181,7 @@ CASES = [
             "truncated gzip",
             all_of(archive(), changed(first_half)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -189,7 +189,7 @@ CASES = [
             "truncated xz",
             all_of(archive(kind="w:xz"), changed(first_half)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -197,7 +197,7 @@ CASES = [
             "truncated bzip2",
             all_of(archive(kind="w:bz2"), changed(first_half)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -205,7 +205,7 @@ CASES = [
             "wrong byte in gzip",
             all_of(archive(), changed(flip_byte)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -213,7 +213,7 @@ CASES = [
             "wrong byte in xz",
             all_of(archive(kind="w:xz"), changed(flip_byte)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -221,7 +221,7 @@ CASES = [
             "wrong byte in bzip2",
             all_of(archive(kind="w:bz2"), changed(flip_byte)),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -229,7 +229,7 @@ CASES = [
             "empty file",
             content_of(b""),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -237,7 +237,7 @@ CASES = [
             "web page",
             content_of(b"<html>404</html>" * 100),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),
@@ -245,7 +245,7 @@ CASES = [
             "gzip of an empty file",
             content_of(gzip.compress(b"")),
             Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a whole tar archive (...); download"
+                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
                 " it again"
             ),
         ),

@@ -238,7 +238,7 @@ CASES = [
     Case(
         "Latin-1",
         edit(YAML, lambda content: b"# Gr\xf6\xdfe\n" + content),
-        Fails("{seq}/camera.yaml: is not a text file in UTF-8; convert it to that, a camera is a YAML file or a K.txt"),
+        Fails("{seq}/camera.yaml: is not a UTF-8 text file; convert it to UTF-8 (a camera is a YAML file or a K.txt)"),
     ),
     Case(
         "byte order mark and Windows line endings",
@@ -352,8 +352,8 @@ CASES = [
         "--camera is an image",
         add_options("--camera", "{seq}/rgb/1305031102.000000.png"),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: is not a text file in UTF-8; convert it to that, a camera is"
-            " a YAML file or a K.txt"
+            "{seq}/rgb/1305031102.000000.png: is not a UTF-8 text file; convert it to UTF-8 (a camera is"
+            " a YAML file or a K.txt)"
         ),
     ),
     Case(

@@ -35,8 +35,8 @@ CASES = [
         "an image",
         add_options("--config", "{seq}/rgb/1305031102.000000.png"),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: is not a text file in UTF-8; convert it to that, a"
-            " configuration is a YAML file"
+            "{seq}/rgb/1305031102.000000.png: is not a UTF-8 text file; convert it to UTF-8 (a"
+            " configuration is a YAML file)"
         ),
     ),
     Case(
@@ -59,7 +59,7 @@ CASES = [
     Case(
         "UTF-16",
         config("seed: 1\n".encode("utf-16")),
-        Fails("{seq}/own.yaml: is not a text file in UTF-8; convert it to that, a configuration is a YAML file"),
+        Fails("{seq}/own.yaml: is not a UTF-8 text file; convert it to UTF-8 (a configuration is a YAML file)"),
     ),
     Case("broken YAML", config("objects: {voting\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")),
     Case("tabs", config("objects:\n\tvoting: 1\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")),

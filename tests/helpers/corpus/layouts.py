@@ -203,9 +203,7 @@ CASES = [
     Case(
         "OpenLORIS, camera file of random bytes",
         openloris(NOISE),
-        Fails(
-            "{seq}/sensors.yaml: is not a text file in UTF-8; convert it to that, it contains YAML written by OpenCV"
-        ),
+        Fails("{seq}/sensors.yaml: is not a UTF-8 text file; convert it to UTF-8 (it contains YAML written by OpenCV)"),
     ),
     Case(
         "images without timestamps",

@@ -256,24 +256,24 @@ CASES = [
         "list in Latin-1",
         edit("rgb.txt", lambda content: b"# Gr\xfc\xdfe\n" + content),
         Fails(
-            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
-            " name on each line"
+            "{seq}/rgb.txt: is not a UTF-8 text file; convert it to UTF-8 (a list has a timestamp and a file"
+            " name on each line)"
         ),
     ),
     Case(
         "list in UTF-16",
         edit("rgb.txt", lambda content: content.decode().encode("utf-16")),
         Fails(
-            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
-            " name on each line"
+            "{seq}/rgb.txt: is not a UTF-8 text file; convert it to UTF-8 (a list has a timestamp and a file"
+            " name on each line)"
         ),
     ),
     Case(
         "image instead of a list",
         lambda place: (place.folder / FIRST).rename(place.folder / "rgb.txt"),
         Fails(
-            "{seq}/rgb.txt: is not a text file in UTF-8; convert it to that, a list has a timestamp and a file"
-            " name on each line"
+            "{seq}/rgb.txt: is not a UTF-8 text file; convert it to UTF-8 (a list has a timestamp and a file"
+            " name on each line)"
         ),
     ),
     Case("associations", associated("T C T D"), Succeeds()),

@@ -204,7 +204,7 @@ CASES = [
     Case(
         "a list that may not be read",
         unreadable("rgb.txt"),
-        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and who may read it"),
+        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and that you may read it"),
         lambda place: without_root_rights(),
     ),
     Case(
@@ -232,15 +232,17 @@ CASES = [
     Case(
         "a camera that may not be read",
         unreadable("camera.yaml"),
-        Fails("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and who may read it"),
+        Fails(
+            "{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and that you may read it"
+        ),
         lambda place: without_root_rights(),
     ),
     Case(
         "a ground truth that may not be read",
         unreadable("groundtruth.txt"),
         Fails(
-            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and who may"
-            " read it (the results are in {out})",
+            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and that you"
+            " may read it (the results are in {out})",
             saved_poses=8,
         ),
         lambda place: without_root_rights(),

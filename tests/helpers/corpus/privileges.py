@@ -1,4 +1,4 @@
-"""The rights of a common user, also where the tests run as root: who may read every file tests no permissions."""
+"""File permissions that hold also if the tests run as root, which could read every file otherwise."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_VERSION = 0x20080522
-_OVERRIDE = 1 << 1 | 1 << 2
+_CAPABILITY_VERSION = 0x20080522
+"""_LINUX_CAPABILITY_VERSION_3 (capget(2))."""
+_BYPASS_PERMISSIONS = 1 << 1 | 1 << 2
 """CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH (capabilities(7))."""
 
 
 @contextmanager
 def without_root_rights() -> Iterator[None]:
-    """Let permissions of files hold for this thread, even as root of Linux."""
+    """Enforce file permissions in this thread, even for root on Linux."""
     if not sys.platform.startswith("linux") or os.geteuid() != 0:
         yield
         return
     libc = ctypes.CDLL(None, use_errno=True)
-    header = struct.pack("Ii", _VERSION, 0)
-    rights = ctypes.create_string_buffer(24)
-    assert libc.capget(header, rights) == 0
-    effective, *others = struct.unpack("6I", rights.raw)
-    assert libc.capset(header, struct.pack("6I", effective & ~_OVERRIDE, *others)) == 0
+    header = struct.pack("Ii", _CAPABILITY_VERSION, 0)
+    capabilities = ctypes.create_string_buffer(24)
+    assert libc.capget(header, capabilities) == 0
+    effective, *others = struct.unpack("6I", capabilities.raw)
+    assert libc.capset(header, struct.pack("6I", effective & ~_BYPASS_PERMISSIONS, *others)) == 0
     try:
         yield
     finally:
-        assert libc.capset(header, rights.raw) == 0
+        assert libc.capset(header, capabilities.raw) == 0

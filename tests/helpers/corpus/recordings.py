@@ -1,4 +1,4 @@
-"""Bags of ROS 1, ROS 2 and mcap."""
+"""Cases with bags of ROS 1, ROS 2 and mcap."""
 
 from __future__ import annotations
 
@@ -20,27 +20,29 @@ Change = Callable[[Messages, list[Message]], list[Message]]
 
 
 def bag(kind: Kind, change: Change | None = None) -> Damage:
-    """The sequence as a bag, its messages changed; of a ROS 2 bag the file, beside which its metadata stay."""
+    """Write the sequence as a bag with changed messages; of a ROS 2 bag, give its file next to metadata.yaml."""
 
     def make(place: Workspace) -> None:
-        to = Messages(kind)
-        messages: list[Message] = [(INFO, 10.0, to.info(WIDTH, HEIGHT, K, [], P))]
+        make_message = Messages(kind)
+        messages: list[Message] = [(INFO, 10.0, make_message.info(WIDTH, HEIGHT, K, [], P))]
         for i in range(FRAMES):
             stamp = 10 + i / 10
-            messages.append((RGB, stamp, to.image(stamp, "bgr8", colour(*camera_position(i)))))
-            messages.append((DEPTH, stamp, to.image(stamp, "16UC1", MILLIMETRES)))
-        path = to.write(place.root / "take", change(to, messages) if change is not None else messages)
+            messages.append((RGB, stamp, make_message.image(stamp, "bgr8", colour(*camera_position(i)))))
+            messages.append((DEPTH, stamp, make_message.image(stamp, "16UC1", MILLIMETRES)))
+        path = make_message.write(
+            place.root / "take", change(make_message, messages) if change is not None else messages
+        )
         place.seq = str(path if kind == "bag" else next(path.glob(f"*.{kind}")))
 
     return make
 
 
-def without(topic: str) -> Change:
+def remove_topic(topic: str) -> Change:
     return lambda to, messages: [message for message in messages if message[0] != topic]
 
 
-def with_all(topic: str, content: Callable[[Messages, float], object]) -> Change:
-    """Other messages on a topic."""
+def replace_messages(topic: str, content: Callable[[Messages, float], object]) -> Change:
+    """Replace all messages on a topic."""
 
     def change(to: Messages, messages: list[Message]) -> list[Message]:
         return [(name, at, content(to, at) if name == topic else message) for name, at, message in messages]
@@ -48,31 +50,31 @@ def with_all(topic: str, content: Callable[[Messages, float], object]) -> Change
     return change
 
 
-def camera(k: list[float], d: tuple[float, ...] = (), model: str = "plumb_bob") -> Change:
-    return with_all(INFO, lambda to, at: to.info(WIDTH, HEIGHT, k, list(d), P, model))
+def replace_camera(k: list[float], d: tuple[float, ...] = (), model: str = "plumb_bob") -> Change:
+    return replace_messages(INFO, lambda to, at: to.info(WIDTH, HEIGHT, k, list(d), P, model))
 
 
-def too_high(to: Messages, at: float) -> object:
+def image_shorter_than_its_height(to: Messages, at: float) -> object:
     message = to.image(at, "bgr8", colour(0))
     message.height = 10**6
     return message
 
 
-def without_size(to: Messages, at: float) -> object:
+def image_without_pixels(to: Messages, at: float) -> object:
     message = to.image(at, "bgr8", colour(0))
     message.height = message.width = message.step = 0
     message.data = np.zeros(0, np.uint8)
     return message
 
 
-def with_holes(to: Messages, at: float) -> object:
+def depth_with_nan(to: Messages, at: float) -> object:
     metres = (depth() / 5000).astype(np.float32)
     metres[:, ::8] = np.nan
     return to.image(at, "32FC1", metres)
 
 
-def cut(change: Callable[[bytes], bytes]) -> Damage:
-    """Change the bytes of the bag."""
+def change_bytes(change: Callable[[bytes], bytes]) -> Damage:
+    """Change the bytes of the bag file."""
 
     def make(place: Workspace) -> None:
         path = Path(place.seq)
@@ -82,211 +84,211 @@ def cut(change: Callable[[bytes], bytes]) -> Damage:
 
 
 def noise(name: str) -> Damage:
-    """A file of noise under a name, given as the sequence."""
+    """Write a file of random bytes and give it as the sequence."""
     return all_of(lambda place: (place.root / name).write_bytes(NOISE), set_sequence("{root}/" + name))
 
 
-def other_database(place: Workspace) -> None:
+def unrelated_database(place: Workspace) -> None:
     with sqlite3.connect(place.root / "notes.db3") as database:
         database.execute("CREATE TABLE notes (text TEXT)")
     database.close()
 
 
-def without_metadata(place: Workspace) -> None:
+def damaged_metadata(place: Workspace) -> None:
     (place.root / "take" / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
 
 
 CASES = [
-    Case("bag of ROS 1", bag("bag"), Succeeds(max_ate=None)),
-    Case("bag of ROS 2", bag("db3"), Succeeds(max_ate=None)),
-    Case("mcap", bag("mcap"), Succeeds(max_ate=None)),
+    Case("valid ROS 1 bag", bag("bag"), Succeeds(max_ate=None)),
+    Case("valid ROS 2 bag", bag("db3"), Succeeds(max_ate=None)),
+    Case("valid mcap", bag("mcap"), Succeeds(max_ate=None)),
     Case(
-        "ROS 1 breaks off",
-        all_of(bag("bag"), cut(first_half)),
-        Fails("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        "truncated ROS 1 bag",
+        all_of(bag("bag"), change_bytes(first_half)),
+        Fails("{root}/take.bag: is damaged or not a bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
-        "ROS 2 breaks off",
-        all_of(bag("db3"), cut(first_half)),
-        Fails("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        "truncated ROS 2 bag",
+        all_of(bag("db3"), change_bytes(first_half)),
+        Fails("{root}/take/take.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
-        "mcap breaks off",
-        all_of(bag("mcap"), cut(first_half)),
-        Fails("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        "truncated mcap",
+        all_of(bag("mcap"), change_bytes(first_half)),
+        Fails("{root}/take/take.mcap: is damaged or not a bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
-        "ROS 1 is empty",
-        all_of(bag("bag"), cut(lambda content: b"")),
-        Fails("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        "empty ROS 1 bag",
+        all_of(bag("bag"), change_bytes(lambda content: b"")),
+        Fails("{root}/take.bag: is damaged or not a bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
-        "ROS 2 is empty",
-        all_of(bag("db3"), cut(lambda content: b"")),
-        Fails("{root}/take/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        "empty ROS 2 bag",
+        all_of(bag("db3"), change_bytes(lambda content: b"")),
+        Fails("{root}/take/take.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
-        "mcap is empty",
-        all_of(bag("mcap"), cut(lambda content: b"")),
-        Fails("{root}/take/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        "empty mcap",
+        all_of(bag("mcap"), change_bytes(lambda content: b"")),
+        Fails("{root}/take/take.mcap: is damaged or not a bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
-        "ROS 1 is noise",
+        "random bytes as a ROS 1 bag",
         noise("take.bag"),
-        Fails("{root}/take.bag: is no whole bag (...); copy it again, or repair it with rosbag reindex"),
+        Fails("{root}/take.bag: is damaged or not a bag (...); copy it again, or repair it with rosbag reindex"),
     ),
     Case(
-        "ROS 2 is noise",
+        "random bytes as a ROS 2 bag",
         noise("take.db3"),
-        Fails("{root}/take.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        Fails("{root}/take.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
-        "mcap is noise",
+        "random bytes as an mcap",
         noise("take.mcap"),
-        Fails("{root}/take.mcap: is no whole bag (...); copy it again, or repair it with mcap recover"),
+        Fails("{root}/take.mcap: is damaged or not a bag (...); copy it again, or repair it with mcap recover"),
     ),
     Case(
-        "another database",
-        all_of(other_database, set_sequence("{root}/notes.db3")),
-        Fails("{root}/notes.db3: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        "unrelated SQLite database",
+        all_of(unrelated_database, set_sequence("{root}/notes.db3")),
+        Fails("{root}/notes.db3: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
-        "a ROS 2 folder whose metadata are broken",
-        all_of(bag("db3"), without_metadata, set_sequence("{root}/take")),
-        Fails("{root}/take: is no whole bag (...); copy it again, or repair it with ros2 bag reindex"),
+        "ROS 2 folder with damaged metadata",
+        all_of(bag("db3"), damaged_metadata, set_sequence("{root}/take")),
+        Fails("{root}/take: is damaged or not a bag (...); copy it again, or repair it with ros2 bag reindex"),
     ),
     Case(
         "no camera",
-        bag("mcap", without(INFO)),
+        bag("mcap", remove_topic(INFO)),
         Fails(
-            "{root}/take/take.mcap: has no camera beside /camera/color/image_raw; name it with"
-            " --info-topic, or give --camera"
+            "{root}/take/take.mcap: has no CameraInfo topic for /camera/color/image_raw; name it"
+            " with --info-topic, or give --camera"
         ),
     ),
     Case(
         "no depth",
-        bag("bag", without(DEPTH)),
+        bag("bag", remove_topic(DEPTH)),
         Fails(
-            "{root}/take.bag: no topic has the name of depth images; give --depth-topic one of /camera/color/image_raw"
+            "{root}/take.bag: no topic is named like depth images; set --depth-topic to one of /camera/color/image_raw"
         ),
     ),
     Case(
         "no colour",
-        bag("mcap", without(RGB)),
+        bag("mcap", remove_topic(RGB)),
         Fails(
-            "{root}/take/take.mcap: no topic has the name of colour images; give --rgb-topic one of"
+            "{root}/take/take.mcap: no topic is named like colour images; set --rgb-topic to one of"
             " /camera/aligned_depth_to_color/image_raw"
         ),
     ),
     Case(
         "no images",
         bag("bag", lambda to, messages: messages[:1]),
-        Fails("{root}/take.bag: holds no images; record the topics of colour, of depth and of their camera"),
+        Fails("{root}/take.bag: contains no images; record the colour, depth and CameraInfo topics"),
     ),
     Case(
-        "two clocks",
-        bag("db3", with_all(DEPTH, lambda to, at: to.image(at + 100, "16UC1", MILLIMETRES))),
+        "no common stamps",
+        bag("db3", replace_messages(DEPTH, lambda to, at: to.image(at + 100, "16UC1", MILLIMETRES))),
         Fails(
-            "{root}/take/take.db3: no image on /camera/color/image_raw lies within 0.02 s of one on"
-            " /camera/aligned_depth_to_color/image_raw; choose others with --rgb-topic and --depth-topic"
+            "{root}/take/take.db3: no image on /camera/color/image_raw is within 0.02 s of an image on"
+            " /camera/aligned_depth_to_color/image_raw; choose other topics with --rgb-topic and --depth-topic"
         ),
     ),
     Case(
-        "depth of 8 bits",
-        bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "mono8", colour(0)[..., 0]))),
+        "8-bit depth",
+        bag("mcap", replace_messages(DEPTH, lambda to, at: to.image(at, "mono8", colour(0)[..., 0]))),
         Fails(
             "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: holds mono8 images, not"
-            " depth; name another with --depth-topic"
+            " depth; choose another topic with --depth-topic"
         ),
     ),
     Case(
-        "depth for colour",
-        bag("mcap", with_all(RGB, lambda to, at: to.image(at, "16UC1", MILLIMETRES))),
+        "depth on the colour topic",
+        bag("mcap", replace_messages(RGB, lambda to, at: to.image(at, "16UC1", MILLIMETRES))),
         Fails(
-            "{root}/take/take.mcap: /camera/color/image_raw: holds 16UC1 images, not colour; name another"
-            " with --rgb-topic, or have them converted to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
+            "{root}/take/take.mcap: /camera/color/image_raw: holds 16UC1 images, not colour; choose another"
+            " topic with --rgb-topic, or convert the images to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
             " 8UC1, bayer_rggb8, bayer_bggr8, bayer_gbrg8, bayer_grbg8, yuv422, uyvy, yuv422_yuy2, yuyv"
         ),
     ),
     Case(
         "depth of another size",
-        bag("mcap", with_all(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
+        bag("mcap", replace_messages(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
         Fails(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, but its colour"
-            " image has 80x60; name depth that is registered to colour with --depth-topic"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, its colour"
+            " image 80x60; choose depth registered to colour with --depth-topic"
         ),
     ),
-    Case("depth with NaN", bag("mcap", with_all(DEPTH, with_holes)), Succeeds(max_ate=None)),
+    Case("depth with NaN", bag("mcap", replace_messages(DEPTH, depth_with_nan)), Succeeds(max_ate=None)),
     Case(
-        "images shorter than they say",
-        bag("mcap", with_all(RGB, too_high)),
+        "images with too little data",
+        bag("mcap", replace_messages(RGB, image_shorter_than_its_height)),
         Fails(
             "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 80x1000000"
-            " pixels need; record it again"
+            " pixels need; record the bag again"
         ),
     ),
     Case(
         "images without pixels",
-        bag("mcap", with_all(RGB, without_size)),
-        Fails("{root}/take/take.mcap: /camera/color/image_raw: an image has no pixels; record it again"),
+        bag("mcap", replace_messages(RGB, image_without_pixels)),
+        Fails("{root}/take/take.mcap: /camera/color/image_raw: an image has no pixels; record the bag again"),
     ),
     Case(
-        "an unknown encoding",
-        bag("mcap", with_all(RGB, lambda to, at: to.image(at, "rgb10", colour(0)))),
+        "unsupported encoding",
+        bag("mcap", replace_messages(RGB, lambda to, at: to.image(at, "rgb10", colour(0)))),
         Fails(
-            "{root}/take/take.mcap: /camera/color/image_raw: holds rgb10 images, not colour; name another"
-            " with --rgb-topic, or have them converted to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
+            "{root}/take/take.mcap: /camera/color/image_raw: holds rgb10 images, not colour; choose another"
+            " topic with --rgb-topic, or convert the images to one of rgb8, 8UC3, bgr8, rgba8, bgra8, mono8, y8,"
             " 8UC1, bayer_rggb8, bayer_bggr8, bayer_gbrg8, bayer_grbg8, yuv422, uyvy, yuv422_yuy2, yuyv"
         ),
     ),
     Case(
-        "broken JPEG",
-        bag("mcap", with_all(RGB, lambda to, at: to.compressed(at, "jpeg", b"\xff\xd8\xff" + NOISE))),
-        Fails("{root}/take/take.mcap: /camera/color/image_raw: is truncated or damaged; copy or download it again"),
+        "damaged JPEG",
+        bag("mcap", replace_messages(RGB, lambda to, at: to.compressed(at, "jpeg", b"\xff\xd8\xff" + NOISE))),
+        Fails("{root}/take/take.mcap: /camera/color/image_raw: is truncated or broken; copy or download it again"),
     ),
     Case(
-        "compressed depth breaks off",
-        bag("mcap", with_all(DEPTH, lambda to, at: to.compressed(at, "16UC1; compressedDepth", b"1234"))),
+        "truncated compressed depth",
+        bag("mcap", replace_messages(DEPTH, lambda to, at: to.compressed(at, "16UC1; compressedDepth", b"1234"))),
         Fails(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is not a PNG, JPEG or TIFF image;"
-            " copy or export it again"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is no image, or none of PNG,"
+            " JPEG or TIFF; copy or export it again"
         ),
     ),
     Case(
-        "a camera of NaN",
-        bag("mcap", camera([float("nan"), *K[1:]])),
+        "NaN in the camera",
+        bag("mcap", replace_camera([float("nan"), *K[1:]])),
         Fails(
             "{root}/take/take.mcap: /camera/color/camera_info: fx: input should be a finite number, got"
             " nan; correct the camera"
         ),
     ),
     Case(
-        "a camera that was never calibrated",
-        bag("mcap", camera(9 * [0.0])),
+        "uncalibrated camera",
+        bag("mcap", replace_camera(9 * [0.0])),
         Fails(
             "{root}/take/take.mcap: /camera/color/camera_info: fx: input should be greater than or equal to"
             " 1, got 0.0; correct the camera"
         ),
     ),
     Case(
-        "a fisheye lens",
-        bag("mcap", camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
+        "unsupported distortion model",
+        bag("mcap", replace_camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
         Fails(
-            "{root}/take/take.mcap: /camera/color/camera_info has a lens of the kind equidistant, which is"
-            " not known here; record rectified images, or give --camera with k1, k2, p1, p2, k3"
+            "{root}/take/take.mcap: /camera/color/camera_info has the unsupported distortion model"
+            " equidistant; record rectified images, or give --camera with k1, k2, p1, p2, k3"
         ),
     ),
     Case(
-        "a topic that is not there",
+        "missing topic",
         all_of(bag("mcap"), add_options("--depth-topic", "/depth")),
         Fails(
-            "{root}/take/take.mcap: has no images on /depth; give --depth-topic one of"
+            "{root}/take/take.mcap: has no images on /depth; set --depth-topic to one of"
             " /camera/aligned_depth_to_color/image_raw, /camera/color/image_raw"
         ),
     ),
     Case(
-        "--fps",
+        "--fps for a bag",
         all_of(bag("mcap"), add_options("--fps", "30")),
-        Fails("{root}/take/take.mcap: is a bag, which does not support --fps; remove this option"),
+        Fails("{root}/take/take.mcap: is a bag, --fps means nothing to it; leave it out"),
     ),
 ]

@@ -1,4 +1,4 @@
-"""Pairs of videos."""
+"""Cases with pairs of a colour video and a depth video."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_op
 
 
 def save(path: Path, images: list[NDArray[np.generic]]) -> None:
-    """Without loss, at 10 frames a second, in 16 bits where the images have so many."""
+    """Write a lossless video at 10 Hz, with the bit depth of the images."""
     first = images[0]
     bits = cv2.CV_16U if first.dtype == np.uint16 else cv2.CV_8U
-    kind = [cv2.VIDEOWRITER_PROP_DEPTH, bits, cv2.VIDEOWRITER_PROP_IS_COLOR, int(first.ndim == 3)]
+    writer_options = [cv2.VIDEOWRITER_PROP_DEPTH, bits, cv2.VIDEOWRITER_PROP_IS_COLOR, int(first.ndim == 3)]
     size = (first.shape[1], first.shape[0])
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size, kind)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size, writer_options)
     for image in images:
         writer.write(image)
     writer.release()
 
 
 def videos(place: Workspace) -> None:
-    """The sequence as a pair of videos."""
+    """Write the sequence as a pair of videos."""
     folder = place.root / "take"
     folder.mkdir()
     (folder / "camera.yaml").write_text(CAMERA)
@@ -35,7 +35,7 @@ def videos(place: Workspace) -> None:
     place.seq = str(folder)
 
 
-def changed(file: str, change: Callable[[bytes], bytes]) -> Damage:
+def change_bytes(file: str, change: Callable[[bytes], bytes]) -> Damage:
     def make(place: Workspace) -> None:
         videos(place)
         path = place.root / "take" / file
@@ -44,68 +44,68 @@ def changed(file: str, change: Callable[[bytes], bytes]) -> Damage:
     return make
 
 
-def with_video(file: str, image: NDArray[np.generic]) -> Damage:
+def replace_video(file: str, image: NDArray[np.generic]) -> Damage:
     return all_of(videos, lambda place: save(place.root / "take" / file, FRAMES * [image]))
 
 
 CASES = [
-    Case("colour and depth", videos, Succeeds(max_ate=None)),
+    Case("valid pair", videos, Succeeds(max_ate=None)),
     Case(
-        "colour breaks off",
-        changed("colour.mkv", first_half),
+        "truncated colour",
+        change_bytes("colour.mkv", first_half),
         Fails(
-            "{root}/take/colour.mkv: breaks off at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
+            "{root}/take/colour.mkv: is truncated at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
             " before are in {out}; go on with --resume {out})",
             saved_poses=3,
         ),
     ),
     Case(
-        "depth breaks off",
-        changed("depth.mkv", first_half),
-        Fails("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        "truncated depth",
+        change_bytes("depth.mkv", first_half),
+        Fails("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "depth breaks off at once",
-        changed("depth.mkv", lambda content: content[:300]),
-        Fails("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        "depth truncated in its header",
+        change_bytes("depth.mkv", lambda content: content[:300]),
+        Fails("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "noise",
-        changed("colour.mkv", lambda content: NOISE),
-        Fails("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        "random bytes",
+        change_bytes("colour.mkv", lambda content: NOISE),
+        Fails("{root}/take/colour.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "empty",
-        changed("depth.mkv", lambda content: b""),
-        Fails("{root}/take/depth.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        "empty file",
+        change_bytes("depth.mkv", lambda content: b""),
+        Fails("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "text",
-        changed("colour.mkv", lambda content: b"the video\n" * 100),
-        Fails("{root}/take/colour.mkv: is no video that can be decoded; copy it again, or convert it with ffmpeg"),
+        "text file",
+        change_bytes("colour.mkv", lambda content: b"the video\n" * 100),
+        Fails("{root}/take/colour.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
     ),
     Case(
-        "depth of 8 bits",
-        with_video("depth.mkv", colour(0)),
+        "8-bit depth",
+        replace_video("depth.mkv", colour(0)),
         Fails(
-            "{root}/take/depth.mkv: has not 16 bits of grey a pixel, as depth has; export it again with"
+            "{root}/take/depth.mkv: depth is not one channel of 16 bits; export it again with"
             " ffmpeg -c:v ffv1 -pix_fmt gray16le"
         ),
     ),
     Case(
         "depth of another size",
-        with_video("depth.mkv", depth()[::2, ::2].copy()),
+        replace_video("depth.mkv", depth()[::2, ::2].copy()),
         Fails(
-            "{root}/take/depth.mkv: has 40x30 pixels, but its colour image has 80x60; export depth that is"
-            " registered to the colour image"
+            "{root}/take/depth.mkv: has 40x30 pixels, its colour image 80x60; export the depth that is"
+            " registered to colour, pixel by pixel"
         ),
     ),
     Case(
-        "two of colour",
-        with_video("other.mkv", colour(0)),
+        "two colour videos",
+        replace_video("other.mkv", colour(0)),
         Fails(
-            "{root}/take: a colour and a depth video belong together, here are colour.mkv, other.mkv,"
-            " depth.mkv; name them such as take.mp4 and take_depth.mkv and give the first"
+            "{root}/take: expected one colour and one depth video, found colour.mkv, other.mkv,"
+            " depth.mkv; name them like take.mp4 and take_depth.mkv and give the first"
         ),
     ),
     Case(
@@ -122,13 +122,13 @@ CASES = [
         Fails("--fps 0: is out of range; pass between 0.01 and 10000 Hz"),
     ),
     Case(
-        "--fps that is no number",
+        "--fps nan",
         all_of(videos, add_options("--fps", "nan")),
-        Fails("--fps nan: is out of range; pass between 0.01 and 10000 Hz"),
+        Fails("--fps nan: give frames a second, between 0.01 and 10000"),
     ),
     Case(
-        "--fps without end",
+        "--fps inf",
         all_of(videos, add_options("--fps", "inf")),
-        Fails("--fps inf: is out of range; pass between 0.01 and 10000 Hz"),
+        Fails("--fps inf: give frames a second, between 0.01 and 10000"),
     ),
 ]

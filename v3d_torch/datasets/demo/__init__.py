@@ -1,4 +1,4 @@
-"""The built-in sequence: a furnished room, three people, a hand-held camera; made on first use, no download."""
+"""Built-in demo sequence: a hand-held camera in a furnished room with three people, rendered on first use."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from v3d_torch.errors import OutputError
 
 
 def ensure_demo(cache_dir: Path, progress: Progress | None = None) -> Path:
-    """The demo sequence, rendered once and kept.
+    """Return the folder of the demo sequence, rendering it if it is not in the cache.
 
-    The folder's name carries a hash of the code and the photographs it is made from, so that a newer version of either
-    never meets an older one's images.
+    The name of the folder contains a hash of the code and the photographs from which it is rendered, so that images of
+    another version are never used.
 
     Args:
-        cache_dir: where the sequence is kept; made if need be.
-        progress: called with (frames done, frames) while it is rendered.
+        cache_dir: Folder for the sequence; created if missing.
+        progress: Called with (frames done, number of frames) while the sequence is rendered.
 
     Returns:
-        A folder in TUM layout: ``rgb/*.jpg``, ``depth/*.png`` (16 bit, 5000 units per metre, 0 = none), ``rgb.txt``,
-        ``depth.txt``, ``associations.txt``, ``groundtruth.txt`` (camera-to-world), ``camera.yaml``, and
-        ``masks/*.png``: the truth of moving pixels (0 static, 1 the person who walks, 2 the one who sways).
+        Folder in TUM layout: ``rgb/*.jpg``, ``depth/*.png`` (16 bit, 5000 units per metre, 0 = no measurement),
+        ``rgb.txt``, ``depth.txt``, ``associations.txt``, ``groundtruth.txt`` (camera-to-world), ``camera.yaml``, and
+        ``masks/*.png`` with the true motion mask (0 = static, 1 = the walking person, 2 = the swaying person).
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputError: If the folder cannot be written.
     """
     sequence = cache_dir / f"demo-{_version()}"
     if sequence.is_dir():
@@ -40,13 +40,13 @@ def ensure_demo(cache_dir: Path, progress: Progress | None = None) -> Path:
             _publish(folder, sequence)
     except OSError as error:
         raise OutputError(
-            f"{cache_dir}: cannot keep the demo sequence there ({error}); free some space or name another cache folder."
+            f"{cache_dir}: cannot store the demo sequence ({error}); free the disk or set V3D_CACHE to another folder"
         ) from error
     return sequence
 
 
 def _publish(folder: Path, sequence: Path) -> None:
-    """Rename; where another process was faster, its sequence has the same bytes and stays."""
+    """Rename the rendered folder; if another process was faster, keep its sequence, which has the same bytes."""
     try:
         folder.rename(sequence)
     except OSError:
@@ -56,6 +56,7 @@ def _publish(folder: Path, sequence: Path) -> None:
 
 
 def _version() -> str:
+    """Hash of the code and the photographs of the demo."""
     here = Path(__file__).parent
     digest = hashlib.sha256()
     for path in [*sorted(here.glob("*.py")), *sorted((here.parent / "assets").iterdir())]:

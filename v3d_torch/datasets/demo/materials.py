@@ -1,7 +1,6 @@
-"""Procedural materials: seeded textures with corners at every scale, made of fractal noise and drawn shapes.
+"""Procedural textures of materials, made of fractal noise and drawn shapes, with corners at every scale.
 
-Every function returns float32 RGB in [0, 1], shape :math:`(H, W, 3)`. Sizes are in metres, ``density`` in texels per
-metre.
+All textures are RGB in [0, 1], float32, shape :math:`(H, W, 3)`. Sizes are in metres, densities in texels per metre.
 """
 
 from __future__ import annotations
@@ -15,21 +14,24 @@ Colour = tuple[float, float, float]
 
 
 def texels(metres: float, density: float) -> int:
-    """Number of texels that cover a length."""
+    """Return the number of texels that cover a length in metres, at least 8."""
     return max(8, round(metres * density))
 
 
 def fractal_noise(
     rng: np.random.Generator, height: int, width: int, cells: tuple[float, float] = (4.0, 4.0), octaves: int = 5
 ) -> NDArray[np.float32]:
-    """Sum of value noise over octaves (Perlin, 1985), zero mean, about unit range, shape :math:`(H, W)`.
+    """Generate fractal noise: a sum of octaves of value noise (Perlin, 1985) with zero mean and about unit range.
 
     Args:
-        rng: source of the noise.
-        height: rows.
-        width: columns.
-        cells: lattice cells of the coarsest octave over the height and over the width.
-        octaves: each has twice the frequency and half the amplitude of the one before.
+        rng: Random generator.
+        height: Number of rows.
+        width: Number of columns.
+        cells: Lattice cells of the coarsest octave along the height and the width.
+        octaves: Number of octaves; each doubles the frequency and halves the amplitude.
+
+    Returns:
+        Noise, float32, shape :math:`(H, W)`.
     """
     total = np.zeros((height, width), np.float32)
     for octave in range(octaves):
@@ -40,12 +42,12 @@ def fractal_noise(
 
 
 def tint(colour: Colour, value: NDArray[np.float32]) -> Texture:
-    """One colour, brightened and darkened by a factor per texel."""
+    """Multiply a colour by a brightness factor per texel."""
     return np.asarray(np.clip(np.asarray(colour, np.float32) * value[..., None], 0.0, 1.0), np.float32)
 
 
 def plaster(rng: np.random.Generator, width: float, height: float, density: float, colour: Colour) -> Texture:
-    """A painted wall with stains, roller marks and small chips."""
+    """Painted wall with stains, roller marks and small chips."""
     rows, columns = texels(height, density), texels(width, density)
     value = 1.0 + 0.10 * fractal_noise(rng, rows, columns, (3, 5), 7)
     chips = fractal_noise(rng, rows, columns, (rows / 14, columns / 14), 2)
@@ -55,7 +57,7 @@ def plaster(rng: np.random.Generator, width: float, height: float, density: floa
 def wood(
     rng: np.random.Generator, width: float, height: float, density: float, colour: Colour, board: float = 0.14
 ) -> Texture:
-    """Boards that run along the width, each with its own tone, grain, length and knots."""
+    """Wooden boards along the width, each with its own tone, grain, joint and knots."""
     rows, columns = texels(height, density), texels(width, density)
     image = np.zeros((rows, columns, 3), np.float32)
     step = texels(board, density)
@@ -77,7 +79,7 @@ def wood(
 
 
 def bricks(rng: np.random.Generator, width: float, height: float, density: float, colour: Colour) -> Texture:
-    """Running bond of bricks 0.24 m x 0.08 m, each with its own tone, pores, and mortar between them."""
+    """Brick wall in running bond: bricks of 0.24 m x 0.08 m with different tones and pores, and mortar."""
     rows, columns = texels(height, density), texels(width, density)
     value = np.zeros((rows, columns), np.float32)
     hue = np.zeros((rows, columns), np.float32)
@@ -98,18 +100,18 @@ def bricks(rng: np.random.Generator, width: float, height: float, density: float
 
 
 def terrazzo(rng: np.random.Generator, width: float, height: float, density: float, colour: Colour) -> Texture:
-    """Stone slabs of 0.4 m with chips of many colours."""
+    """Terrazzo slabs of 0.4 m with chips of many colours."""
     rows, columns = texels(height, density), texels(width, density)
     image = tint(colour, 1.0 + 0.12 * fractal_noise(rng, rows, columns, (6, 6), 6))
     for _ in range(int(width * height * 550)):
         points = rng.normal(0.0, 0.011 * density, (5, 2)) + rng.uniform((0, 0), (columns, rows))
         shade = np.asarray(colour) * rng.uniform(0.35, 1.35) + rng.uniform(-0.08, 0.08, 3)
         cv2.fillConvexPoly(image, cv2.convexHull(points.astype(np.int32)), tuple(np.clip(shade, 0, 1)), cv2.LINE_AA)
-    return with_seams(image, texels(0.4, density))
+    return add_seams(image, texels(0.4, density))
 
 
-def with_seams(image: Texture, step: int) -> Texture:
-    """Dark lines every ``step`` texels both ways, as between slabs or panels."""
+def add_seams(image: Texture, step: int) -> Texture:
+    """Darken every ``step``-th row and column of an image in place, as seams between slabs; return the image."""
     image[::step] *= 0.5
     image[:, ::step] *= 0.5
     return image

@@ -1,4 +1,4 @@
-"""Who is in the room: cut-outs of two photographs, and how they move."""
+"""People in the demo: three figures from two photographs, and their motions."""
 
 from __future__ import annotations
 
@@ -8,66 +8,71 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v3d_torch.datasets.demo.geometry import Figure, Pose, Vector
-from v3d_torch.datasets.demo.pictures import photograph
+from v3d_torch.datasets.demo.pictures import load_photograph
+from v3d_torch.datasets.demo.scene import Figure, FigurePose, Vector
 
 WALK_SPEED = 1.0
-"""Of the walker, m/s: 3.3 cm a frame."""
+"""Speed of the walking person, m/s: a slow walk."""
 WALK_START = 0.60
-"""Seconds until the walker's centre is at the left end of the way."""
+"""Time at which the centre of the walking person is at the left end of its path, seconds."""
 
 
-def walk(t: float) -> Pose:
-    """Glide to the right, the body rising 1.5 cm with each of two steps a second."""
-    return Pose(shift=(WALK_SPEED * (t - WALK_START), 0.0, 0.015 * abs(math.sin(2 * math.pi * t))))
+def walk(t: float) -> FigurePose:
+    """Return the pose of the walking person: constant velocity along x, and a small rise with each of two steps/s."""
+    return FigurePose(shift=(WALK_SPEED * (t - WALK_START), 0.0, 0.015 * abs(math.sin(2 * math.pi * t))))
 
 
-def sway(t: float) -> Pose:
-    """Lean from side to side about the middle and turn the shoulders: the shape moves, the centroid stays."""
-    return Pose(
+def sway(t: float) -> FigurePose:
+    """Return the pose of the swaying person: lean and twist about the middle change the shape, not the centroid."""
+    return FigurePose(
         lean=0.26 * math.sin(2 * math.pi * 1.0 * t),
         twist=0.40 * math.sin(2 * math.pi * 0.9 * t + 0.8),
     )
 
 
 def recolour(rgba: NDArray[np.float32], hue_shift: float, hair: float) -> NDArray[np.float32]:
-    """Another suit and darker hair on the astronaut.
+    """Change the colours of suit and hair in the photograph of the astronaut, to get another person.
 
     Args:
-        rgba: the cut-out.
-        hue_shift: of strongly coloured texels (the suit), degrees.
-        hair: factor on the brightness of the hair.
+        rgba: Cut-out of the astronaut, in [0, 1], float32, shape :math:`(H, W, 4)`.
+        hue_shift: Change of the hue of the suit (its strongly saturated texels), degrees.
+        hair: Factor on the brightness of the hair.
 
     Returns:
-        The same shape.
+        Recoloured cut-out, same shape.
     """
     hsv = cv2.cvtColor(np.ascontiguousarray(rgba[..., :3]), cv2.COLOR_RGB2HSV)
     rows = np.linspace(0, 1, rgba.shape[0], dtype=np.float32)[:, None]
-    suit = _soft((rows > 0.33) & (hsv[..., 1] > 0.45) & (hsv[..., 0] < 40))
-    other = cv2.cvtColor(
+    suit = _feather((rows > 0.33) & (hsv[..., 1] > 0.45) & (hsv[..., 0] < 40))
+    shifted = cv2.cvtColor(
         np.dstack([(hsv[..., 0] + hue_shift) % 360, hsv[..., 1] * 0.75, hsv[..., 2] * 0.85]), cv2.COLOR_HSV2RGB
     )
-    rgb = suit * other + (1 - suit) * rgba[..., :3]
-    brown = _soft((rows < 0.24) & (hsv[..., 1] > 0.34) & (hsv[..., 0] > 22) & (hsv[..., 0] < 60))
+    rgb = suit * shifted + (1 - suit) * rgba[..., :3]
+    brown = _feather((rows < 0.24) & (hsv[..., 1] > 0.34) & (hsv[..., 0] > 22) & (hsv[..., 0] < 60))
     rgb = rgb * (1 - brown * (1 - hair))
     return np.dstack([rgb, rgba[..., 3]]).astype(np.float32)
 
 
-def _soft(region: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """A region with soft edges, shape :math:`(H, W, 1)`."""
-    return np.asarray(cv2.GaussianBlur(region.astype(np.float32), (0, 0), 1.2)[..., None])
+def _feather(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Blur a mask to soft edges, shape :math:`(H, W, 1)`."""
+    return np.asarray(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 1.2)[..., None])
 
 
-def people(walker: Vector, stander: Vector, swayer: Vector) -> list[Figure]:
-    """Three people at the given places (the walker's is where the way begins).
+def build_people(walker: Vector, stander: Vector, swayer: Vector) -> list[Figure]:
+    """Build the three people.
+
+    Args:
+        walker: Left end of the path of the walking person, world frame, metres.
+        stander: Position of the standing person.
+        swayer: Position of the swaying person.
 
     Returns:
-        The one who walks (mover 1), the one who stands still, the one who sways (mover 2).
+        The walking person (mask id 1), the standing person (0), and the swaying person (2).
     """
-    astronaut, photographer = photograph("astronaut.png"), photograph("photographer.png")
-    other = recolour(astronaut, 165.0, 0.5)
+    astronaut, photographer = load_photograph("astronaut.png"), load_photograph("photographer.png")
+    second_astronaut = recolour(astronaut, 165.0, 0.5)
     return [
         Figure(astronaut[:, ::-1], walker, 1.06, 0.20, motion=walk, mover=1),
         Figure(photographer, stander, 0.93, 0.18),
-        Figure(other, swayer, 1.00, 0.20, yaw=-0.15, motion=sway, mover=2, pivot=(0.40, 0.57)),
+        Figure(second_astronaut, swayer, 1.00, 0.20, yaw=-0.15, motion=sway, mover=2, pivot=(0.40, 0.57)),
     ]

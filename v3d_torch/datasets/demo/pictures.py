@@ -1,6 +1,6 @@
-"""Things drawn on surfaces: book spines, posters, papers, a clock face, a plant.
+"""Pictures for surfaces and figures: photographs, and drawings of books, posters, pages, a clock, a plant, an orange.
 
-As in :mod:`materials`, images are float32 RGB in [0, 1], shape :math:`(H, W, 3)`; those with a silhouette are RGBA.
+All pictures are RGB in [0, 1], float32, shape :math:`(H, W, 3)`; those of figures are RGBA, with a silhouette.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from v3d_torch.datasets.demo.materials import Colour, Texture, fractal_noise, texels, tint
 from v3d_torch.errors import InputError
 
-ASSETS = Path(__file__).parents[1] / "assets"
-CLOTH = np.asarray(
+_ASSETS = Path(__file__).parents[1] / "assets"
+_COVER_COLOURS = np.asarray(
     [
         (0.58, 0.14, 0.12), (0.75, 0.36, 0.16), (0.83, 0.66, 0.30), (0.87, 0.82, 0.70), (0.34, 0.42, 0.22),
         (0.14, 0.32, 0.30), (0.20, 0.33, 0.50), (0.13, 0.17, 0.30), (0.42, 0.22, 0.34), (0.30, 0.21, 0.15),
@@ -23,26 +23,30 @@ CLOTH = np.asarray(
     ],
     np.float32,
 )  # fmt: skip
-"""Colours of book covers."""
+"""Colours of book covers, RGB in [0, 1]."""
 
 
-def photograph(name: str) -> NDArray[np.float32]:
-    """A photograph of the assets folder, RGB or RGBA in [0, 1]."""
-    image = cv2.imread(str(ASSETS / name), cv2.IMREAD_UNCHANGED)
+def load_photograph(name: str) -> NDArray[np.float32]:
+    """Load a photograph from the assets folder of the package.
+
+    Raises:
+        InputError: If the file is missing or damaged.
+    """
+    image = cv2.imread(str(_ASSETS / name), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise InputError(f"{ASSETS / name}: a photograph of the demo cannot be read; install the package again")
+        raise InputError(f"{_ASSETS / name}: photograph of the demo cannot be read; install the package again")
     order = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(image, order).astype(np.float32) / np.float32(255.0)
 
 
-def framed(image: Texture, border: float, colour: Colour) -> Texture:
-    """An image in a frame; ``border`` is a fraction of its height."""
+def add_frame(image: Texture, border: float, colour: Colour) -> Texture:
+    """Add a picture frame, whose width is a fraction ``border`` of the image height."""
     n = max(2, round(border * image.shape[0]))
     return np.asarray(cv2.copyMakeBorder(image, n, n, n, n, cv2.BORDER_CONSTANT, value=colour), np.float32)
 
 
 def bookshelf(rng: np.random.Generator, width: float, height: float, density: float, boards: int) -> Texture:
-    """Shelves full of books, each spine with its own height, colour, bands and lettering."""
+    """Bookshelf with ``boards`` rows of books of different size, colour, bands and lettering."""
     rows, columns = texels(height, density), texels(width, density)
     image = np.full((rows, columns, 3), (0.10, 0.075, 0.05), np.float32)
     edge = max(3, round(0.022 * density))
@@ -66,8 +70,8 @@ def bookshelf(rng: np.random.Generator, width: float, height: float, density: fl
 
 
 def book_spine(rng: np.random.Generator, rows: int, columns: int) -> Texture:
-    """A book seen from the back: one colour, rounded, with bands and lettering."""
-    colour = CLOTH[rng.integers(len(CLOTH))] * rng.uniform(0.7, 1.15)
+    """Spine of a book: one colour, shaded as a rounded back, with bands and lettering."""
+    colour = _COVER_COLOURS[rng.integers(len(_COVER_COLOURS))] * rng.uniform(0.7, 1.15)
     round_back = 1.0 - 0.45 * np.abs(np.linspace(-1, 1, columns, dtype=np.float32)) ** 3
     book = np.broadcast_to(colour * round_back[None, :, None], (rows, columns, 3)).astype(np.float32)
     ink = colour * 0.35 if colour.mean() > 0.45 else np.minimum(colour * 0.4 + 0.6, 1.0)
@@ -83,7 +87,7 @@ def book_spine(rng: np.random.Generator, rows: int, columns: int) -> Texture:
 
 
 def poster(rng: np.random.Generator, width: float, height: float, density: float) -> Texture:
-    """An abstract print: overlapping discs, bars and triangles in a few colours on paper, with a line of lettering."""
+    """Abstract poster: overlapping discs, bars and triangles in a few colours, and a line of lettering."""
     rows, columns = texels(height, density), texels(width, density)
     paper = np.asarray((0.93, 0.90, 0.83), np.float32)
     image = np.full((rows, columns, 3), paper, np.float32)
@@ -108,8 +112,8 @@ def poster(rng: np.random.Generator, width: float, height: float, density: float
     return image
 
 
-def paper(rng: np.random.Generator, rows: int = 300, columns: int = 210) -> Texture:
-    """A printed page: title, paragraphs of words, a small figure."""
+def page(rng: np.random.Generator, rows: int = 300, columns: int = 210) -> Texture:
+    """Printed page: title, paragraphs of words, and a small figure."""
     image = np.full((rows, columns, 3), (0.93, 0.93, 0.91), np.float32)
     image[24:32, 40 : columns - 60] = 0.15
     for top in range(46, rows - 20, 7):
@@ -125,7 +129,7 @@ def paper(rng: np.random.Generator, rows: int = 300, columns: int = 210) -> Text
 
 
 def clock_face(size: int = 256) -> NDArray[np.float32]:
-    """A wall clock, ten past ten, RGBA."""
+    """Wall clock at ten past ten, RGBA."""
     image = np.zeros((size, size, 4), np.float32)
     middle, radius = (size // 2, size // 2), size * 0.48
     cv2.circle(image, middle, int(radius), (0.10, 0.10, 0.12, 1.0), -1, cv2.LINE_AA)
@@ -144,7 +148,7 @@ def clock_face(size: int = 256) -> NDArray[np.float32]:
 
 
 def plant(rng: np.random.Generator, size: int = 320) -> NDArray[np.float32]:
-    """A potted plant: bent leaves of many greens over a terracotta pot, RGBA."""
+    """Potted plant: bent leaves in many greens over a terracotta pot, RGBA."""
     image = np.zeros((size, size, 4), np.float32)
     root = np.asarray((size * 0.5, size * 0.70))
     for i in range(60):
@@ -170,7 +174,7 @@ def plant(rng: np.random.Generator, size: int = 320) -> NDArray[np.float32]:
 
 
 def orange(rng: np.random.Generator, size: int = 128) -> NDArray[np.float32]:
-    """An orange with its pores, lit from above, RGBA."""
+    """Orange with pores, lit from above, RGBA."""
     y, x = np.mgrid[0:size, 0:size].astype(np.float32) * (2.0 / (size - 1)) - 1.0
     r2 = x**2 + y**2
     z = np.sqrt(np.clip(1.0 - r2, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Writes the demo as a sequence in the layout of the TUM RGB-D benchmark."""
+"""Rendering of the demo as a sequence in the layout of the TUM RGB-D benchmark."""
 
 from __future__ import annotations
 
@@ -12,36 +12,39 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from v3d_torch.datasets.demo.path import camera_pose
-from v3d_torch.datasets.demo.render import Renderer
+from v3d_torch.datasets.demo.camera_trajectory import camera_pose
+from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.room import build_room
-from v3d_torch.datasets.demo.sensor import sense_colour, sense_depth
+from v3d_torch.datasets.demo.sensor_model import sense_colour, sense_depth
 from v3d_torch.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, readout=0.0)
-"""The default calibration of a Kinect; rendered images have all rows of one time."""
+"""Default calibration of a Kinect, with a global shutter: all rows of a rendered image have the same time."""
 FRAMES = 120
+"""Number of frames."""
 RATE = 30.0
-"""Frames per second."""
-START = 1.0
-"""Stamp of the first frame, seconds."""
+"""Frame rate, Hz."""
+START_STAMP = 1.0
+"""Timestamp of the first frame, seconds."""
 SEED = 7
+"""Seed of textures and sensor noise."""
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 Progress = Callable[[int, int], None]
+"""Called with the number of frames done and the number of all frames."""
 
 
 def write_sequence(folder: Path, frames: range = range(FRAMES), progress: Progress | None = None) -> None:
     """Render frames of the demo into an empty folder.
 
     Args:
-        folder: where ``rgb/``, ``depth/``, ``masks/`` and the lists go.
-        frames: which of the sequence's frames; each is the same in every selection.
-        progress: called with (frames done, frames) after every frame.
+        folder: Folder for ``rgb/``, ``depth/``, ``masks/`` and the lists; created if missing.
+        frames: Indices of the frames to render; the bytes of a frame do not depend on the others.
+        progress: Called after every frame.
     """
     for name in ("rgb", "depth", "masks"):
         (folder / name).mkdir(parents=True, exist_ok=True)
-    with _one_thread():
+    with _single_thread():
         renderer = Renderer(build_room(SEED), CAMERA)
         for done, index in enumerate(frames, start=1):
             _write_frame(folder, renderer, index)
@@ -51,9 +54,8 @@ def write_sequence(folder: Path, frames: range = range(FRAMES), progress: Progre
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    # Rendering is thousands of small operations: threads that wait for each other make it ten times slower as soon as
-    # another process wants a core.
+def _single_thread() -> Iterator[None]:
+    """Run torch on one thread: rendering is many small operations, which are slower with threads on a busy machine."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -63,32 +65,33 @@ def _one_thread() -> Iterator[None]:
 
 
 def _stamp(index: int) -> str:
-    return f"{START + index / RATE:.6f}"
+    return f"{START_STAMP + index / RATE:.6f}"
 
 
 def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:
     time = index / RATE
     rendering = renderer(camera_pose(time), time)
-    generator = torch.Generator().manual_seed(SEED * 100_003 + index)
+    generator = torch.Generator().manual_seed(SEED * 100_003 + index)  # a different seed for each frame
     colour = sense_colour(rendering.colour, generator).numpy()
     depth = sense_depth(rendering.depth, CAMERA, generator).numpy()
     stamp = _stamp(index)
-    _save(folder / "rgb" / f"{stamp}.jpg", np.ascontiguousarray(colour[..., ::-1]))
-    _save(folder / "depth" / f"{stamp}.png", (depth * CAMERA.depth_scale).round().astype(np.uint16))
-    _save(folder / "masks" / f"{stamp}.png", rendering.mover.numpy())
+    _write_image(folder / "rgb" / f"{stamp}.jpg", np.ascontiguousarray(colour[..., ::-1]))
+    _write_image(folder / "depth" / f"{stamp}.png", (depth * CAMERA.depth_scale).round().astype(np.uint16))
+    _write_image(folder / "masks" / f"{stamp}.png", rendering.motion_mask.numpy())
 
 
-def _save(path: Path, image: Image) -> None:
-    # Encoded and written apart: cv2.imwrite does not say why it failed.
-    encoded = cv2.imencode(path.suffix, image)[1]  # JPEG at OpenCV's quality of 95
+def _write_image(path: Path, image: Image) -> None:
+    # Encode and write separately, because cv2.imwrite does not report the cause of a failure.
+    encoded = cv2.imencode(path.suffix, image)[1]  # JPEG with OpenCV's default quality of 95
     path.write_bytes(encoded.tobytes())
 
 
 def _write_lists(folder: Path, frames: range) -> None:
+    """Write the image lists, the ground truth and the camera file."""
     stamps = [_stamp(index) for index in frames]
     poses = np.stack([camera_pose(index / RATE) for index in frames])
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-    truth = [
+    groundtruth = [
         f"{stamp} " + " ".join(f"{value:.9f}" for value in (*T_wc[:3, 3], *q))
         for stamp, T_wc, q in zip(stamps, poses, quaternions, strict=True)
     ]
@@ -96,7 +99,7 @@ def _write_lists(folder: Path, frames: range) -> None:
         "rgb.txt": ["# timestamp filename", *(f"{s} rgb/{s}.jpg" for s in stamps)],
         "depth.txt": ["# timestamp filename", *(f"{s} depth/{s}.png" for s in stamps)],
         "associations.txt": [f"{s} rgb/{s}.jpg {s} depth/{s}.png" for s in stamps],
-        "groundtruth.txt": ["# camera-to-world", "# timestamp tx ty tz qx qy qz qw", *truth],
+        "groundtruth.txt": ["# camera-to-world", "# timestamp tx ty tz qx qy qz qw", *groundtruth],
         "camera.yaml": [
             *(f"{key}: {getattr(CAMERA, key)}" for key in ("width", "height", "fx", "fy", "cx", "cy")),
             f"distortion: {list(CAMERA.distortion)}  # k1 k2 p1 p2 k3 (OpenCV)",

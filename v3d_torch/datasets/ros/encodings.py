@@ -1,4 +1,4 @@
-"""Ways in which cameras send colour, by the names that ROS and librealsense share."""
+"""Colour encodings of ROS and librealsense, and their conversion to RGB."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-COLOURS: dict[str, tuple[int, int | None]] = {
+COLOUR_ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
     "8UC3": (3, cv2.COLOR_BGR2RGB),
     "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -28,11 +28,19 @@ COLOURS: dict[str, tuple[int, int | None]] = {
     "yuv422_yuy2": (2, cv2.COLOR_YUV2RGB_YUYV),
     "yuyv": (2, cv2.COLOR_YUV2RGB_YUYV),
 }
-"""Bytes a pixel, and OpenCV's way from it to RGB."""
+"""Bytes per pixel of each supported encoding, and the OpenCV code that converts it to RGB (None: already RGB)."""
 
 
-def to_rgb(encoding: str, pixels: NDArray[Any]) -> Tensor:
-    """Pixels of 8 bits a channel, shape (H, W, C) or (H, W), as `RGBDFrame` holds colour; always a copy."""
-    conversion = COLOURS[encoding][1]
+def convert_to_rgb(encoding: str, pixels: NDArray[Any]) -> Tensor:
+    """Convert an 8-bit colour image to an RGB tensor.
+
+    Args:
+        encoding: Key of `COLOUR_ENCODINGS`.
+        pixels: Encoded image, uint8, shape (H, W, C) or (H, W).
+
+    Returns:
+        RGB image, uint8, shape :math:`(3, H, W)`; never shares memory with ``pixels``.
+    """
+    conversion = COLOUR_ENCODINGS[encoding][1]
     rgb = pixels.copy() if conversion is None else cv2.cvtColor(pixels, conversion)
     return torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)

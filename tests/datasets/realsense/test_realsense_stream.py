@@ -1,0 +1,279 @@
+"""RealSense streams from a simulated camera and from recordings, and the conversion of their calibration."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.simulated_realsense import (
+    BASELINE,
+    COLOUR_K,
+    DEPTH_K,
+    FPS,
+    HEIGHT,
+    WIDTH,
+    SimulatedDevice,
+    make_intrinsics,
+    rs,
+)
+from helpers.tiny_images import as_rgb, colour_of
+from typer.testing import CliRunner
+
+from v3d_torch.cli import record, run
+from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
+from v3d_torch.datasets.realsense import RealSenseStream
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+
+OPEN_LIVE_DEVICE = "v3d_torch.datasets.realsense.realsense_stream.open_live_device"
+
+
+def take_frames(stream: RGBDStream, count: int) -> list[Any]:
+    frames = iter(stream)
+    try:
+        return [next(frames) for _ in range(count)]
+    finally:
+        frames.close()  # type: ignore[attr-defined]
+
+
+# --- live cameras
+
+
+@pytest.fixture(scope="module")
+def live() -> Iterator[SimpleNamespace]:
+    camera = SimulatedDevice()
+    stream = RealSenseStream("simulated", lambda: camera)
+    frames = take_frames(stream, 5)
+    yield SimpleNamespace(camera=camera, stream=stream, frames=frames)
+
+
+def test_live_frames_are_in_order_with_their_own_depth(live: SimpleNamespace) -> None:
+    assert isinstance(live.stream, RGBDStream) and not isinstance(live.stream, RGBDSequence)
+    assert live.stream.camera == PinholeCamera(*COLOUR_K, WIDTH, HEIGHT, depth_scale=1000)
+    for index, frame in enumerate(live.frames):
+        assert frame.index == index
+        number = round((frame.stamp - live.camera.first_stamp / 1000) * FPS)
+        assert frame.stamp == pytest.approx(live.camera.first_stamp / 1000 + number / FPS, abs=1e-5)
+        assert np.array_equal(as_rgb(frame.image), colour_of(number, WIDTH, HEIGHT))
+        assert (frame.depth.dtype, frame.depth.shape) == (torch.float32, (1, HEIGHT, WIDTH))
+        assert float(frame.depth[0, 24, 38]) == pytest.approx(1 - number / 1000)  # depth of the same frame
+    stamps = [frame.stamp for frame in live.frames]
+    assert stamps == sorted(set(stamps))
+
+
+def test_convention_depth_is_aligned_to_colour(live: SimpleNamespace) -> None:
+    """The corners of the board are at their projections into the colour camera."""
+    frame = live.frames[0]
+    number = round((frame.stamp - live.camera.first_stamp / 1000) * FPS)
+    z = 1 - number / 1000
+    rows, columns = torch.nonzero((frame.depth[0] > 0.9) & (frame.depth[0] < 1.1), as_tuple=True)
+    (fx, fy, cx, cy), (gx, gy, px, py) = COLOUR_K, DEPTH_K
+    left, right = (fx * ((edge - px) / gx + BASELINE / z) + cx for edge in (23.5, 39.5))
+    top, bottom = (fy * (edge - py) / gy + cy for edge in (15.5, 31.5))
+    bounds = [columns.min() - 0.5, columns.max() + 0.5, rows.min() - 0.5, rows.max() + 0.5]
+    assert [float(edge) for edge in bounds] == pytest.approx([left, right, top, bottom], abs=1)
+
+
+def test_yielded_frames_do_not_share_memory(live: SimpleNamespace) -> None:
+    """librealsense reuses the memory of a frame, so that each image must be a copy."""
+    assert len({frame.image.numpy().tobytes() for frame in live.frames}) == len(live.frames)
+
+
+def test_camera_runs_only_during_iteration() -> None:
+    camera = SimulatedDevice()
+    stream = RealSenseStream("simulated", lambda: camera)
+    assert camera.sent_count == 0
+    take_frames(stream, 1)
+    assert camera.stopped.is_set()
+    sent_count = camera.sent_count
+    assert take_frames(stream, 1)[0].index == 0
+    assert camera.sent_count > sent_count and camera.stopped.is_set()
+
+
+def test_ctrl_c_releases_the_camera() -> None:
+    camera = SimulatedDevice()
+    with pytest.raises(KeyboardInterrupt):
+        for frame in RealSenseStream("simulated", lambda: camera):
+            if frame.index == 1:
+                raise KeyboardInterrupt
+    assert camera.stopped.wait(5)
+
+
+def test_silent_camera_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v3d_torch.datasets.realsense.realsense_stream._SILENCE_TIMEOUT", 0.3)
+    camera = SimulatedDevice()
+    monkeypatch.setattr(camera, "wait", lambda milliseconds: None)
+    with pytest.raises(InputError, match="simulated: sends no images; plug"):
+        next(iter(RealSenseStream("simulated", lambda: camera)))
+    assert camera.stopped.is_set()
+
+
+def test_camera_of_another_size_is_an_input_error() -> None:
+    stream = RealSenseStream("simulated", SimulatedDevice, "tum_fr3")
+    with pytest.raises(InputError, match=r"simulated: sends 64x48 pixels, --camera has 640x480; remove --camera"):
+        take_frames(stream, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "label"), [("realsense", "realsense"), ("realsense:", "realsense"), ("realsense:123", "realsense_123")]
+)
+def test_missing_camera_is_an_input_error(name: str, label: str) -> None:
+    if rs.context().query_devices().size():
+        pytest.skip("a camera is connected")
+    start = time.monotonic()
+    with pytest.raises(InputError, match=f"^{label}: no camera is connected; plug it into a USB 3 port$"):
+        open_source(name)
+    assert time.monotonic() - start < 5
+    with pytest.raises(InputError, match="is a live camera, --depth-topic means nothing to it"):
+        open_source(name, options=SourceOptions(depth_topic="/a"))
+
+
+def test_missing_pyrealsense2_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
+    with pytest.raises(InputError, match=r"^realsense: RealSense needs pyrealsense2 .*; run pip install pyrealsense2$"):
+        open_source("realsense:")
+
+
+def test_missing_libusb_is_an_input_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cause = "libusb-1.0.so.0: cannot open shared object file: No such file or directory"
+    (tmp_path / "pyrealsense2.py").write_text(f"raise ImportError({cause!r})")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    with pytest.raises(InputError, match=r"^realsense: .*libusb-1.0.so.0: .*run apt install libusb-1.0-0$"):
+        open_source("realsense:")
+
+
+def test_record_command_saves_frames_until_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole command runs; only the camera is simulated."""
+    camera = SimulatedDevice()
+    requests: list[tuple[object, ...]] = []
+    monkeypatch.setattr(OPEN_LIVE_DEVICE, lambda *request: (requests.append(request), camera)[1])
+
+    def interrupt() -> None:
+        while len(list((tmp_path / "out" / "depth").glob("[0-9]*"))) < 4:
+            time.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    done = CliRunner().invoke(record.app, ["--out", str(tmp_path / "out"), "--fps", "15"])
+    assert done.exit_code == 0, done.output
+    assert camera.stopped.is_set()
+    assert set(requests) == {("realsense", "", 15.0)}
+    saved = load_sequence(str(tmp_path / "out"))
+    assert len(saved) >= 4 and f"{len(saved)} frames" in done.output
+    assert saved.camera == PinholeCamera(*COLOUR_K, WIDTH, HEIGHT, depth_scale=1000)
+    for frame in saved:
+        number = round((frame.stamp - camera.first_stamp / 1000) * FPS)
+        assert np.array_equal(as_rgb(frame.image), colour_of(number, WIDTH, HEIGHT))
+        assert float(frame.depth[0, 24, 38]) == pytest.approx(1 - number / 1000)
+
+
+def test_run_command_on_a_live_camera_ends_with_ctrl_c_and_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OPEN_LIVE_DEVICE, lambda *request: SimulatedDevice(scale=5, still=True))
+    out = tmp_path / "out"
+
+    def interrupt() -> None:
+        while not (out / "run.log").exists() or (out / "run.log").read_text().count("frame") < 4:
+            time.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    arguments = ["--seq", "realsense:", "--segmenter", "none", "--out", str(out), "--set", "threads=1"]
+    done = CliRunner().invoke(run.app, arguments)
+    assert done.exit_code == 0, done.output
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert (metrics["sequence"], metrics["failure"]) == ("realsense", None)
+    assert metrics["frames"] == metrics["processed"] == metrics["tracked"] >= 3
+    assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
+
+
+# --- recordings
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("realsense") / "take.db3"
+    camera = SimulatedDevice(record_to=path)
+    camera.start()
+    while camera.sent_count < 15:
+        time.sleep(0.05)
+    camera.stop()
+    return path
+
+
+def test_recording_yields_all_frames_at_any_speed(recording: Path) -> None:
+    stream = open_source(str(recording))
+    assert isinstance(stream, RealSenseStream)
+    assert (stream.name, stream.groundtruth) == ("take", None)
+    assert stream.camera == PinholeCamera(*COLOUR_K, WIDTH, HEIGHT, depth_scale=1000)
+    runs = []
+    for pause in (0.0, 0.1):
+        numbers = []
+        for frame in stream:
+            (number,) = (n for n in range(20) if np.array_equal(as_rgb(frame.image), colour_of(n, WIDTH, HEIGHT)))
+            assert float(frame.depth[0, 24, 38]) == pytest.approx(1 - number / 1000)
+            numbers.append(number)
+            time.sleep(pause)
+        runs.append(numbers)
+    assert runs[0] == runs[1] == list(range(runs[0][0], runs[0][-1] + 1))
+    assert len(runs[0]) >= 10
+
+
+def test_recording_is_a_stream_not_a_sequence(recording: Path) -> None:
+    with pytest.raises(InputError, match=r"take.db3: is a stream, .*python -m v3d_torch record --seq"):
+        load_sequence(str(recording))
+
+
+def test_truncated_recording_is_an_input_error(recording: Path, tmp_path: Path) -> None:
+    truncated = tmp_path / "take.db3"
+    truncated.write_bytes(recording.read_bytes()[:5000])
+    with pytest.raises(InputError, match=rf"{truncated}: ") as caught:
+        list(open_source(str(truncated)))
+    assert "\n" not in str(caught.value)
+
+
+# --- calibration
+
+
+def camera_with(intrinsics: Any, depth_unit: float = 0.001) -> PinholeCamera:
+    device = SimulatedDevice()
+    device.intrinsics, device.depth_unit = intrinsics, depth_unit
+    return RealSenseStream("simulated", lambda: device).camera
+
+
+@pytest.mark.parametrize("model", ["brown_conrady", "inverse_brown_conrady"])
+def test_convention_distortion_is_that_of_librealsense(model: str) -> None:
+    """Pixels back-project to the same rays as in librealsense."""
+    intrinsics = make_intrinsics(COLOUR_K, (-0.056, 0.066, -0.0007, 0.0003, -0.0217), model)  # of a D455
+    camera = camera_with(intrinsics)
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.rand(50, 2, dtype=torch.float64, generator=generator) * torch.tensor([WIDTH - 1, HEIGHT - 1])
+    rays = camera.back_project(camera.undistort(pixels), torch.ones(50, dtype=torch.float64))
+    expected = [rs.rs2_deproject_pixel_to_point(intrinsics, uv, 1.0) for uv in pixels.tolist()]
+    torch.testing.assert_close(rays, torch.tensor(expected, dtype=torch.float64), atol=2e-5, rtol=0)
+    assert (camera.undistort(pixels) - pixels).abs().max() > 0.4
+
+
+def test_unsupported_distortion_model_is_rejected_unless_it_is_zero() -> None:
+    with pytest.raises(
+        InputError, match="simulated: has the unsupported distortion model kannala_brandt4; give --camera"
+    ):
+        camera_with(make_intrinsics(COLOUR_K, (0.1, 0, 0, 0, 0), "kannala_brandt4"))
+    assert camera_with(make_intrinsics(COLOUR_K, model="kannala_brandt4")).distortion == (0, 0, 0, 0, 0)
+
+
+def test_depth_unit_of_the_device_sets_the_depth_scale() -> None:
+    assert camera_with(make_intrinsics(COLOUR_K), depth_unit=float(np.float32(0.0001))).depth_scale == 10000

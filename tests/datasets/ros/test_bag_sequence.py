@@ -1,0 +1,250 @@
+"""Sequences in bags of ROS 1, ROS 2 and mcap: frames, stamps, cameras, invalid bags, and a run of the command."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.bags import DEPTH, INFO, KINDS, RGB, Kind, Message, Messages
+from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of
+
+from v3d_torch.datasets import SourceOptions, load_sequence
+from v3d_torch.datasets.demo.sequence import write_sequence
+from v3d_torch.datasets.ros import BagSequence
+from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.errors import InputError
+from v3d_torch.evaluation import evaluate
+from v3d_torch.geometry.camera import PinholeCamera
+
+K = [30.0, 0, 15.5, 0, 31.0, 11.5, 0, 0, 1]
+P = [28.0, 0, 15.0, 0, 0, 29.0, 11.0, 0, 0, 0, 1, 0]
+D = [0.1, -0.2, 0.003, 0.004, 0.05]
+ROS2 = Messages("db3")
+
+
+def valid_messages(make: Messages, frames: int = 3) -> list[Message]:
+    """Colour at 10, 10.1, ... seconds and depth 4 ms later; all messages arrive half a second after their stamps."""
+    messages: list[Message] = [(INFO, 10.5, make.info(WIDTH, HEIGHT, K, D, P)), ("/imu", 10.5, make.header(10, ""))]
+    for i in range(frames):
+        stamp = 10 + i / 10
+        messages.append((RGB, stamp + 0.5, make.image(stamp, "rgb8", colour_of(i))))
+        messages.append((DEPTH, stamp + 0.504, make.image(stamp + 0.004, "16UC1", depth_of(i))))
+    return messages
+
+
+def assert_frame(sequence: BagSequence, index: int, seed: int) -> None:
+    frame = sequence[index]
+    assert np.array_equal(as_rgb(frame.image), colour_of(seed))
+    assert (frame.image.dtype, frame.depth.dtype) == (torch.uint8, torch.float32)
+    np.testing.assert_allclose(frame.depth[0], depth_of(seed) / 1000, rtol=1e-6)
+
+
+# --- files and stamps
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_can_be_read_in_any_order(kind: Kind, tmp_path: Path) -> None:
+    make = Messages(kind)
+    path = make.write(tmp_path / "take", valid_messages(make))
+    sequence = load_sequence(str(path))
+    assert isinstance(sequence, BagSequence)
+    assert (sequence.name, sequence.groundtruth) == ("take", None)
+    assert sequence.stamps.tolist() == pytest.approx([10, 10.1, 10.2], abs=1e-9)
+    assert sequence.camera == PinholeCamera(30, 31, 15.5, 11.5, WIDTH, HEIGHT, tuple(D), depth_scale=1000)
+    for index in (0, 1, 2, 2, 0):
+        assert_frame(sequence, index, index)
+    assert [frame.index for frame in sequence] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_file_inside_a_ros2_bag_can_be_opened(kind: Kind, tmp_path: Path) -> None:
+    make = Messages(kind)
+    (file,) = make.write(tmp_path / "take", valid_messages(make)).glob(f"*.{kind}")
+    sequence = load_sequence(str(file))
+    assert isinstance(sequence, BagSequence)
+    assert_frame(sequence, 2, 2)
+
+
+def test_unset_header_stamps_are_replaced_by_arrival_times(tmp_path: Path) -> None:
+    messages = valid_messages(ROS2)
+    for topic, _, message in messages:
+        if topic in (RGB, DEPTH):
+            message.header.stamp.sec = message.header.stamp.nanosec = 0
+    sequence = load_sequence(str(ROS2.write(tmp_path / "take", messages)))
+    assert sequence.stamps.tolist() == pytest.approx([10.5, 10.6, 10.7])
+
+
+def test_decreasing_stamps_and_unpaired_images_are_dropped(tmp_path: Path) -> None:
+    messages = valid_messages(ROS2, 2)
+    messages.append((RGB, 11.0, ROS2.image(10.05, "rgb8", colour_of(7))))  # stamped before the previous image
+    messages.append((DEPTH, 11.0, ROS2.image(10.05, "16UC1", depth_of(7))))
+    messages.append((RGB, 11.1, ROS2.image(10.6, "rgb8", colour_of(8))))  # no depth within the tolerance
+    messages.append((DEPTH, 11.2, ROS2.image(10.69, "16UC1", depth_of(9))))
+    messages.append((RGB, 11.3, ROS2.image(10.7, "rgb8", colour_of(9))))  # its depth arrived first
+    sequence = load_sequence(str(ROS2.write(tmp_path / "take", messages)))
+    assert isinstance(sequence, BagSequence)
+    assert sequence.stamps.tolist() == pytest.approx([10, 10.1, 10.7])
+    assert_frame(sequence, 2, 9)
+
+
+# --- cameras
+
+
+def load_camera_from_bag(path: Path, *messages: Message, **options: str) -> PinholeCamera:
+    bag = ROS2.write(
+        path / "take", [message for message in valid_messages(ROS2) if message[0] != INFO] + list(messages)
+    )
+    return load_sequence(str(bag), options=SourceOptions(**options)).camera
+
+
+def test_camera_of_rectified_images_is_the_projection_matrix_without_distortion(tmp_path: Path) -> None:
+    rectified = RGB.replace("image_raw", "image_rect_color")
+    messages = [(rectified if topic == RGB else topic, at, message) for topic, at, message in valid_messages(ROS2)]
+    camera = load_sequence(str(ROS2.write(tmp_path / "take", messages))).camera
+    assert camera == PinholeCamera(28, 29, 15, 11, WIDTH, HEIGHT, depth_scale=1000)
+
+
+def test_distortion_models_are_read_or_rejected(tmp_path: Path) -> None:
+    for number, (distortion, model) in enumerate(
+        [([], ""), (D[:4], "plumb_bob"), ([*D, 0, 0, 0], "rational_polynomial")]
+    ):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        camera = load_camera_from_bag(folder, (INFO, 10.5, ROS2.info(WIDTH, HEIGHT, K, distortion, P, model)))
+        assert camera.distortion == tuple((distortion + [0.0] * 5)[:5])
+    for distortion, model in (([*D, 0.1, 0, 0], "rational_polynomial"), (D[:4], "equidistant")):
+        folder = tmp_path / model
+        folder.mkdir()
+        with pytest.raises(InputError, match=f"{INFO} has the unsupported distortion model {model}; record rectified"):
+            load_camera_from_bag(folder, (INFO, 10.5, ROS2.info(WIDTH, HEIGHT, K, distortion, P, model)))
+
+
+def test_camera_is_read_from_the_topic_of_the_user(tmp_path: Path) -> None:
+    message = ROS2.info(WIDTH, HEIGHT, K, D, P)
+    assert load_camera_from_bag(tmp_path, ("/my/camera", 10.5, message), info_topic="/my/camera").fx == 30
+
+
+def test_camera_of_the_user_sets_the_depth_scale(tmp_path: Path) -> None:
+    bag = ROS2.write(tmp_path / "take", [message for message in valid_messages(ROS2) if message[0] != INFO])
+    camera = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=5000)
+    sequence = load_sequence(str(bag), camera=camera)
+    assert sequence.camera is camera
+    np.testing.assert_allclose(sequence[0].depth[0], depth_of(0) / 5000, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("topics", "options", "error"),
+    [
+        ([RGB, INFO], {}, f"no topic is named like depth images; set --depth-topic to one of {RGB}$"),
+        ([DEPTH, INFO], {}, f"no topic is named like colour images; set --rgb-topic to one of {DEPTH}$"),
+        ([INFO], {}, "contains no images; record the colour, depth and CameraInfo"),
+        ([RGB, DEPTH, INFO], {"rgb_topic": "/x"}, f"has no images on /x; set --rgb-topic to one of {DEPTH}, {RGB}$"),
+        ([RGB, DEPTH, INFO], {"info_topic": "/x"}, f"has no CameraInfo on /x; set --info-topic to one of {INFO}$"),
+        ([RGB, DEPTH], {"info_topic": "/x"}, "has no CameraInfo on /x or any other topic; give --camera instead$"),
+        ([RGB, DEPTH], {}, f"has no CameraInfo topic for {RGB}; name it with --info-topic, or give --camera$"),
+        ([RGB, DEPTH, INFO], {"rgb_topic": DEPTH, "depth_topic": RGB, "info_topic": INFO}, "16UC1 images, not colour"),
+        ([RGB, DEPTH, INFO], {"fps": 30.0}, "is a bag, --fps means nothing to it"),
+    ],
+)
+def test_missing_or_wrong_topics_are_an_input_error(
+    topics: list[str], options: dict[str, Any], error: str, tmp_path: Path
+) -> None:
+    path = ROS2.write(tmp_path / "take", [message for message in valid_messages(ROS2) if message[0] in topics])
+    with pytest.raises(InputError, match=error) as caught:
+        load_sequence(str(path), options=SourceOptions(**options))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+# --- invalid bags
+
+
+def write_with_other_depth(tmp_path: Path, **change: Any) -> Path:
+    """Write a bag whose depth messages have another stamp, size, frame_id or topic."""
+    messages = [message for message in valid_messages(ROS2) if message[0] != DEPTH]
+    for i in range(3):
+        stamp = change.get("stamp", 10) + i / 10
+        pixels = depth_of(i, *change.get("size", (WIDTH, HEIGHT)))
+        message = ROS2.image(stamp, "16UC1", pixels, frame=change.get("frame", "optical"))
+        messages.append((change.get("topic", DEPTH), stamp + 0.5, message))
+    return ROS2.write(tmp_path / "take", messages)
+
+
+def test_unregistered_depth_is_rejected_unless_name_or_user_confirms_it(tmp_path: Path) -> None:
+    """Depth in another frame than colour is unregistered."""
+    path = write_with_other_depth(tmp_path, topic="/camera/depth/image_rect_raw", frame="/depth_frame")
+    with pytest.raises(
+        InputError, match=r"image_rect_raw is in frame depth_frame, colour in frame optical; .*--depth-topic"
+    ):
+        load_sequence(str(path))
+    assert len(load_sequence(str(path), options=SourceOptions(depth_topic="/camera/depth/image_rect_raw"))) == 3
+    (tmp_path / "aligned").mkdir()
+    assert len(load_sequence(str(write_with_other_depth(tmp_path / "aligned", frame="/depth_frame")))) == 3
+
+
+def test_depth_of_another_size_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"{DEPTH}: has 40x24 pixels, its colour image 32x24; choose depth registered"):
+        load_sequence(str(write_with_other_depth(tmp_path, size=(40, HEIGHT))))
+
+
+def test_depth_without_common_stamps_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no image on .* is within 0.02 s of an image on"):
+        load_sequence(str(write_with_other_depth(tmp_path, stamp=20)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("keep", [0, 60, 0.5])
+def test_truncated_bag_is_an_input_error(kind: Kind, keep: float, tmp_path: Path) -> None:
+    make = Messages(kind)
+    path = make.write(tmp_path / "take", valid_messages(make))
+    file = path if kind == "bag" else next(path.glob(f"*.{kind}"))
+    content = file.read_bytes()
+    file.write_bytes(content[: int(keep * len(content)) if keep < 1 else int(keep)])
+    with pytest.raises(InputError, match="is damaged or not a bag") as caught:
+        list(load_sequence(str(path)))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_rosbags_is_an_input_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = ROS2.write(tmp_path / "take", valid_messages(ROS2))
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(InputError, match=r"reading a bag needs rosbags .*run pip install rosbags"):
+        load_sequence(str(path))
+
+
+# --- the command
+
+
+def test_run_on_a_bag_of_the_demo_is_accurate(tmp_path: Path) -> None:
+    """Run the command on ten frames of the demo as a ROS 1 bag."""
+    write_sequence(tmp_path / "folder", range(10))
+    folder = load_sequence(str(tmp_path / "folder"))
+    make, camera = Messages("bag"), folder.camera
+    intrinsics = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
+    messages: list[Message] = [("/kinect/rgb/info", 1.0, make.info(640, 480, intrinsics, [], P))]
+    for frame in folder:
+        images = ("rgb", "rgb8", as_rgb(frame.image)), ("depth", "32FC1", frame.depth[0].numpy())
+        for kind, encoding, pixels in images:
+            messages.append((f"/kinect/{kind}/image", frame.stamp, make.image(frame.stamp, encoding, pixels)))
+    bag = make.write(tmp_path / "demo", messages)
+    arguments = ["--seq", bag, "--info-topic", "/kinect/rgb/info", "--segmenter", "none", "--out", tmp_path / "out"]
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "NO_COLOR": "1"},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (metrics["sequence"], metrics["frames"], metrics["tracked"]) == ("demo", 10, 10)
+    trajectory = read_trajectory(tmp_path / "out" / "trajectory.txt")
+    assert trajectory.stamps.tolist() == pytest.approx(folder.stamps.tolist(), abs=1e-6)
+    assert folder.groundtruth is not None
+    assert evaluate(folder.groundtruth, trajectory).ate.rmse < 0.005

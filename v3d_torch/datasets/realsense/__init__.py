@@ -1,0 +1,12 @@
+"""Intel RealSense cameras, live and from files that RealSense software recorded."""
+
+from __future__ import annotations
+
+from v3d_torch.datasets.realsense.realsense_stream import (
+    RealSenseStream,
+    is_recording,
+    open_camera,
+    open_recording,
+)
+
+__all__ = ["RealSenseStream", "is_recording", "open_camera", "open_recording"]

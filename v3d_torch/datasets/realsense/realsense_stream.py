@@ -1,0 +1,136 @@
+"""RGB-D streams of Intel RealSense cameras (such as the D435i), live and from recordings."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.images import depth_to_metres
+from v3d_torch.datasets.realsense.camera import camera_from_intrinsics, depth_scale_from, import_librealsense
+from v3d_torch.datasets.realsense.device import Device, open_live_device, open_recorded_device
+from v3d_torch.datasets.ros import read_topic_types
+from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS, convert_to_rgb
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.types import RGBDFrame
+
+_WAIT_MS = 200
+"""Longest wait for one frame set, milliseconds: between waits, Ctrl-C and the end of the stream are noticed."""
+_SILENCE_TIMEOUT = 5.0
+"""Time without frames after which a camera counts as unplugged, seconds."""
+
+
+class RealSenseStream:
+    """RGB-D frames of a RealSense camera: depth aligned to colour, stamps from the clock of the camera.
+
+    The camera runs only while the stream is iterated. If frames are consumed more slowly than they arrive, a live
+    camera drops some of them; a recording drops none.
+
+    Args:
+        name: Name of the stream, for tables and error messages.
+        open_device: Opens the camera or file without starting it.
+        camera: Camera given by the user; None takes the calibration of the device.
+
+    Raises:
+        InputError: If ``open_device`` raises it, or the distortion model is not supported.
+    """
+
+    groundtruth = None
+
+    def __init__(self, name: str, open_device: Callable[[], Device], camera: CameraChoice = None) -> None:
+        device = open_device()
+        calibrated = None if camera is not None else camera_from_intrinsics(name, device.intrinsics, device.depth_unit)
+        self.name = name
+        self.camera: PinholeCamera = choose_camera(camera, Path(name), calibrated)
+        self._open_device = open_device
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        """Start the device and yield its frames.
+
+        Raises:
+            InputError: If the camera stops sending frames or sends an unsupported format.
+        """
+        rs = import_librealsense(self.name)
+        align = rs.align(rs.stream.color)
+        device = self._open_device()
+        device.start()
+        try:
+            index, previous_stamp = 0, -math.inf
+            for frames in self._wait_for_frames(device):
+                aligned = align.process(frames)
+                colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
+                stamp = colour.get_timestamp() / 1000
+                if stamp <= previous_stamp:  # the same colour image, paired with a newer depth image
+                    continue
+                yield self._convert_frame(index, stamp, colour, depth, depth_scale_from(device.depth_unit))
+                index, previous_stamp = index + 1, stamp
+        finally:
+            device.stop()
+
+    def _wait_for_frames(self, device: Device) -> Iterator[Any]:
+        """Yield frame sets with a colour and a depth image until the device ends."""
+        last_arrival = time.monotonic()
+        while True:
+            frames = device.wait(_WAIT_MS)
+            if frames is not None:
+                last_arrival = time.monotonic()
+                if frames.get_color_frame() and frames.get_depth_frame():
+                    yield frames
+            elif device.is_over():
+                return
+            elif time.monotonic() - last_arrival > _SILENCE_TIMEOUT:
+                raise InputError(f"{self.name}: sends no images; plug the camera into a USB 3 port and start again")
+
+    def _convert_frame(self, index: int, stamp: float, colour: Any, depth: Any, depth_scale: float) -> RGBDFrame:
+        encoding = colour.get_profile().format().name
+        if encoding not in COLOUR_ENCODINGS:
+            raise InputError(f"{self.name}: sends colour in the unsupported format {encoding}; record it as rgb8")
+        width, height = colour.get_width(), colour.get_height()
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise InputError(
+                f"{self.name}: sends {width}x{height} pixels, --camera has {self.camera.width}x{self.camera.height};"
+                " remove --camera to use the calibration of the device"
+            )
+        # librealsense reuses the memory of both images: convert_to_rgb and metres copy it.
+        pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOUR_ENCODINGS[encoding][0])
+        units = np.asanyarray(depth.get_data())
+        return RGBDFrame(
+            index, stamp, convert_to_rgb(encoding, pixels), depth_to_metres(units, depth_scale), camera=self.camera
+        )
+
+
+def open_camera(name: str, camera: CameraChoice = None, *, fps: float | None = None) -> RealSenseStream:
+    """Open a connected camera as a stream.
+
+    Args:
+        name: ``realsense:`` for any camera, ``realsense:SERIAL`` for one of several.
+        camera: Camera given by the user; None takes the calibration of the device.
+        fps: Frame rate to request, Hz; None takes the default.
+
+    Raises:
+        InputError: If the camera cannot be opened, see `open_live_device`.
+    """
+    serial = name.partition(":")[2]
+    label = f"realsense_{serial}" if serial else "realsense"  # without a colon: valid as a folder name
+    return RealSenseStream(label, partial(open_live_device, label, serial, fps), camera)
+
+
+def open_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:
+    """Open a file that RealSense software recorded as a stream, see `open_recorded_device`."""
+    return RealSenseStream(path.resolve().stem, partial(open_recorded_device, path), camera)
+
+
+def is_recording(path: Path) -> bool:
+    """Check whether a bag was recorded by RealSense software.
+
+    Such a bag needs librealsense: its depth is not aligned to colour, and it has no CameraInfo of ROS.
+    """
+    is_bag_file = path.suffix in (".bag", ".db3") and path.is_file()
+    return is_bag_file and any(topic.startswith("/device_0/") for topic in read_topic_types(path))

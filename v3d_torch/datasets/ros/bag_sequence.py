@@ -1,0 +1,217 @@
+"""RGB-D sequences in ROS 1 bags, ROS 2 bags and mcap files, read with rosbags and without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
+from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
+from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
+from v3d_torch.datasets.stored import Cursor, StoredSequence
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.download import Progress
+from v3d_torch.io.timestamps import associate
+
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+
+_DEPTH_SCALE = 1000.0
+"""Units per metre of 16-bit depth: ROS stores millimetres (REP 118)."""
+
+_REPAIR_COMMANDS = {
+    ".bag": "rosbag reindex",
+    ".mcap": "mcap recover",
+    ".db3": "ros2 bag reindex",
+    "": "ros2 bag reindex",
+}
+"""Command that repairs a bag, by file suffix; a ROS 2 folder has none."""
+
+_DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "")
+"""Distortion models whose first coefficients are k1, k2, p1, p2, k3; rational_polynomial has further ones."""
+
+
+class BagSequence(StoredSequence):
+    """RGB-D frames of a bag: colour and depth images of two topics, paired by their header stamps.
+
+    The constructor reads the bag once for the stamps; images are decoded when a frame is requested.
+
+    Args:
+        path: A ``.bag``, ``.db3`` or ``.mcap`` file, or the folder of a ROS 2 bag.
+        camera: Camera given by the user; None takes the CameraInfo of the colour images.
+        rgb_topic, depth_topic, info_topic: Topics given by the user; None chooses by name (see `choose_topics`).
+        progress: Called with the number of messages read so far.
+
+    Raises:
+        InputError: If the bag is damaged or has no matching colour, depth and camera.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        camera: CameraChoice = None,
+        *,
+        rgb_topic: str | None = None,
+        depth_topic: str | None = None,
+        info_topic: str | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self.path = path
+        self.topics = topics = choose_topics(path, read_topic_types(path), rgb_topic, depth_topic, info_topic)
+        chosen = choose_camera(camera, path, None if camera is not None else _read_camera(path, topics))
+        stamps, frame_ids = _index_messages(path, topics, progress)
+        depth_frame, colour_frame = frame_ids[topics.depth], frame_ids[topics.rgb]
+        is_confirmed = depth_topic is not None or topics.is_registered
+        if not is_confirmed and depth_frame and colour_frame and depth_frame != colour_frame:
+            raise InputError(
+                f"{path}: depth on {topics.depth} is in frame {depth_frame}, colour in frame {colour_frame}; record"
+                " depth that is registered to colour (align_depth), or give --depth-topic if this depth is registered"
+            )
+        colour_stamps, depth_stamps = (list(stamps[topic]) for topic in (topics.rgb, topics.depth))
+        pairs = associate(colour_stamps, depth_stamps, MAX_STAMP_DIFFERENCE)
+        if not pairs:
+            raise InputError(
+                f"{path}: no image on {topics.rgb} is within {MAX_STAMP_DIFFERENCE} s of an image on {topics.depth};"
+                " choose other topics with --rgb-topic and --depth-topic"
+            )
+        super().__init__(
+            path.resolve().stem,
+            [colour_stamps[i] for i, _ in pairs],
+            chosen,
+            delays=[depth_stamps[j] - colour_stamps[i] for i, j in pairs],
+        )
+        self._message_indices = [
+            (stamps[topics.rgb][colour_stamps[i]], stamps[topics.depth][depth_stamps[j]]) for i, j in pairs
+        ]
+        self._colour_messages, self._depth_messages = (
+            Cursor(partial(_read_messages, path, topic)) for topic in (topics.rgb, topics.depth)
+        )
+        self._read(0)  # raise errors that concern every frame now
+
+    def _read(self, index: int) -> tuple[Tensor, Tensor]:
+        i, j = self._message_indices[index]
+        colour_source, depth_source = f"{self.path}: {self.topics.rgb}", f"{self.path}: {self.topics.depth}"
+        image = decode_colour_message(self._colour_messages[i][-1], colour_source)
+        depth = decode_depth_message(self._depth_messages[j][-1], self.camera.depth_scale, depth_source)
+        return self._check_registered(
+            (colour_source, image), (depth_source, depth), "choose depth registered to colour with --depth-topic"
+        )
+
+
+def is_bag(path: Path) -> bool:
+    """Check whether a path is a file with the suffix of a bag, or the folder of a ROS 2 bag."""
+    metadata = path / "metadata.yaml"
+    return (path.suffix in (".bag", ".db3", ".mcap") and path.is_file()) or (
+        metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(encoding="utf-8", errors="replace")
+    )
+
+
+def read_topic_types(path: Path) -> dict[str, str]:
+    """Read the message type of each topic of a bag, such as ``sensor_msgs/msg/Image`` in ROS 1 and 2.
+
+    Raises:
+        InputError: If the bag cannot be read.
+    """
+    with _open_bag(path) as (reader, _):
+        return {connection.topic: connection.msgtype for connection in reader.connections}
+
+
+@contextmanager
+def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, str], Any]]]:
+    """Open a bag; yield its reader and the function that deserializes a message of a given type."""
+    try:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError(f"{path}: reading a bag needs rosbags ({error}); run pip install rosbags") from error
+    # All versions of ROS 1, and all of ROS 2, define images and cameras alike. The definitions in the bag are not
+    # parsed, so that a malformed definition of an unrelated topic cannot fail.
+    is_ros1 = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
+    try:
+        reader = Reader1(path) if is_ros1 else Reader2(path)
+        reader.open()
+    except Exception as error:
+        raise _damaged_bag_error(path, error) from error
+    try:
+        yield reader, store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    finally:
+        reader.close()
+
+
+def _damaged_bag_error(path: Path, error: Exception) -> InputError:
+    # rosbags does not wrap the errors of the libraries that it uses for each format.
+    cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+    repair = _REPAIR_COMMANDS[path.suffix]
+    return InputError(f"{path}: is damaged or not a bag ({cause}); copy it again, or repair it with {repair}")
+
+
+def _read_messages(path: Path, *topics: str) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, arrival time (nanoseconds) and message of some topics, in order of arrival."""
+    with _open_bag(path) as (reader, deserialize):
+        connections = [connection for connection in reader.connections if connection.topic in topics]
+        try:
+            for connection, arrival, content in reader.messages(connections):
+                yield connection.topic, arrival, deserialize(content, connection.msgtype)
+        except Exception as error:
+            raise _damaged_bag_error(path, error) from error
+
+
+def _index_messages(
+    path: Path, topics: BagTopics, progress: Progress | None
+) -> tuple[dict[str, dict[float, int]], dict[str, str]]:
+    """Index the colour and depth messages of a bag.
+
+    Returns:
+        For each topic, the message index by stamp (seconds, increasing); and for each topic, its frame_id.
+    """
+    indices: dict[str, dict[float, int]] = {topics.rgb: {}, topics.depth: {}}
+    frame_ids = dict.fromkeys(indices, "")
+    counts = dict.fromkeys(indices, 0)
+    for done, (topic, arrival, message) in enumerate(_read_messages(path, *indices), start=1):
+        topic_indices, index = indices[topic], counts[topic]
+        counts[topic] += 1
+        frame_ids[topic] = frame_ids[topic] or message.header.frame_id.strip("/")
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9 or arrival * 1e-9
+        # Drop images whose stamps are not increasing: the clock was set back.
+        if not topic_indices or stamp > next(reversed(topic_indices)):
+            topic_indices[stamp] = index
+        if progress is not None:
+            progress(done, None)
+    return indices, frame_ids
+
+
+def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
+    """Read the colour camera from the first CameraInfo message."""
+    if topics.info is None:
+        raise InputError(
+            f"{path}: has no CameraInfo topic for {topics.rgb}; name it with --info-topic, or give --camera"
+        )
+    info = next((message for _, _, message in _read_messages(path, topics.info)), None)
+    if info is None:
+        raise InputError(
+            f"{path}: has no messages on {topics.info}; name another topic with --info-topic, or give --camera"
+        )
+    # ROS 1 has field names in upper case, ROS 2 in lower case.
+    K, D, P = (getattr(info, name if hasattr(info, name) else name.lower()) for name in "KDP")
+    rows = (np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)).tolist()
+    intrinsics = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
+    distortion = [] if topics.is_rectified else np.asarray(D).tolist()
+    if any(distortion[5:]) or (any(distortion) and info.distortion_model not in _DISTORTION_MODELS):
+        raise InputError(
+            f"{path}: {topics.info} has the unsupported distortion model {info.distortion_model}; record rectified"
+            " images, or give --camera with k1, k2, p1, p2, k3"
+        )
+    size = {"width": info.width, "height": info.height, "depth_scale": _DEPTH_SCALE}
+    fields = intrinsics | size | {"distortion": (distortion + [0.0] * 5)[:5]}
+    return camera_from_fields(fields, f"{path}: {topics.info}")
