@@ -92,7 +92,8 @@ class V3DSLAM:
         self.compensate_rolling_shutter = RollingShutterCompensation(camera)
         self.compensate_depth_delay = DepthDelayCompensation(config, camera)
         self.map_tracker = MapTracker(config.tracking, config.features, camera)
-        self.mapper = Mapper(config, camera, self._known)
+        sparse_map = SparseMap.empty(config, camera) if self._known is None else self._known
+        self.mapper = Mapper(config, camera, sparse_map)
         self.loop_closer = LoopCloser(config.loop, self.register, self.map_tracker, config.tracking.local_keyframes)
         for keyframe in self.mapper.map.active_keyframes:
             self.loop_closer.add_keyframe(keyframe)

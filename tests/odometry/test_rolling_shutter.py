@@ -201,7 +201,7 @@ def test_only_landmarks_that_live_are_behind_features() -> None:
     sparse_map = mapped(KINECT)
     first = sparse_map.keyframes[0]
     shown = torch.where(torch.arange(len(first.landmarks)) % 2 == 0, first.landmarks, -1)
-    sparse_map.landmarks["alive"][shown[4]] = False
+    sparse_map.landmarks["active"][shown[4]] = False
     found, points = sparse_map.landmark_positions(shown)
     assert found.tolist() == [i for i in range(0, len(shown), 2) if i != 4]
     assert torch.equal(points, sparse_map.landmarks["point"][first.landmarks[found]])

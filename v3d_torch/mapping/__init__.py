@@ -1,1 +1,1 @@
-"""The map: keyframes, landmarks, bundle adjustment, the pose of every frame."""
+"""The map: keyframes, landmarks, local bundle adjustment, culling and map files."""

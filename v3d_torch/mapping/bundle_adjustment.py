@@ -1,7 +1,8 @@
-"""Bundle adjustment: keyframe poses and landmarks that explain all observations best (ORB-SLAM2, local mapping).
+"""Bundle adjustment: joint optimisation of keyframe poses and landmarks (ORB-SLAM2, local mapping).
 
-Levenberg-Marquardt on robust errors in pixels and inverse depth; landmarks are eliminated by the Schur complement
-(Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000); what is left, 6 unknowns per pose, is solved densely.
+Levenberg-Marquardt minimises robust errors of pixels and inverse depth. Landmarks are eliminated by the Schur
+complement (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000); the reduced system, with 6 unknowns per
+pose, is solved densely.
 
 Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with ``xi = [translation, rotation]``.
 """
@@ -20,14 +21,20 @@ from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
 from v3d_torch.optim.reprojection import Measurements, Whitened, chi_square, perspective, perspective_jacobian, whitened
 from v3d_torch.optim.schur import NormalEquations, columns, solve_normal_equations
 
+_NEGLIGIBLE_DAMPING = 1e-9
+"""Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
+
+State = tuple[Tensor, Tensor]
+"""Poses ``T_cw``, shape :math:`(K, 4, 4)`, and points, shape :math:`(P, 3)`."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Observations(Measurements):
-    """Measurements, and who sees whom in them.
+    """Measurements of landmarks by cameras.
 
     Attributes:
-        pose: index of the camera, int64, shape :math:`(M,)`.
-        point: index of the landmark, int64, shape :math:`(M,)`.
+        pose: Index of the pose that made each observation, int64, shape :math:`(M,)`.
+        point: Index of the observed point, int64, shape :math:`(M,)`.
     """
 
     pose: Tensor
@@ -36,17 +43,17 @@ class Observations(Measurements):
 
 @dataclass(frozen=True)
 class BundleResult:
-    """An adjusted map.
+    """Result of a bundle adjustment.
 
     Attributes:
-        T_cw: world to camera, float64, shape :math:`(K, 4, 4)`; fixed poses are as given, to the bit.
-        points: world frame, metres, float64, shape :math:`(P, 3)`.
-        chi2: squared error of each observation in sigmas, float64, shape :math:`(M,)`; infinite behind the camera.
-            Compare with ``observations.limit`` to find outliers.
-        cost_before: sum of robust squared errors at the start.
-        cost_after: the same at the end.
-        iterations: steps tried.
-        errors: at the end.
+        T_cw: World-to-camera poses, float64, shape :math:`(K, 4, 4)`; fixed poses are bit-identical to the input.
+        points: Positions of the landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
+        chi2: Squared whitened error of each observation, float64, shape :math:`(M,)`; infinite behind the camera. An
+            observation is an outlier if its error is greater than ``observations.limit``.
+        cost_before: Sum of the robust squared errors at the start.
+        cost_after: Sum of the robust squared errors at the result.
+        iterations: Number of steps tried.
+        residuals: Residuals at the result.
     """
 
     T_cw: Tensor
@@ -55,60 +62,60 @@ class BundleResult:
     cost_before: float
     cost_after: float
     iterations: int
-    errors: Errors
+    residuals: BundleResiduals
 
 
 @dataclass(frozen=True)
-class Errors:
-    """The errors at some poses and points. In all that follows the observations come last, sorted as in `Bundle`.
+class BundleResiduals:
+    """Reprojection residuals at given poses and points. Observations are the last dimension, sorted as in the problem.
 
     Attributes:
-        in_camera: point of each observation in its camera, metres, shape :math:`(3, M)`.
-        seen: where, as `perspective` gives it, shape :math:`(3, M)`.
-        R: rotations from the world into its camera, shape :math:`(3, 3, M)`.
-        residuals: in sigmas, shape :math:`(3, M)`.
-        weights: of Huber's kernel, shape :math:`(M,)`.
-        bundle: they are of.
+        in_camera: Observed point of each observation, camera frame, metres, shape :math:`(3, M)`.
+        projected: The observed points as `perspective` projects them, shape :math:`(3, M)`.
+        R_cw: World-to-camera rotation of each observation, shape :math:`(3, 3, M)`.
+        whitened: Residuals divided by their standard deviations, shape :math:`(3, M)`.
+        weights: Weights of the Huber kernel, shape :math:`(M,)`.
+        problem: The problem that the residuals belong to.
     """
 
     in_camera: Tensor
-    seen: Tensor
-    R: Tensor
-    residuals: Tensor
+    projected: Tensor
+    R_cw: Tensor
+    whitened: Tensor
     weights: Tensor
-    bundle: Bundle
+    problem: BundleProblem
 
     @cached_property
     def normal_equations(self) -> NormalEquations:
-        """The robust cost linearised, once for however many steps are tried from there."""
-        return self.bundle.linearise(self)
+        """Normal equations of the linearised robust cost; computed once for all damping factors."""
+        return self.problem.linearise(self)
 
-    def profile(self, drift: Tensor) -> tuple[float, float]:
-        r"""How the cost would go on if all was seen elsewhere, and adjusted anew: as far as it is a parabola.
+    def reduced_cost_derivatives(self, uv_jacobian: Tensor) -> tuple[float, float]:
+        r"""Derivatives of the minimum cost over poses and points, with respect to a parameter of the measurements.
 
-        With the errors' change :math:`j` by that and their Jacobian :math:`J` by poses and points, these follow by
-        :math:`-(J^T W J)^{-1} J^T W j`, and what is left of :math:`j` changes the cost.
+        Let :math:`j` be the derivative of the residuals with respect to the parameter, and :math:`J` their Jacobian
+        with respect to poses and points. When the parameter changes by one unit, the adjusted poses and points change
+        by :math:`-(J^T W J)^{-1} J^T W j`, and the cost changes by the part of :math:`j` that remains after that.
 
         Args:
-            drift: of the places where it was seen, pixels for one of whatever unit, float64, shape :math:`(M, 2)`.
+            uv_jacobian: Derivative of the measured pixels with respect to the parameter, float64,
+                shape :math:`(M, 2)`, in the order in which the observations were given.
 
         Returns:
-            First and second derivative of the cost by that unit.
+            First and second derivative of the cost.
         """
-        j = self.bundle.drifted(drift)
-        here, change = self.normal_equations, replace(self, residuals=j).normal_equations
-        xi, moved = solve_normal_equations(change, _NEXT_TO_NONE)
+        j = self.problem.whitened_derivative(uv_jacobian)
+        own, change = self.normal_equations, replace(self, whitened=j).normal_equations
+        pose_step, point_step = solve_normal_equations(change, _NEGLIGIBLE_DAMPING)
         first, second = (
-            float((self.weights * j * of).sum() + (xi * by.U[..., 6]).sum() + (moved.T * by.V[:, 3]).sum())
-            for of, by in ((self.residuals, here), (j, change))
+            float(
+                (self.weights * j * residuals).sum()
+                + (pose_step * equations.U[..., 6]).sum()
+                + (point_step.T * equations.V[:, 3]).sum()
+            )
+            for residuals, equations in ((self.whitened, own), (j, change))
         )
         return 2 * first, 2 * second
-
-
-_NEXT_TO_NONE = 1e-9
-"""Damping of a step that is to be taken whole."""
-
-State = tuple[Tensor, Tensor]  # T_cw (K, 4, 4), points (P, 3)
 
 
 @torch.no_grad()
@@ -121,39 +128,40 @@ def bundle_adjust(
     iterations: int = 10,
     tolerance: float = 1e-6,
 ) -> BundleResult:
-    """Adjust poses and points together.
+    """Optimise poses and points jointly.
 
     Args:
-        T_cw: world-to-camera poses, float64, shape :math:`(K, 4, 4)`.
-        points: landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
-        observations: of the points by the poses.
-        camera: intrinsics.
-        fixed: poses that stay as they are, bool, shape :math:`(K,)`. Without one the map as a whole may drift.
-        iterations: most Levenberg-Marquardt steps.
-        tolerance: relative change of the cost that ends them.
+        T_cw: World-to-camera poses, float64, shape :math:`(K, 4, 4)`.
+        points: Positions of the landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
+        observations: Observations of the points by the poses.
+        camera: Intrinsics.
+        fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`. Without a fixed pose the world frame can
+            drift.
+        iterations: Maximum number of Levenberg-Marquardt steps.
+        tolerance: Relative change of the cost that ends the optimisation.
 
     Returns:
-        Poses and points at the least robust cost found.
+        Poses and points with the lowest robust cost found.
     """
-    bundle = Bundle(observations, camera, fixed, len(points))
-    found = levenberg_marquardt((T_cw, points), bundle.errors_at, bundle.step, iterations, tolerance)
+    problem = BundleProblem(observations, camera, fixed, len(points))
+    found = levenberg_marquardt((T_cw, points), problem.residuals_at, problem.step, iterations, tolerance)
     T_cw, points = found.state
-    chi2 = bundle.as_given(chi_square(found.system.in_camera.T, found.system.residuals.T))
+    chi2 = problem.in_input_order(chi_square(found.system.in_camera.T, found.system.whitened.T))
     return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, found.system)
 
 
-class Bundle:
-    """The least-squares problem. Its observations are sorted: those of free poses first, pose by pose.
+class BundleProblem:
+    """Least-squares problem of a bundle adjustment. Its observations are sorted by pose, those of fixed poses last.
 
     Args:
-        observations: of the points by the poses.
-        camera: intrinsics.
-        fixed: poses that stay as they are, bool, shape :math:`(K,)`.
-        points: how many there are.
+        observations: Observations of the points by the poses.
+        camera: Intrinsics.
+        fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`.
+        point_count: Number of points.
     """
 
-    def __init__(self, observations: Observations, camera: PinholeCamera, fixed: Tensor, points: int) -> None:
-        self._points = points
+    def __init__(self, observations: Observations, camera: PinholeCamera, fixed: Tensor, point_count: int) -> None:
+        self._point_count = point_count
         self._free = torch.nonzero(~fixed)[:, 0]
         row = torch.full((len(fixed),), len(self._free))
         row[self._free] = torch.arange(len(self._free))
@@ -164,58 +172,58 @@ class Bundle:
         self._target = Whitened(target.scale[:, self._order], target.offset[:, self._order])
         self._limit, self._sigma = observations.limit[self._order], observations.pixel_sigma[self._order]
 
-    def as_given(self, of_each: Tensor) -> Tensor:
-        """Numbers of the sorted observations, (M,), in the order in which these were given."""
-        return torch.empty_like(of_each).index_copy_(0, self._order, of_each)
+    def in_input_order(self, values: Tensor) -> Tensor:
+        """Reorder one value per sorted observation, shape :math:`(M,)`, to the order of the given observations."""
+        return torch.empty_like(values).index_copy_(0, self._order, values)
 
-    def drifted(self, drift: Tensor) -> Tensor:
-        """How the errors change when what is seen moves by drift, pixels as given, (M, 2); shape :math:`(3, M)`."""
-        change = torch.zeros_like(self._target.scale)
-        change[:2] = -drift[self._order].T / self._sigma
-        return change
+    def whitened_derivative(self, uv_jacobian: Tensor) -> Tensor:
+        """Derivative of the whitened residuals, :math:`(3, M)`, for a derivative of the measured pixels, (M, 2)."""
+        derivative = torch.zeros_like(self._target.scale)
+        derivative[:2] = -uv_jacobian[self._order].T / self._sigma
+        return derivative
 
-    def errors_at(self, state: State) -> tuple[float, Errors]:
-        """The robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and what it is the sum of."""
+    def residuals_at(self, state: State) -> tuple[float, BundleResiduals]:
+        """Robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and the residuals."""
         T_cw, points = state
         T = columns(T_cw[:, :3].flatten(1).T, self._pose).unflatten(0, (3, 4))
         x, y, z = columns(points.T.contiguous(), self._point)
         in_camera = T[:, 3].addcmul(T[:, 0], x).addcmul_(T[:, 1], y).addcmul_(T[:, 2], z)
-        seen = perspective(in_camera)
-        residuals = self._target.errors(seen)
+        projected = perspective(in_camera)
+        residuals = self._target.errors(projected)
         costs, weights = huber((residuals * residuals).sum(dim=0), self._limit)
-        return float(costs.sum()), Errors(in_camera, seen, T[:, :3], residuals, weights, self)
+        return float(costs.sum()), BundleResiduals(in_camera, projected, T[:, :3], residuals, weights, self)
 
-    def linearise(self, errors: Errors) -> NormalEquations:
-        """The robust cost linearised at some errors."""
-        root, free = errors.weights.sqrt(), sum(self._counts)
-        by_pose = perspective_jacobian(errors.seen) * (self._target.scale * root)
-        by_point = _inner(errors.R.transpose(0, 1), by_pose[:3].transpose(0, 1))
-        residuals = (errors.residuals * root)[None]
-        V = _inner(by_point, torch.cat([by_point, residuals]))
+    def linearise(self, residuals: BundleResiduals) -> NormalEquations:
+        """Normal equations of the robust cost, linearised at the given residuals."""
+        root, free = residuals.weights.sqrt(), sum(self._counts)
+        by_pose = perspective_jacobian(residuals.projected) * (self._target.scale * root)
+        by_point = _inner(residuals.R_cw.transpose(0, 1), by_pose[:3].transpose(0, 1))
+        weighted = (residuals.whitened * root)[None]
+        V = _inner(by_point, torch.cat([by_point, weighted]))
         by_pose = by_pose[..., :free]
-        # Pose by pose, as the errors of one lie side by side: adding up outer products of single errors takes long.
-        of_each = torch.cat([by_pose, residuals[..., :free]]).split(self._counts, dim=-1)
+        # One matrix product for each pose, whose observations are adjacent: faster than a sum of outer products.
+        of_each = torch.cat([by_pose, weighted[..., :free]]).split(self._counts, dim=-1)
         U = [rows[None, :6] @ rows.T for rows in (of_one.flatten(1) for of_one in of_each)]
         index = self._point.expand(12, -1)
         return NormalEquations(
             U=torch.cat([V.new_zeros(0, 6, 7), *U]),
-            V=V.new_zeros(12, self._points).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, 4)),
+            V=V.new_zeros(12, self._point_count).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, 4)),
             W=_inner(by_point[..., :free], by_pose),
             pose=self._row[:free],
             point=self._point[:free],
         )
 
-    def step(self, state: State, errors: Errors, damping: float) -> State:
-        """The state after a damped Gauss-Newton step from errors there."""
+    def step(self, state: State, residuals: BundleResiduals, damping: float) -> State:
+        """State after a damped Gauss-Newton step from the given state and its residuals."""
         T_cw, points = state
-        xi, moved = solve_normal_equations(errors.normal_equations, damping)
-        return T_cw.index_copy(0, self._free, se3_exp(xi) @ T_cw[self._free]), points + moved
+        pose_step, point_step = solve_normal_equations(residuals.normal_equations, damping)
+        return T_cw.index_copy(0, self._free, se3_exp(pose_step) @ T_cw[self._free]), points + point_step
 
 
 def _inner(a: Tensor, b: Tensor) -> Tensor:
-    """Sums over the errors of products of derivatives, (A, 3, M) and (B, 3, M) to (A, B, M).
+    """Inner products over the three residuals of each observation, (A, 3, M) and (B, 3, M) to (A, B, M).
 
-    Error by error: as matrix products of three by three, one for each observation, it takes three times as long.
+    Elementwise operations over all observations are faster than one small matrix product for each.
     """
     total = a[:, None, 0] * b[:, 0]
     return total.addcmul_(a[:, None, 1], b[:, 1]).addcmul_(a[:, None, 2], b[:, 2])

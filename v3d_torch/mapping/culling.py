@@ -1,74 +1,130 @@
-"""Keyframes that the map can do without (ORB-SLAM2, local mapping: keyframe culling).
+"""Culling of landmarks and keyframes (ORB-SLAM2, local mapping: MapPointCulling and KeyFrameCulling).
 
-A camera that stays in a room makes keyframes for as long as it looks. One whose landmarks enough others see as well
-tells nothing new, but costs memory, and time in each adjustment.
+A camera that stays in one room keeps creating keyframes. A keyframe adds little information if enough other keyframes
+observe its landmarks, but costs memory and time in every bundle adjustment.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from v3d_torch.config import MappingConfig
+from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.tensor_table import unique_ids
 
+_MIN_FOUND_RATIO = 0.25
+"""Minimum ratio of frames that matched a landmark to frames that should have matched it (ORB-SLAM2)."""
 
-def cull_redundant_keyframes(sparse_map: SparseMap, newest: Keyframe, config: MappingConfig) -> None:
-    """Retire the neighbours of a new keyframe that are redundant by now; never the first, which fixes the world.
+_CONFIRMATION_KEYFRAMES = 3
+"""Keyframes after its own within which a landmark must be observed again, as in ORB-SLAM2."""
+
+_MIN_OBSERVATIONS = 2
+"""Observations that confirm a landmark: its own keyframe and another one."""
+
+
+def cull_landmarks(tables: MapTables) -> None:
+    """Cull landmarks with a low found ratio, and landmarks that no second keyframe has observed, in place.
+
+    A landmark is first checked when the keyframe after its own is complete.
 
     Args:
-        sparse_map: whose keyframes and observations are changed in place.
-        newest: the new keyframe.
-        config: when a keyframe is redundant.
+        tables: Data of the map.
     """
-    neighbours = sparse_map.covisible_keyframes(newest.landmark_ids, config.bundle_keyframes).tolist()
-    around = _Neighbourhood(sparse_map, neighbours)
+    landmarks, observations = tables.landmarks, tables.observations
+    age = len(tables.keyframes) - 1 - landmarks["keyframe"]
+    observers = torch.bincount(observations["landmark"][observations["valid"]], minlength=len(landmarks))
+    low_found_ratio = landmarks["found"] < _MIN_FOUND_RATIO * landmarks["visible"]
+    unconfirmed = (age == _CONFIRMATION_KEYFRAMES) & (observers < _MIN_OBSERVATIONS)
+    landmarks["active"][(low_found_ratio & (age > 0)) | unconfirmed] = False
+
+
+def cull_keyframes(tables: MapTables, references: Mapping[int, int]) -> None:
+    """Cull the given keyframes, in place: remove their observations and tie their poses to other keyframes.
+
+    Landmarks without an observation become inactive.
+
+    Args:
+        tables: Data of the map.
+        references: Index of the reference keyframe of each culled keyframe, by the index of the culled keyframe.
+    """
+    for keyframe in tables.keyframes:
+        keyframe.reference = references.get(keyframe.reference, keyframe.reference)
+    culled, empty = torch.tensor(list(references)), torch.zeros(0, dtype=torch.int64)
+    for index in references:
+        keyframe = tables.keyframes[index]
+        keyframe.features, keyframe.landmarks = keyframe.features[empty], empty
+    observations = tables.observations
+    observations.keep_rows(observations["valid"] & ~torch.isin(observations["keyframe"], culled))
+    observed = torch.bincount(observations["landmark"], minlength=len(tables.landmarks)) > 0
+    tables.landmarks["active"][~observed] = False
+
+
+def cull_redundant_keyframes(tables: MapTables, newest: Keyframe, config: MappingConfig) -> None:
+    """Cull redundant neighbours of a new keyframe, in place; the first keyframe always stays, it fixes the world frame.
+
+    Args:
+        tables: Data of the map.
+        newest: The new keyframe.
+        config: Criterion of redundancy, and size of the neighbourhood.
+    """
+    neighbours = covisible_keyframes(tables, newest.landmark_ids, config.bundle_keyframes).tolist()
+    neighbourhood = _Neighbourhood(tables, neighbours)
     references: dict[int, int] = {}
-    shares = around.redundancy(config.redundant_views)
+    ratios = neighbourhood.redundant_ratios(config.redundant_views)
     for index in neighbours:
-        if index in (0, newest.index) or shares[index] <= config.redundant_ratio:
+        if index in (0, newest.index) or ratios[index] <= config.redundant_ratio:
             continue
-        references[index] = around.nearest(index)
-        around.drop(index)
-        shares = around.redundancy(config.redundant_views)
-        references = {gone: references.get(reference, reference) for gone, reference in references.items()}
+        references[index] = neighbourhood.most_covisible(index)
+        neighbourhood.remove(index)
+        ratios = neighbourhood.redundant_ratios(config.redundant_views)
+        # A reference keyframe can itself be culled later.
+        references = {culled: references.get(reference, reference) for culled, reference in references.items()}
     if references:
-        sparse_map.cull_keyframes(references)
+        cull_keyframes(tables, references)
 
 
 class _Neighbourhood:
-    """Who sees the landmarks of some keyframes."""
+    """All observations of the landmarks that some keyframes observe."""
 
-    def __init__(self, sparse_map: SparseMap, keyframes: list[int]) -> None:
-        table = sparse_map.observations
-        usable = table["valid"] & sparse_map.landmarks["alive"][table["landmark"]]
-        theirs = torch.zeros(len(sparse_map.landmarks), dtype=torch.bool)
-        theirs[table["landmark"][usable & torch.isin(table["keyframe"], torch.tensor(keyframes))]] = True
-        rows = usable & theirs[table["landmark"]]
-        self._keyframe, self._octave = table["keyframe"][rows], table["octave"][rows]
-        landmarks, self._landmark = unique_ids(table["landmark"][rows], len(sparse_map.landmarks))
-        self._landmarks = len(landmarks)
-        self._levels, self._keyframes = sparse_map.features.levels, len(sparse_map.keyframes)
+    def __init__(self, tables: MapTables, keyframes: list[int]) -> None:
+        observations = tables.observations
+        usable = observations["valid"] & tables.landmarks["active"][observations["landmark"]]
+        by_keyframes = usable & torch.isin(observations["keyframe"], torch.tensor(keyframes))
+        observed = torch.zeros(len(tables.landmarks), dtype=torch.bool)
+        observed[observations["landmark"][by_keyframes]] = True
+        rows = usable & observed[observations["landmark"]]
+        self._keyframe, self._octave = observations["keyframe"][rows], observations["octave"][rows]
+        landmarks, self._landmark = unique_ids(observations["landmark"][rows], len(tables.landmarks))
+        self._landmark_count = len(landmarks)
+        self._keyframe_count = len(tables.keyframes)
+        self._levels = int(self._octave.max()) + 1 if len(self._octave) else 1
 
-    def redundancy(self, views: int) -> Tensor:
-        """Share of each keyframe's landmarks that so many others see on its level of scale, the next or a finer one."""
-        place = self._landmark * self._levels + self._octave
-        counts = torch.bincount(place, minlength=self._landmarks * self._levels)
-        up_to = counts.view(-1, self._levels).cumsum(dim=1)
-        others = up_to[self._landmark, (self._octave + 1).clamp(max=self._levels - 1)] - 1
-        enough = torch.bincount(self._keyframe[others >= views], minlength=self._keyframes)
-        return enough / torch.bincount(self._keyframe, minlength=self._keyframes).clamp(min=1)
+    def redundant_ratios(self, min_views: int) -> Tensor:
+        """Ratio of each keyframe's landmarks that enough others observe at the same, the next or a finer octave."""
+        cell = self._landmark * self._levels + self._octave
+        counts = torch.bincount(cell, minlength=self._landmark_count * self._levels)
+        up_to_octave = counts.view(-1, self._levels).cumsum(dim=1)
+        others = up_to_octave[self._landmark, (self._octave + 1).clamp(max=self._levels - 1)] - 1
+        redundant = torch.bincount(self._keyframe[others >= min_views], minlength=self._keyframe_count)
+        return redundant / torch.bincount(self._keyframe, minlength=self._keyframe_count).clamp(min=1)
 
-    def nearest(self, keyframe: int) -> int:
-        """The other keyframe that shares most landmarks with one; of those that share as many, the newest."""
+    def most_covisible(self, keyframe: int) -> int:
+        """The other keyframe that shares most landmarks with the given one; the newest, if several share as many."""
         others = self._keyframe[torch.isin(self._landmark, self._landmark[self._keyframe == keyframe])]
         shared = torch.bincount(others)
         shared[keyframe] = 0
         return int((shared * len(shared) + torch.arange(len(shared))).argmax())
 
-    def drop(self, keyframe: int) -> None:
-        """Go on without a keyframe."""
-        kept = self._keyframe != keyframe
-        self._keyframe, self._octave, self._landmark = self._keyframe[kept], self._octave[kept], self._landmark[kept]
+    def remove(self, keyframe: int) -> None:
+        """Remove the observations of a keyframe."""
+        others = self._keyframe != keyframe
+        self._keyframe, self._octave, self._landmark = (
+            self._keyframe[others],
+            self._octave[others],
+            self._landmark[others],
+        )

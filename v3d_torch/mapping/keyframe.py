@@ -1,4 +1,4 @@
-"""Keyframes of the map, and the loops between them."""
+"""Keyframes of the map, and loops between keyframes."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from v3d_torch.features.orb import Features
 
 @dataclass
 class Keyframe:
-    """A frame that the map keeps.
+    """A frame that is stored in the map.
 
     Attributes:
-        index: number of the keyframe, from 0.
-        frame: index of its frame in the sequence; -1 for a keyframe of an earlier run.
-        stamp: seconds.
-        T_cw: world to camera, float64, shape :math:`(4, 4)`; the back end moves it.
-        features: on pixels that stood still.
-        landmarks: id of the landmark behind each feature, -1 for none, int64, shape :math:`(N,)`.
-        disconnected: whether only a guess joins it to the rest of the map.
-        reference: index of the keyframe that it moves along with since it was retired; its own while it is part of the
-            map.
+        index: Index of the keyframe, from 0.
+        frame: Index of the frame in the sequence; -1 for a keyframe of an earlier run.
+        stamp: Timestamp, seconds.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`; changed by bundle adjustment and loop correction.
+        features: Features on static pixels; empty once the keyframe is culled.
+        landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
+        disconnected: True if the keyframe is joined to the rest of the map only by a guessed pose.
+        reference: Index of the reference keyframe. A culled keyframe moves rigidly with its reference keyframe; every
+            other keyframe is its own reference.
     """
 
     index: int
@@ -42,34 +42,34 @@ class Keyframe:
 
     @property
     def is_culled(self) -> bool:
-        """Whether the map does without it: it sees nothing any more, but frames and landmarks still hang on it."""
+        """True if the keyframe has no observations any more and only its pose is used, by frames and landmarks."""
         return self.reference != self.index
 
     @property
     def is_from_earlier_run(self) -> bool:
-        """Whether an earlier run made it."""
+        """True if the keyframe was created by an earlier run."""
         return self.frame < 0
 
     @property
     def landmark_ids(self) -> Tensor:
-        """Ids of the landmarks that it sees, int64, shape :math:`(L,)`."""
+        """IDs of the observed landmarks, int64, shape :math:`(L,)`."""
         return self.landmarks[self.landmarks >= 0]
 
 
 def stack_poses(keyframes: Sequence[Keyframe]) -> Tensor:
-    """World to camera of keyframes, float64, shape :math:`(K, 4, 4)`; K may be 0."""
+    """Return the world-to-camera poses of keyframes, float64, shape :math:`(K, 4, 4)`; K can be 0."""
     poses = [keyframe.T_cw[None] for keyframe in keyframes]
     return torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A motion between two keyframes that a place seen again tells.
+    """Relative pose of two keyframes, measured when a place was recognised.
 
     Attributes:
-        i: index of the older keyframe.
-        j: index of the newer one.
-        T_ij: pose of camera j in camera i, float64, shape :math:`(4, 4)`.
+        i: Index of the older keyframe.
+        j: Index of the newer keyframe.
+        T_ij: Pose of camera j in camera i, float64, shape :math:`(4, 4)`.
     """
 
     i: int

@@ -1,8 +1,8 @@
-"""Landmarks found again in the keyframes around a new one (ORB-SLAM2, local mapping).
+"""Landmark fusion between a new keyframe and its neighbours (ORB-SLAM2, local mapping: SearchInNeighbors).
 
-A keyframe makes landmarks of what tracking did not recognise. Many of them its neighbours see as well, as a feature
-without a landmark or as a landmark of their own; joined, they tie the keyframes together where else each would hang on
-its own depth image.
+A new keyframe creates landmarks from the features that tracking did not match. Many of the same points are already
+features or landmarks of neighbouring keyframes. Fusing them connects the keyframes; without fusion each keyframe would
+depend on its own depth image alone.
 """
 
 from __future__ import annotations
@@ -15,50 +15,55 @@ from v3d_torch.features.orb import measurements
 from v3d_torch.features.projection_matcher import ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.mapping.landmark_ids import contains
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.optim.reprojection import chi_square, reprojection
 
+_SEARCH_RADIUS = 3.0
+"""Radius of the projection matching, pixels at pyramid level 0 (ORB-SLAM2). Small, because both poses are known."""
+
 
 class LandmarkFusion:
-    """Joins the landmarks of a new keyframe with those of its neighbours.
+    """Fuses the landmarks of a new keyframe with those of its neighbours.
 
     Args:
-        config: of the whole system.
-        camera: of the keyframes.
+        config: Configuration of the whole system.
+        camera: Camera of the keyframes.
     """
 
     def __init__(self, config: Config, camera: PinholeCamera) -> None:
         self._config = config
         self._camera = camera
-        self._search = ProjectionMatcher(config.tracking, config.features, camera)
+        self._match = ProjectionMatcher(config.tracking, config.features, camera)
 
     def __call__(self, sparse_map: SparseMap, keyframe: Keyframe) -> None:
-        """Look for the landmarks of a keyframe in its neighbours, and for theirs in it.
+        """Match the landmarks of a keyframe in its neighbours, and the landmarks of the neighbours in the keyframe.
 
         Args:
-            sparse_map: whose landmarks and observations are changed in place.
-            keyframe: the newest.
+            sparse_map: Map; its landmarks and observations are changed in place.
+            keyframe: The newest keyframe.
         """
         covisible = sparse_map.covisible_keyframes(
             keyframe.landmark_ids, self._config.mapping.fusion_keyframes + 1
         ).tolist()
         neighbours = [sparse_map.keyframes[index] for index in covisible if index != keyframe.index]
         for neighbour in neighbours:
-            self._find(sparse_map, keyframe.landmark_ids, neighbour)
+            self._fuse(sparse_map, keyframe.landmark_ids, neighbour)
         if neighbours:
-            self._find(sparse_map, torch.cat([neighbour.landmark_ids for neighbour in neighbours]).unique(), keyframe)
+            landmarks = torch.cat([neighbour.landmark_ids for neighbour in neighbours]).unique()
+            self._fuse(sparse_map, landmarks, keyframe)
 
-    def _find(self, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe) -> None:
-        """Find those landmarks that a keyframe sees without knowing."""
+    def _fuse(self, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe) -> None:
+        """Match landmarks to features of a keyframe by projection, and fuse the matches."""
         features, config = keyframe.features, self._config
-        local = sparse_map.select_landmarks(
-            landmarks[~sparse_map.is_among(landmarks, keyframe.landmark_ids)].sort().values
-        )
-        seen = self._search.project(keyframe.T_cw, local)
-        row, feature = self._search(features, seen, local, config.mapping.fuse_radius).unbind(dim=1)
+        observed = contains(keyframe.landmark_ids, landmarks, len(sparse_map.landmarks))
+        local = sparse_map.select_landmarks(landmarks[~observed].sort().values)
+        projected = self._match.project(keyframe.T_cw, local)
+        row, feature = self._match(features, projected, local, _SEARCH_RADIUS).unbind(dim=1)
+        # Reject matches by reprojection error, depth included.
         in_camera = local.points[row] @ keyframe.T_cw[:3, :3].T + keyframe.T_cw[:3, 3]
         measured = measurements(features[feature], config.tracking, config.features)
-        fits = chi_square(in_camera, reprojection(in_camera, measured, self._camera)) <= measured.limit
-        found = torch.full_like(keyframe.landmarks, -1)
-        found[feature[fits]] = local.ids[row[fits]]
-        sparse_map.fuse_landmarks(keyframe, found)
+        inliers = chi_square(in_camera, reprojection(in_camera, measured, self._camera)) <= measured.limit
+        matches = torch.full_like(keyframe.landmarks, -1)
+        matches[feature[inliers]] = local.ids[row[inliers]]
+        sparse_map.fuse_landmarks(keyframe, matches)

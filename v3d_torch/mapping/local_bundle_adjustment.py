@@ -1,4 +1,4 @@
-"""Local bundle adjustment: a new keyframe, its neighbours and what they see (ORB-SLAM2, local mapping)."""
+"""Local bundle adjustment of a new keyframe, its covisible keyframes and their landmarks (ORB-SLAM2, local mapping)."""
 
 from __future__ import annotations
 
@@ -11,27 +11,34 @@ from v3d_torch.config import Config
 from v3d_torch.features.orb import pixel_sigma
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import rigid
-from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
+from v3d_torch.mapping.bundle_adjustment import BundleResult, Observations, bundle_adjust
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.readout_calibration import calibrate_readout
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.tensor_table import unique_ids
 from v3d_torch.odometry.rolling_shutter import Readout
 
-_SELDOM = 10
-"""After the first keyframes every so many ask for the readout: later turns of the camera tell more of it."""
+_MAX_ITERATIONS = 5
+"""Maximum number of Levenberg-Marquardt steps."""
+
+_COST_TOLERANCE = 1e-5
+"""Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations:
+a smaller change is a small fraction of one, and the next keyframe continues from there."""
+
+_LATE_CALIBRATION_INTERVAL = 10
+"""Interval in keyframes of the readout calibration after the first keyframes, for later rotations of the camera."""
 
 
 @dataclass(frozen=True)
 class LocalAdjustment:
-    """What a local bundle adjustment has found.
+    """Result of a local bundle adjustment.
 
     Attributes:
-        T_cw: world to camera of all keyframes, those adjusted and those left alone, float64, shape :math:`(K, 4, 4)`.
-        landmarks: ids of those adjusted, int64, shape :math:`(P,)`.
-        points: where they are, world frame, metres, float64, shape :math:`(P, 3)`.
-        outliers: rows of the observations that do not fit, int64, shape :math:`(O,)`.
-        readout: of the camera, as it is known by now.
+        T_cw: World-to-camera poses of all keyframes, adjusted or unchanged, float64, shape :math:`(K, 4, 4)`.
+        landmarks: IDs of the adjusted landmarks, int64, shape :math:`(P,)`.
+        points: Positions of the adjusted landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
+        outliers: Rows of the outliers in the table of observations, int64, shape :math:`(O,)`.
+        readout: Estimate of the camera's readout after the adjustment.
     """
 
     T_cw: Tensor
@@ -41,8 +48,12 @@ class LocalAdjustment:
     readout: Readout
 
     def apply(self, sparse_map: SparseMap) -> None:
-        """Change the map that was adjusted, in place; it has got no new keyframe since."""
-        # Landmarks with one observation do not take part: they go along with the keyframe that made them.
+        """Write the result to the map that was adjusted, in place; the map must have no newer keyframe.
+
+        Args:
+            sparse_map: The map.
+        """
+        # Landmarks with a single observation are not adjusted: they move with the keyframe that created them.
         sparse_map.move_keyframes(self.T_cw)
         sparse_map.landmarks["point"][self.landmarks] = self.points
         sparse_map.remove_observations(self.outliers)
@@ -53,24 +64,24 @@ class LocalAdjustment:
 def local_bundle_adjust(
     sparse_map: SparseMap, keyframe: Keyframe, config: Config, camera: PinholeCamera
 ) -> LocalAdjustment | None:
-    """Adjust the keyframes around a new one together with their landmarks, and find what does not fit.
+    """Adjust a new keyframe together with its covisible keyframes and their landmarks, and detect outliers.
 
-    Keyframes further off that see the same landmarks take part and stay where they are.
+    Other keyframes that observe the same landmarks take part with fixed poses.
 
     Args:
-        sparse_map: stays as it is.
-        keyframe: the new one.
-        config: size of the neighbourhood, noise.
-        camera: intrinsics.
+        sparse_map: The map; it is not changed.
+        keyframe: The new keyframe.
+        config: Configuration of the whole system: size of the window, measurement noise.
+        camera: Intrinsics.
 
     Returns:
-        None where there is nothing to adjust.
+        The result, or None if there are fewer than two keyframes or no observations to adjust.
     """
     window = sparse_map.covisible_keyframes(
         keyframe.landmarks[keyframe.landmarks >= 0], config.mapping.bundle_keyframes
     )
     table = sparse_map.observations
-    rows = _observations_around(sparse_map, window)
+    rows = _select_observations(sparse_map, window)
     if len(window) < 2 or len(rows) == 0:
         return None
     poses, pose = unique_ids(table["keyframe"][rows], len(sparse_map.keyframes))
@@ -78,7 +89,7 @@ def local_bundle_adjust(
     T_cw = sparse_map.T_cw
     fixed = ~torch.isin(poses, window) | (poses == 0)
     if not fixed.any():
-        fixed[0] = True  # the oldest, else the neighbourhood as a whole could drift
+        fixed[0] = True  # fix the gauge by the oldest keyframe
     observations = Observations(
         uv=table["uv"].index_select(0, rows),
         inverse_depth=table["inverse_depth"][rows],
@@ -87,28 +98,37 @@ def local_bundle_adjust(
         pose=pose,
         point=point,
     )
-    found = bundle_adjust(
+    result = bundle_adjust(
         T_cw[poses],
         sparse_map.landmarks["point"][landmarks],
         observations,
         camera,
         fixed,
-        iterations=config.mapping.bundle_iterations,
-        tolerance=config.mapping.bundle_tolerance,
+        iterations=_MAX_ITERATIONS,
+        tolerance=_COST_TOLERANCE,
     )
-    readout = sparse_map.readout
-    asks = keyframe.index <= config.rolling_shutter.calibration_keyframes or keyframe.index % _SELDOM == 0
-    if asks and config.rolling_shutter.enabled and not readout.is_certain:
-        readout = calibrate_readout(readout, *found.errors.profile(table["readout_jacobian"].index_select(0, rows)))
-    T_cw[poses[~fixed]] = rigid(found.T_cw[~fixed])
-    return LocalAdjustment(T_cw, landmarks, found.points, rows[found.chi2 > observations.limit], readout)
+    readout = _calibrated_readout(sparse_map, keyframe, result, rows, config)
+    T_cw[poses[~fixed]] = rigid(result.T_cw[~fixed])
+    return LocalAdjustment(T_cw, landmarks, result.points, rows[result.chi2 > observations.limit], readout)
 
 
-def _observations_around(sparse_map: SparseMap, window: Tensor) -> Tensor:
-    """Rows of all observations of living landmarks that the window sees and that are seen more than once."""
+def _calibrated_readout(
+    sparse_map: SparseMap, keyframe: Keyframe, result: BundleResult, rows: Tensor, config: Config
+) -> Readout:
+    """The readout of the camera after an adjustment of some rows of the table of observations."""
+    readout, index = sparse_map.readout, keyframe.index
+    is_due = index <= config.rolling_shutter.calibration_keyframes or index % _LATE_CALIBRATION_INTERVAL == 0
+    if not is_due or not config.rolling_shutter.enabled or readout.is_certain:
+        return readout
+    uv_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, rows)
+    return calibrate_readout(readout, *result.residuals.reduced_cost_derivatives(uv_jacobian))
+
+
+def _select_observations(sparse_map: SparseMap, window: Tensor) -> Tensor:
+    """Rows of all observations of active landmarks that the window observes and that have at least two observations."""
     table = sparse_map.observations
-    usable = table["valid"] & sparse_map.landmarks["alive"][table["landmark"]]
-    seen = torch.zeros(len(sparse_map.landmarks), dtype=torch.bool)
-    seen[table["landmark"][usable & torch.isin(table["keyframe"], window)]] = True
+    usable = table["valid"] & sparse_map.landmarks["active"][table["landmark"]]
+    observed = torch.zeros(len(sparse_map.landmarks), dtype=torch.bool)
+    observed[table["landmark"][usable & torch.isin(table["keyframe"], window)]] = True
     times = torch.bincount(table["landmark"][usable], minlength=len(sparse_map.landmarks))
-    return torch.nonzero(usable & (seen & (times > 1))[table["landmark"]])[:, 0]
+    return torch.nonzero(usable & (observed & (times > 1))[table["landmark"]])[:, 0]

@@ -1,4 +1,4 @@
-"""A map as columns of numbers, and back: what is kept of it in a file."""
+"""Conversion of a map and its static views to named columns, and back; the content of a map file."""
 
 from __future__ import annotations
 
@@ -10,34 +10,40 @@ from torch import Tensor
 
 from v3d_torch.features.orb import Features
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.mapping.tensor_table import TensorTable
 
 Columns = Mapping[str, Tensor]
-"""By group/name; the columns of a group have the same number of rows."""
+"""Columns by ``group/name``. The columns of one group have the same number of rows."""
 
 
-def to_columns(sparse_map: SparseMap, views: StaticViews) -> dict[str, Tensor]:
-    """All that a map and its views hold; of an empty map, the types and sizes that there are."""
-    keyframes, features = _empty()
-    for keyframe in sparse_map.keyframes:
+def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
+    """Convert a map and its views to columns. An empty map gives empty columns of the right type and shape.
+
+    Args:
+        tables: Data of the map.
+        views: Static views of its keyframes.
+    """
+    keyframes, features = _empty_tables()
+    for keyframe in tables.keyframes:
         keyframes.append(
             stamp=torch.tensor([keyframe.stamp], dtype=torch.float64),
             T_cw=keyframe.T_cw[None],
             disconnected=torch.tensor([keyframe.disconnected]),
             reference=torch.tensor([keyframe.reference]),
-            features=torch.tensor([len(keyframe.features)]),
+            feature_count=torch.tensor([len(keyframe.features)]),
         )
         features.append(**vars(keyframe.features), landmark=keyframe.landmarks)
-    loops, size = sparse_map.loops, (views.camera.height, views.camera.width)
-    units = [torch.zeros(0, *size, dtype=torch.uint16), *(view.units[None] for view in views)]
+    loops, size = tables.loops, (views.camera.height, views.camera.width)
+    depth_units = [torch.zeros(0, *size, dtype=torch.uint16), *(view.depth_units[None] for view in views)]
     colours = [torch.zeros(0, 3, *size, dtype=torch.uint8), *(view.colour[None] for view in views)]
     groups = {
         "keyframe": keyframes.columns,
         "feature": features.columns,
-        "landmark": sparse_map.landmarks.columns,
-        "observation": sparse_map.observations.columns,
+        "landmark": tables.landmarks.columns,
+        "observation": tables.observations.columns,
         "loop": {
             "i": torch.tensor([loop.i for loop in loops], dtype=torch.int64),
             "j": torch.tensor([loop.j for loop in loops], dtype=torch.int64),
@@ -45,17 +51,23 @@ def to_columns(sparse_map: SparseMap, views: StaticViews) -> dict[str, Tensor]:
         },
         "view": {
             "keyframe": torch.tensor([view.keyframe.index for view in views], dtype=torch.int64),
-            "units": torch.cat(units),
+            "depth_units": torch.cat(depth_units),
             "colour": torch.cat(colours),
         },
     }
     return {f"{group}/{name}": column for group, columns in groups.items() for name, column in columns.items()}
 
 
-def from_columns(columns: Columns, sparse_map: SparseMap, views: StaticViews) -> None:
-    """Fill an empty map and empty views; keyframes are of an earlier run then, their frame is -1."""
-    keyframes, features, loops, seen = (_group(columns, name) for name in ("keyframe", "feature", "loop", "view"))
-    ends = accumulate(keyframes["features"].tolist(), initial=0)
+def fill_from_columns(columns: Columns, tables: MapTables, views: StaticViews) -> None:
+    """Fill an empty map and empty views, in place. The keyframes are marked as from an earlier run (frame -1).
+
+    Args:
+        columns: Columns without inconsistencies, see `find_inconsistency`.
+        tables: Empty map.
+        views: Empty views.
+    """
+    keyframes, features = _select_group(columns, "keyframe"), _select_group(columns, "feature")
+    ends = accumulate(keyframes["feature_count"].tolist(), initial=0)
     for index, (first, last) in enumerate(pairwise(ends)):
         own = {name: column[first:last] for name, column in features.items()}
         landmarks = own.pop("landmark")
@@ -69,41 +81,42 @@ def from_columns(columns: Columns, sparse_map: SparseMap, views: StaticViews) ->
             disconnected=bool(keyframes["disconnected"][index]),
             reference=int(keyframes["reference"][index]),
         )
-        sparse_map.keyframes.append(keyframe)
-    sparse_map.landmarks.append(**_group(columns, "landmark"))
-    sparse_map.observations.append(**_group(columns, "observation"))
+        tables.keyframes.append(keyframe)
+    tables.landmarks.append(**_select_group(columns, "landmark"))
+    tables.observations.append(**_select_group(columns, "observation"))
+    loops, stored = _select_group(columns, "loop"), _select_group(columns, "view")
     for i, j, T_ij in zip(loops["i"].tolist(), loops["j"].tolist(), loops["T_ij"], strict=True):
-        sparse_map.loops.append(Loop(i, j, T_ij))
-    for index, units, colour in zip(seen["keyframe"].tolist(), seen["units"], seen["colour"], strict=True):
-        views.append(StaticView(sparse_map.keyframes[index], units, colour))
+        tables.loops.append(Loop(i, j, T_ij))
+    for index, units, colour in zip(stored["keyframe"].tolist(), stored["depth_units"], stored["colour"], strict=True):
+        views.append(StaticView(tables.keyframes[index], units, colour))
 
 
-def find_error(columns: Columns, sparse_map: SparseMap, views: StaticViews) -> str | None:
-    """What would break a run later, as far as columns can tell.
+def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticViews) -> str | None:
+    """Find a type, shape, value or index in columns that would break a later run.
 
     Args:
-        columns: of a file.
-        sparse_map: empty, of the right camera.
-        views: empty.
+        columns: Columns of a file.
+        sparse_map: Empty map with the camera of the file.
+        views: Empty views with the camera of the file.
 
     Returns:
-        The first thing found, None for nothing.
+        Description of the first inconsistency, or None.
     """
     lengths: dict[str, int] = {}
     for name, empty in to_columns(sparse_map, views).items():
         column, group = columns[name], name.split("/")[0]
         if column.dtype != empty.dtype or (len(column) and column.shape[1:] != empty.shape[1:]):
-            return f"{name} is {column.dtype} of shape {tuple(column.shape)}"
+            return f"{name} has dtype {column.dtype} and shape {tuple(column.shape)}"
         if lengths.setdefault(group, len(column)) != len(column):
-            return f"{name} has {len(column)} rows of {lengths[group]}"
+            return f"{name} has {len(column)} rows instead of {lengths[group]}"
         if not bool(column.isfinite().all() if column.dtype.is_floating_point else True):
             return f"{name} is not finite"
-    counts, owners = columns["keyframe/features"], columns["observation/keyframe"]
+    counts, owners = columns["keyframe/feature_count"], columns["observation/keyframe"]
     if int(counts.sum()) != lengths["feature"]:
-        return "keyframe/features does not add up"
+        return "keyframe/feature_count does not add up to the number of features"
     camera, keyframes, landmarks = sparse_map.camera, lengths["keyframe"], lengths["landmark"]
-    for name, least, beyond in (
-        ("keyframe/features", 0, lengths["feature"] + 1),
+    for name, minimum, end in (
+        ("keyframe/feature_count", 0, lengths["feature"] + 1),
         ("keyframe/reference", 0, keyframes),
         ("feature/pixel", 0, torch.tensor([camera.width, camera.height])),
         ("feature/landmark", -1, landmarks),
@@ -115,34 +128,33 @@ def find_error(columns: Columns, sparse_map: SparseMap, views: StaticViews) -> s
         ("loop/j", 0, keyframes),
         ("view/keyframe", 0, keyframes),
     ):
-        if not bool(((columns[name] >= least) & (columns[name] < beyond)).all()):
-            return f"{name} points to what is not there"
+        if not bool(((columns[name] >= minimum) & (columns[name] < end)).all()):
+            return f"{name} has values out of range"
     reference = columns["keyframe/reference"]
-    return None if torch.equal(reference[reference], reference) else "keyframe/reference points to what is retired"
+    return None if torch.equal(reference[reference], reference) else "keyframe/reference refers to a culled keyframe"
 
 
-def _empty() -> tuple[TensorTable, TensorTable]:
-    """Tables of keyframes and of their features, one keyframe's after another's."""
-    number, real = torch.int64, torch.float64
+def _empty_tables() -> tuple[TensorTable, TensorTable]:
+    """Tables of keyframes, and of the features of all keyframes in the order of the keyframes."""
     keyframes = TensorTable(
-        stamp=((), real),
-        T_cw=((4, 4), real),
+        stamp=((), torch.float64),
+        T_cw=((4, 4), torch.float64),
         disconnected=((), torch.bool),
-        reference=((), number),
-        features=((), number),
+        reference=((), torch.int64),
+        feature_count=((), torch.int64),
     )
     features = TensorTable(
-        uv=((2,), real),
-        readout_jacobian=((2,), real),
-        pixel=((2,), number),
-        depth=((), real),
-        octave=((), number),
+        uv=((2,), torch.float64),
+        readout_jacobian=((2,), torch.float64),
+        pixel=((2,), torch.int64),
+        depth=((), torch.float64),
+        octave=((), torch.int64),
         descriptors=((32,), torch.uint8),
-        landmark=((), number),
+        landmark=((), torch.int64),
     )
     return keyframes, features
 
 
-def _group(columns: Columns, group: str) -> dict[str, Tensor]:
-    """Columns of a group by their own names."""
+def _select_group(columns: Columns, group: str) -> dict[str, Tensor]:
+    """Columns of a group, by name without the group."""
     return {name.removeprefix(f"{group}/"): column for name, column in columns.items() if name.startswith(f"{group}/")}

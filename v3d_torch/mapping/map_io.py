@@ -1,7 +1,7 @@
-"""Maps as files: all that a later run needs to find its camera in one, to go on with it and to draw it.
+"""Map files: save a map, and load it in a later run for localisation, extension or drawing.
 
-A file is a zip of NumPy arrays (npz) without pickled objects, so that reading one runs no code of it. Who sees what
-together and the index of places are not in it: they follow from the rest.
+A map file is a zip archive of NumPy arrays (npz) without pickled objects, so that loading a file runs no code from it.
+Covisibility and the keyframe database are not stored, because they follow from the rest.
 """
 
 from __future__ import annotations
@@ -22,17 +22,26 @@ from v3d_torch.config import Config
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.files import StrPath, atomic_write
-from v3d_torch.mapping.map_columns import find_error, from_columns, to_columns
+from v3d_torch.mapping.map_columns import fill_from_columns, find_inconsistency, to_columns
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import Readout
 
-_FORMAT, _VERSION = "v3d_torch map", 3
+_FORMAT, _VERSION = "v3d_torch map", 4
 
-_ROOM, _RATIO = 1 << 28, 20
-"""Bytes that any file may unpack to, and by how much a larger one may grow: maps grow threefold."""
+_MIN_UNPACKED_LIMIT = 1 << 28
+"""Bytes to which any file may unpack, however small it is."""
 
-_DAMAGE = (
+_MAX_UNPACKED_RATIO = 20
+"""Additional bytes to which a file may unpack, relative to its size. Maps unpack to about three times their size."""
+
+_PIXEL_TOLERANCE = 0.01
+"""Maximum difference of intrinsics of the same camera, pixels: camera files differ in their number of digits."""
+
+_DISTORTION_TOLERANCE = 1e-5
+"""Maximum difference of distortion coefficients of the same camera."""
+
+_DAMAGE_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
@@ -43,16 +52,16 @@ _DAMAGE = (
     RuntimeError,
     MemoryError,
 )
-"""What zip archives, arrays and texts in them raise when bytes are wrong or missing."""
+"""Errors of zip archives, arrays and JSON with wrong or missing bytes."""
 
 
 @dataclass(frozen=True)
 class StoredMap:
-    """A map of an earlier run.
+    """Map of an earlier run.
 
     Attributes:
-        map: keyframes, whose frame is -1, and landmarks.
-        views: what keyframes saw standing still, for the coloured map; may be none.
+        map: Keyframes, with frame -1, and landmarks.
+        views: Static views of the keyframes, for dense reconstruction; can be empty.
     """
 
     map: SparseMap
@@ -60,15 +69,15 @@ class StoredMap:
 
 
 def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = None) -> None:
-    """Write a map; the same map makes the same bytes.
+    """Write a map file. Equal maps give identical files.
 
     Args:
-        path: of the file, whatever its suffix.
-        sparse_map: keyframes and landmarks.
-        views: what keyframes saw standing still; without them the map cannot be drawn later.
+        path: Path of the file, with any suffix.
+        sparse_map: Keyframes and landmarks.
+        views: Static views of the keyframes; without them a later run cannot reconstruct this part of the map densely.
 
     Raises:
-        OutputError: when the file cannot be written.
+        OutputError: If the file cannot be written.
     """
     views = StaticViews(sparse_map.camera, stride=1) if views is None else views
     about = {
@@ -77,8 +86,8 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
         "camera": asdict(sparse_map.camera),
         "readout": asdict(sparse_map.readout),
         "settings": {
-            "features.scale": sparse_map.features.scale,
-            "features.levels": sparse_map.features.levels,
+            "features.scale": sparse_map.features_config.scale,
+            "features.levels": sparse_map.features_config.levels,
             **({"dense_map.stride": views.stride} if len(views) else {}),
         },
     }
@@ -88,60 +97,63 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
 
 
 def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
-    """Read a map.
+    """Read a map file.
 
     Args:
-        path: of a file that `save_map` wrote.
-        camera: of the frames to come, which must be the map's.
-        config: of the run to come, which must look for the same features.
+        path: Path of a file written by `save_map`.
+        camera: Camera of the current run, which must be the camera of the map.
+        config: Configuration of the current run, with the feature settings of the map.
 
     Raises:
-        InputError: the file is not there, no map, damaged, or of another version, camera or configuration.
+        InputError: If the file is missing, not a map file, damaged, or of a different version, camera or configuration.
     """
     path = Path(path)
     stored = StoredMap(SparseMap(config.mapping, config.features, camera), StaticViews(camera, config.dense_map.stride))
     try:
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            _refuse_bomb(archive, path.stat().st_size)
-            about = json.loads(_read(archive, "about").tobytes())
+            _check_unpacked_size(archive, path.stat().st_size)
+            about = json.loads(_read_array(archive, "about").tobytes())
             if about["format"] != _FORMAT:
-                raise ValueError("it holds something else")
-            _refuse_other(str(path), about, camera, config)
+                raise ValueError(f"its format is not {_FORMAT!r}")
+            _check_compatibility(path, about, camera, config)
             stored.map.readout = Readout.from_dict(about["readout"])
-            columns = {name: torch.from_numpy(_read(archive, name)) for name in to_columns(stored.map, stored.views)}
+            names = to_columns(stored.map, stored.views)
+            columns = {name: torch.from_numpy(_read_array(archive, name)) for name in names}
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file that --save-map wrote") from error
-    except _DAMAGE as error:
-        raise InputError(f"{path}: is no map, or a damaged one ({error}); give a file that --save-map wrote") from error
-    if (wrong := find_error(columns, stored.map, stored.views)) is not None:
-        raise InputError(f"{path}: is a damaged map ({wrong}); give a file that --save-map wrote")
-    from_columns(columns, stored.map, stored.views)
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file written by --save-map") from error
+    except _DAMAGE_ERRORS as error:
+        raise InputError(
+            f"{path}: is not a map file or is damaged ({error}); give a file written by --save-map"
+        ) from error
+    if (problem := find_inconsistency(columns, stored.map, stored.views)) is not None:
+        raise InputError(f"{path}: is a damaged map file ({problem}); give a file written by --save-map")
+    fill_from_columns(columns, stored.map, stored.views)
     return stored
 
 
-def _refuse_bomb(archive: zipfile.ZipFile, size: int) -> None:
-    """Raise ValueError if the arrays take so much more than the file that it was made to fill the memory."""
-    claimed = sum(member.file_size for member in archive.infolist())
-    if claimed > _ROOM + _RATIO * size:
-        raise ValueError(f"it claims to hold {claimed} bytes in {size}")
+def _check_unpacked_size(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise ValueError if an archive of ``size`` bytes would unpack to far more bytes than any map."""
+    unpacked = sum(member.file_size for member in archive.infolist())
+    if unpacked > _MIN_UNPACKED_LIMIT + _MAX_UNPACKED_RATIO * size:
+        raise ValueError(f"it would unpack to {unpacked} bytes from {size}")
 
 
-def _read(archive: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:
-    """An array of a file, its checksum tested."""
+def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:
+    """Read an array of an archive; its checksum is verified."""
     return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
 
 
-def _refuse_other(path: str, about: Mapping[str, Any], camera: PinholeCamera, config: Config) -> None:
-    """Raise an error if a map is of another version, camera or configuration."""
+def _check_compatibility(path: Path, about: Mapping[str, Any], camera: PinholeCamera, config: Config) -> None:
+    """Raise InputError if a map is of a different version, camera or configuration."""
     if about["version"] != _VERSION:
         raise InputError(
-            f"{path}: is a map in version {about['version']} of its format, of which this program knows version"
-            f" {_VERSION}; read it with the program that wrote it, or make it anew"
+            f"{path}: has version {about['version']} of the map format, but this program reads version {_VERSION};"
+            " make the map again with --save-map, or use the program version that wrote it"
         )
-    theirs = PinholeCamera(**about["camera"])
-    if not _see_the_same(theirs, camera):
+    map_camera = PinholeCamera(**about["camera"])
+    if not _is_same_camera(map_camera, camera):
         raise InputError(
-            f"{path}: was made with another camera ({_said(theirs)}) than the sequence's ({_said(camera)});"
+            f"{path}: was made with another camera ({_describe(map_camera)}) than the sequence's ({_describe(camera)});"
             " give another map, or the right camera with --camera"
         )
     for key, value in about["settings"].items():
@@ -150,12 +162,16 @@ def _refuse_other(path: str, about: Mapping[str, Any], camera: PinholeCamera, co
             raise InputError(f"{path}: was made with {key}={value}, not {own}; add --set {key}={value}")
 
 
-def _see_the_same(a: PinholeCamera, b: PinholeCamera) -> bool:
-    """Whether two cameras differ by less than a hundredth of a pixel."""
-    first, second = (np.array([of.fx, of.fy, of.cx, of.cy, of.width, of.height]) for of in (a, b))
-    return np.allclose(first, second, rtol=0, atol=0.01) and np.allclose(a.distortion, b.distortion, rtol=0, atol=1e-5)
+def _is_same_camera(a: PinholeCamera, b: PinholeCamera) -> bool:
+    """Check whether two cameras are equal up to rounding."""
+    first, second = (
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]) for camera in (a, b)
+    )
+    return np.allclose(first, second, rtol=0, atol=_PIXEL_TOLERANCE) and np.allclose(
+        a.distortion, b.distortion, rtol=0, atol=_DISTORTION_TOLERANCE
+    )
 
 
-def _said(camera: PinholeCamera) -> str:
+def _describe(camera: PinholeCamera) -> str:
     pinhole = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}, {camera.width}x{camera.height}"
     return f"{pinhole}, distortion {list(camera.distortion)}" if camera.is_distorted else pinhole

@@ -1,6 +1,9 @@
-"""Decides when a frame becomes a keyframe, and grows the map with it (ORB-SLAM2, local mapping)."""
+"""Local mapping: keyframe decision, keyframe insertion and landmark fusion (ORB-SLAM2, Sec. III-C)."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
 
 from v3d_torch.config import Config
 from v3d_torch.features.orb import Features
@@ -8,77 +11,84 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_fusion import LandmarkFusion
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
 
 
 class Mapper:
-    """Grows a map.
+    """Decides when a frame becomes a keyframe, and inserts the keyframe into the map.
 
     Args:
-        config: of the whole system.
-        camera: of the frames.
-        known: map to go on with; None to begin a new one.
+        config: Configuration of the whole system.
+        camera: Camera of the frames.
+        sparse_map: Map to extend, empty or of an earlier run.
+
+    Attributes:
+        map: The map.
     """
 
-    def __init__(self, config: Config, camera: PinholeCamera, known: SparseMap | None = None) -> None:
+    def __init__(self, config: Config, camera: PinholeCamera, sparse_map: SparseMap) -> None:
         self._config = config
-        self._most_tracked = 0  # landmarks found by a frame since the last keyframe
-        self._untracked_since: float | None = None
-        self._search_neighbours = LandmarkFusion(config, camera)
-        if known is None:
-            known = SparseMap(config.mapping, config.features, camera)
-            if config.rolling_shutter.enabled:
-                known.readout = Readout.from_camera(camera, config.rolling_shutter)
-        self.map = known
+        self._fuse_landmarks = LandmarkFusion(config, camera)
+        self.map = sparse_map
+        self._most_tracked = 0  # maximum number of landmarks that a frame matched since the last keyframe
+        self._untracked_since: float | None = None  # timestamp, seconds
 
     def __call__(
-        self, frame: RGBDFrame, static: Features, estimate: FramePose, reference: Keyframe | None
+        self, frame: RGBDFrame, features: Features, pose: FramePose, reference: Keyframe | None
     ) -> Keyframe | None:
-        """Make ``frame`` a keyframe if the map needs one.
+        """Insert the frame as a keyframe if the map needs one.
 
         Args:
-            frame: newest.
-            static: its features on what stands still.
-            estimate: its pose.
-            reference: the keyframe that the frame is tied to; None while there is none.
+            frame: The current frame.
+            features: Features of the frame on static pixels.
+            pose: Pose of the frame, with the landmarks matched to its features.
+            reference: Reference keyframe of the frame; None if the map is empty.
 
         Returns:
             The new keyframe, or None.
         """
-        if not self._wants(frame, static, estimate):
+        if not self._needs_keyframe(frame, features, pose):
             return None
-        keyframe = self.map.insert_keyframe(frame.index, frame.stamp, estimate.T_cw, static, estimate.landmarks)
-        keyframe.disconnected = reference is not None and (
-            estimate.status is TrackingStatus.LOST or reference.disconnected
-        )
+        keyframe = self.map.insert_keyframe(frame.index, frame.stamp, pose.T_cw, features, pose.landmarks)
+        keyframe.disconnected = reference is not None and (pose.status is TrackingStatus.LOST or reference.disconnected)
         self._most_tracked, self._untracked_since = 0, None
-        self._search_neighbours(self.map, keyframe)
+        self._fuse_landmarks(self.map, keyframe)
         return keyframe
 
-    def _wants(self, frame: RGBDFrame, static: Features, estimate: FramePose) -> bool:
+    def state_dict(self) -> dict[str, Any]:
+        """Return the data that the keyframe decision keeps from frame to frame; the map has its own state."""
+        return {"most_tracked": self._most_tracked, "untracked_since": self._untracked_since}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self._most_tracked = state["most_tracked"]
+        self._untracked_since = state["untracked_since"]
+
+    def _needs_keyframe(self, frame: RGBDFrame, features: Features, pose: FramePose) -> bool:
+        """Decide whether the map needs a keyframe, and update the counters of this decision."""
         config = self._config.mapping
         if not config.enabled:
             return False
-        self._most_tracked = max(self._most_tracked, estimate.count)
-        if estimate.status is not TrackingStatus.TRACKED:
-            return self._may_go_on(frame.stamp, static, estimate.status)
+        self._most_tracked = max(self._most_tracked, pose.count)
+        if pose.status is not TrackingStatus.TRACKED:
+            return self._needs_untracked_keyframe(frame.stamp, features, pose.status)
         self._untracked_since = None
-        weak = estimate.count < max(config.min_tracked, config.min_tracked_ratio * self._most_tracked)
+        weak = pose.count < max(config.min_tracked, config.min_tracked_ratio * self._most_tracked)
         return weak or frame.index - self.map.keyframes[-1].frame >= config.max_keyframe_interval
 
-    def _may_go_on(self, stamp: float, static: Features, status: TrackingStatus) -> bool:
-        """Without the map for some time, a camera maps on from where it is thought to be, once it sees enough.
+    def _needs_untracked_keyframe(self, stamp: float, features: Features, status: TrackingStatus) -> bool:
+        """Decide whether to continue the map from a pose that was not tracked in the map.
 
-        A map of an earlier run is gone on with from a place that is found in it, and from no other.
+        This takes some time without tracking, during which the camera had enough features. A map of an earlier run
+        is only continued after relocalisation in that map.
         """
         config = self._config.mapping
         if status is TrackingStatus.LOST and self.map.keyframes and self.map.keyframes[-1].is_from_earlier_run:
             return False
-        if int((static.depth > 0).sum()) < config.min_tracked:
-            self._untracked_since = None  # a camera that is covered is not yet looking for its place
+        if int((features.depth > 0).sum()) < config.min_tracked:
+            self._untracked_since = None  # the camera is covered: relocalisation has not been possible yet
             return False
         if self._untracked_since is None:
             self._untracked_since = stamp
-        patience = config.restart_after if status is TrackingStatus.LOST else config.map_by_odometry_after
-        return not self.map.keyframes or stamp - self._untracked_since >= patience
+        delay = config.restart_after if status is TrackingStatus.LOST else config.map_by_odometry_after
+        return not self.map.keyframes or stamp - self._untracked_since >= delay

@@ -1,9 +1,9 @@
-"""How long the camera takes to read an image, by what explains the map best.
+r"""Online calibration of the rolling-shutter readout from the cost of local bundle adjustment.
 
-Rows that are read late bend the image of a camera that turns; a map bent alike explains it as well, until the camera
-turns another way. So a neighbourhood that was adjusted is asked what it would cost at another readout, all poses and
-points adjusted anew: where the parabola of that cost has its bottom, and how steep it is, tell the readout and how sure
-it is.
+A wrong readout distorts the images of a rotating camera. A map with the same distortion explains these images equally
+well, until the camera rotates in another direction. Calibration therefore uses the cost after all poses and points
+are adjusted again, as a function of the readout. Near the current readout this cost is a parabola: its minimum is an
+estimate of the readout, and its curvature is the information of that estimate.
 """
 
 from __future__ import annotations
@@ -11,30 +11,33 @@ from __future__ import annotations
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.odometry.rolling_shutter import Readout
 
-_MEMORY = 0.8
-"""Weight of what was known before: neighbourhoods of keyframes that follow each other share most observations, and the
-first ones knew the camera's motion least."""
+_PRIOR_WEIGHT = 0.8
+"""Weight of the earlier information. Successive local bundle adjustments share most of their observations, and the
+first ones have the least accurate camera motion."""
 
-_TRUST = 0.1
-"""Of the information that the steepness tells: depth and velocities err alike in many observations, and the first
-readouts that TUM's and 7-Scenes' sequences tell are off by three times what independent errors would do."""
+_INFORMATION_WEIGHT = 0.1
+"""Weight of the information from the curvature. Errors of depth and velocity are correlated between observations, so
+that the curvature overestimates the information; 0.1 stands for standard deviations that are three times larger."""
 
 
-def calibrate_readout(known: Readout, slope: float, curvature: float) -> Readout:
-    """The readout as it was known and the one that costs least, in one.
+def calibrate_readout(prior: Readout, slope: float, curvature: float) -> Readout:
+    """Combine the current estimate of the readout with the minimum of the cost.
 
     Args:
-        known: so far.
-        slope: first derivative of the cost, twice the negative log-likelihood, by the seconds of the readout, there.
-        curvature: second derivative.
+        prior: Current estimate of the readout.
+        slope: First derivative of the cost (twice the negative log-likelihood) with respect to the readout in
+            seconds, at the current estimate.
+        curvature: Second derivative of the cost with respect to the readout.
 
     Returns:
-        ``known`` where that is sure, and where no readout costs less than others: the camera stood still, or always
-        moved alike.
+        The new estimate. It equals ``prior`` if that is certain, or if the cost has no minimum because the camera
+        stood still or moved uniformly.
     """
-    if known.is_certain or curvature <= 0:
-        return known
-    bottom = known.seconds - slope / curvature
-    before, told = _MEMORY * known.information, _TRUST * curvature / 2
-    seconds = (before * known.seconds + told * min(max(bottom, -MAX_READOUT), MAX_READOUT)) / (before + told)
-    return Readout(seconds, before + told)
+    if prior.is_certain or curvature <= 0:
+        return prior
+    minimum = prior.seconds - slope / curvature
+    prior_information = _PRIOR_WEIGHT * prior.information
+    information = _INFORMATION_WEIGHT * curvature / 2
+    total = prior_information + information
+    seconds = (prior_information * prior.seconds + information * min(max(minimum, -MAX_READOUT), MAX_READOUT)) / total
+    return Readout(seconds, total)

@@ -1,9 +1,10 @@
-"""What keyframes saw standing still, kept for the dense maps that are made of it after all corrections."""
+"""Static depth and colour images of keyframes, stored for dense reconstruction after all corrections."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,51 +16,54 @@ from v3d_torch.mapping.keyframe import Keyframe
 
 @dataclass(frozen=True)
 class StaticView:
-    """What one keyframe saw standing still.
+    """Static depth and colour image of one keyframe.
 
     Attributes:
-        keyframe: whose pose places the view.
-        units: depth in units of `StaticViews.UNIT`, 0 = no measurement or not static, uint16, shape :math:`(h, w)`.
+        keyframe: Keyframe whose pose is the pose of the view.
+        depth_units: Depth in units of `StaticViews.UNIT`, 0 = no measurement or not static, uint16,
+            shape :math:`(h, w)`.
         colour: RGB, uint8, shape :math:`(3, h, w)`.
     """
 
     keyframe: Keyframe
-    units: Tensor
+    depth_units: Tensor
     colour: Tensor
 
     @property
     def T_cw(self) -> Tensor:
-        """World to camera, float64, shape :math:`(4, 4)`."""
+        """World-to-camera pose, float64, shape :math:`(4, 4)`."""
         return self.keyframe.T_cw
 
     @property
     def T_wc(self) -> Tensor:
-        """Camera to world, float64, shape :math:`(4, 4)`."""
+        """Camera-to-world pose, float64, shape :math:`(4, 4)`."""
         return invert(self.keyframe.T_cw)
 
     @property
     def depth(self) -> Tensor:
-        """Metres, float32, shape :math:`(h, w)`; 0 = no measurement or not static."""
-        return self.units.to(torch.float32) * StaticViews.UNIT
+        """Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement or not static."""
+        return self.depth_units.to(torch.float32) * StaticViews.UNIT
 
 
 class StaticViews:
-    """Images of an ideal pinhole camera that has a pixel for every so manieth of the real one.
+    """Static views of keyframes, as images of a pinhole camera of lower resolution without distortion.
 
-    The lens is taken out once, here: what is made of the views projects points by the pinhole alone.
+    The images are undistorted once, here; dense reconstruction then uses the pinhole projection alone.
 
     Args:
-        camera: of the frames.
-        stride: every n-th pixel is kept, by row and by column.
+        camera: Camera of the frames.
+        stride: Every n-th pixel is stored, by row and by column.
 
     Attributes:
-        stride: of the views.
-        camera: of the views, without distortion.
-        rays: exact direction through every pixel at unit depth, float32, shape :math:`(h, w, 3)`.
+        stride: Stride of the views, pixels of the frames.
+        camera: Camera of the views, without distortion.
+        rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a view's pixel is the exact ray
+            of the frame's pixel that it was taken from.
     """
 
     UNIT = 0.0002
-    """Metres: the unit of TUM's depth images, which divides the millimetre; 16 bits reach 13 m, beyond any use."""
+    """Unit of stored depth, metres: the unit of TUM's depth images, which divides the millimetre. With 16 bits the
+    maximum is 13 m, beyond the range of RGB-D cameras."""
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
         self.stride = stride
@@ -87,13 +91,13 @@ class StaticViews:
         return iter(self._views)
 
     def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor) -> None:
-        """Keep what a keyframe saw.
+        """Store the static pixels of a keyframe as a view.
 
         Args:
-            keyframe: whose pose will place the view.
-            image: uint8 RGB, shape :math:`(3, H, W)`.
-            depth: metres, shape :math:`(1, H, W)`.
-            static: pixels that stand still, bool, shape :math:`(H, W)`.
+            keyframe: Keyframe whose pose is the pose of the view.
+            image: RGB image, uint8, shape :math:`(3, H, W)`.
+            depth: Depth image, metres, shape :math:`(1, H, W)`.
+            static: Mask of static pixels, bool, shape :math:`(H, W)`.
         """
         units = (depth[0, self._v, self._u] / self.UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
@@ -101,5 +105,17 @@ class StaticViews:
         self.append(StaticView(keyframe, units, image[:, self._v, self._u]))
 
     def append(self, view: StaticView) -> None:
-        """Keep a view of this camera, and let go those of keyframes that the map does without by now."""
-        self._views = [known for known in self._views if not known.keyframe.is_culled] + [view]
+        """Append a view, and remove the views of keyframes that were culled.
+
+        Args:
+            view: View of this camera.
+        """
+        self._views = [stored for stored in self._views if not stored.keyframe.is_culled] + [view]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the views, as live objects."""
+        return {"views": self._views}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Replace the views by what `state_dict` of views of the same camera and stride returned."""
+        self._views = state["views"]

@@ -1,27 +1,31 @@
-"""A growable table of tensors: columns of equal length that rows are appended to."""
+"""Growable table of tensors: columns of equal length to which rows are appended."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+_INITIAL_ROWS = 256
+
 
 class TensorTable:
-    """Columns of tensors that grow together; appending costs amortised constant time per row.
+    """Tensor columns that grow together; appending costs amortised constant time per row.
 
     Args:
-        columns: name to (trailing shape, dtype).
+        columns: Trailing shape and dtype of each column, by name.
     """
 
     def __init__(self, **columns: tuple[tuple[int, ...], torch.dtype]) -> None:
         self._length = 0
-        self._columns = {name: torch.zeros(256, *shape, dtype=dtype) for name, (shape, dtype) in columns.items()}
+        self._columns = {
+            name: torch.zeros(_INITIAL_ROWS, *shape, dtype=dtype) for name, (shape, dtype) in columns.items()
+        }
 
     def __len__(self) -> int:
         return self._length
 
     def __getitem__(self, name: str) -> Tensor:
-        """A column as a view: writing to it changes the table."""
+        """Return a column as a view: writing to the view changes the table."""
         return self._columns[name][: self._length]
 
     @property
@@ -30,7 +34,14 @@ class TensorTable:
         return {name: self[name] for name in self._columns}
 
     def append(self, **rows: Tensor) -> Tensor:
-        """Add rows, every column given; returns their indices, int64."""
+        """Append rows and return their indices, int64.
+
+        Args:
+            rows: Values of every column, by name.
+
+        Raises:
+            KeyError: If a column is missing or unknown.
+        """
         if rows.keys() != self._columns.keys():
             raise KeyError(f"rows have {sorted(rows)}, the table has {sorted(self._columns)}")
         count = next(iter(rows.values())).shape[0]
@@ -46,21 +57,22 @@ class TensorTable:
         self._length = end
         return indices
 
-    def keep_rows(self, rows: Tensor) -> None:
-        """Drop all rows but those where ``rows``, bool, is true; the others move up, and keep their order."""
-        self._columns = {name: column[rows] for name, column in self.columns.items()}
-        self._length = int(rows.sum())
+    def keep_rows(self, mask: Tensor) -> None:
+        """Remove all rows except those in a bool mask; the remaining rows keep their order."""
+        self._columns = {name: column[mask] for name, column in self.columns.items()}
+        self._length = int(mask.sum())
 
 
-def unique_ids(numbers: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """What `torch.unique` tells of whole numbers from 0 to below ``count``, without sorting them.
+def unique_ids(ids: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Unique values of non-negative integers, as `torch.unique` returns them, without sorting.
 
     Args:
-        numbers: int64, shape :math:`(N,)`.
-        count: beyond the greatest that there may be.
+        ids: Integers in [0, count), int64, shape :math:`(N,)`.
+        count: Exclusive upper bound of the ids.
 
     Returns:
-        The different ones, ascending, int64, shape :math:`(D,)`, and where each number is among them, :math:`(N,)`.
+        The unique ids in ascending order, int64, shape :math:`(D,)`, and the position of each id among the unique
+        ids, int64, shape :math:`(N,)`.
     """
-    there = torch.zeros(count, dtype=torch.bool).index_fill_(0, numbers, True)
-    return torch.nonzero(there)[:, 0], (there.cumsum(0) - 1).index_select(0, numbers)
+    present = torch.zeros(count, dtype=torch.bool).index_fill_(0, ids, True)
+    return torch.nonzero(present)[:, 0], (present.cumsum(0) - 1).index_select(0, ids)

@@ -151,7 +151,7 @@ class CheckedSLAM(V3DSLAM):
             check_finite("the result", tracked)
             known = self.mapper.map
             check_finite(
-                "the map", {"T_cw": known.T_cw, "landmarks": known.landmarks["point"][known.landmarks["alive"]]}
+                "the map", {"T_cw": known.T_cw, "landmarks": known.landmarks["point"][known.landmarks["active"]]}
             )
             return tracked
 

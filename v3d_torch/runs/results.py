@@ -148,7 +148,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "status": [status.value for status in statuses],
         "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.mapper.map.active_keyframes),
         "known_keyframes": sum(keyframe.is_from_earlier_run for keyframe in slam.mapper.map.active_keyframes),
-        "landmarks": int(slam.mapper.map.landmarks["alive"].sum()),
+        "landmarks": int(slam.mapper.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
         "readout": slam.mapper.map.readout.seconds,
         "failure": failure,

@@ -128,7 +128,7 @@ class RerunViewer:
     def _show_map(self, slam: V3DSLAM) -> None:
         """Log all of the map and all poses as they are after the newest correction."""
         landmarks = slam.mapper.map.landmarks
-        points = landmarks["point"][landmarks["alive"]].numpy()
+        points = landmarks["point"][landmarks["active"]].numpy()
         grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/landmarks", grey)
         frusta = _frusta(self._camera, invert(stack_poses(slam.mapper.map.active_keyframes)))

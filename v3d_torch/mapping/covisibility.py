@@ -1,0 +1,79 @@
+"""Covisibility: which keyframes observe the same landmarks (ORB-SLAM, Mur-Artal et al., T-RO 2015, Sec. III-D)."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse
+import torch
+from torch import Tensor
+
+from v3d_torch.mapping.map_tables import MapTables
+
+
+def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
+    """Count the given landmarks that each keyframe observes.
+
+    Args:
+        tables: Data of the map.
+        landmarks: IDs, int64, shape :math:`(L,)`.
+
+    Returns:
+        Number of shared landmarks of each keyframe, int64, shape :math:`(K,)`.
+    """
+    observations = tables.observations
+    wanted = torch.zeros(len(tables.landmarks), dtype=torch.bool)
+    wanted[landmarks] = True
+    observers = observations["keyframe"][observations["valid"] & wanted[observations["landmark"]]]
+    return torch.bincount(observers, minlength=len(tables.keyframes))
+
+
+def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Tensor:
+    """Find the keyframes that observe most of the given landmarks, best first.
+
+    Args:
+        tables: Data of the map.
+        landmarks: IDs, int64, shape :math:`(L,)`.
+        count: Maximum number of keyframes.
+
+    Returns:
+        Indices of keyframes that observe at least one of the landmarks, int64, shape :math:`(<= count,)`.
+    """
+    shared = count_shared_landmarks(tables, landmarks)
+    score = shared * len(shared) + torch.arange(len(shared))  # the newer keyframe first, if the counts are equal
+    order = torch.argsort(score, descending=True)[:count]
+    return order[shared[order] > 0]
+
+
+def covisibility_edges(tables: MapTables, min_shared: int) -> Tensor:
+    """Find the edges of the pose graph: pairs of covisible keyframes, and pairs of consecutive active keyframes.
+
+    Two consecutive keyframes between which the camera was lost are no edge, because their relative pose is a guess.
+
+    Args:
+        tables: Data of the map.
+        min_shared: Minimum number of landmarks that a covisible pair shares.
+
+    Returns:
+        Pairs of keyframe indices (i, j), i < j, sorted, int64, shape :math:`(E, 2)`.
+    """
+    pairs = torch.cat([_covisible_pairs(tables, min_shared), _consecutive_pairs(tables)])
+    return pairs.unique(dim=0)
+
+
+def _covisible_pairs(tables: MapTables, min_shared: int) -> Tensor:
+    observations = tables.observations
+    valid = observations["valid"]
+    keyframes, landmarks = observations["keyframe"][valid].numpy(), observations["landmark"][valid].numpy()
+    shape = (len(tables.keyframes), len(tables.landmarks))
+    observed = scipy.sparse.csr_array((np.ones(len(keyframes)), (keyframes, landmarks)), shape=shape)
+    shared = scipy.sparse.triu(observed @ observed.T, k=1).tocoo()
+    enough = shared.data >= min_shared
+    return torch.from_numpy(np.stack([shared.row[enough], shared.col[enough]], axis=1).astype(np.int64))
+
+
+def _consecutive_pairs(tables: MapTables) -> Tensor:
+    active = tables.active_keyframes
+    index = torch.tensor([keyframe.index for keyframe in active], dtype=torch.int64)
+    disconnected = torch.tensor([keyframe.disconnected for keyframe in active], dtype=torch.bool)
+    connected = disconnected[:-1] == disconnected[1:]
+    return torch.stack([index[:-1][connected], index[1:][connected]], dim=1)

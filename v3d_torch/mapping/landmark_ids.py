@@ -1,0 +1,90 @@
+"""Landmark IDs: membership, merging of duplicate landmarks, and compaction of the landmark table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from v3d_torch.mapping.map_tables import MapTables
+
+_MAX_LANDMARKS_PER_OBSERVATION = 2
+"""Compaction starts above this ratio of table rows. Below, most rows are in use and compaction saves little."""
+
+
+def contains(ids: Tensor, queries: Tensor, count: int) -> Tensor:
+    """Check which landmark IDs are in a set, by a lookup table because `torch.isin` sorts.
+
+    Args:
+        ids: IDs in the set, int64, shape :math:`(L,)`; -1 for none.
+        queries: IDs to check, int64, shape :math:`(N,)`; -1 for none.
+        count: Number of landmarks in the map.
+
+    Returns:
+        Bool, shape :math:`(N,)`.
+    """
+    table = torch.zeros(count + 1, dtype=torch.bool)  # index -1 is the last entry
+    return table.index_fill_(0, ids, True)[queries]
+
+
+def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
+    """Merge pairs of landmarks, in place, unless one keyframe observes both landmarks of the pair.
+
+    Args:
+        tables: Data of the map.
+        kept: ID of the landmark of each pair that remains, int64, shape :math:`(L,)`.
+        merged: ID of the landmark of each pair that becomes inactive, int64, shape :math:`(L,)`. No ID occurs twice
+            in ``kept`` and ``merged``.
+    """
+    observations, landmarks = tables.observations, tables.landmarks
+    new_id = torch.arange(len(landmarks))
+    new_id[merged] = kept
+    affected = torch.zeros_like(new_id, dtype=torch.bool)
+    affected[kept] = affected[merged] = True
+    rows = torch.nonzero(observations["valid"] & affected[observations["landmark"]])[:, 0]
+    keyframe, landmark = observations["keyframe"][rows], observations["landmark"][rows]
+
+    # Two observations by one keyframe: the two landmarks of the pair are distinct points.
+    keys, times = (keyframe * len(new_id) + new_id[landmark]).unique(return_counts=True)
+    distinct = contains(keys[times > 1] % len(new_id), kept, len(landmarks))
+    new_id[merged[distinct]] = merged[distinct]
+    kept, merged = kept[~distinct], merged[~distinct]
+
+    changed = new_id[landmark] != landmark
+    rows, keyframe, landmark = rows[changed], keyframe[changed], new_id[landmark[changed]]
+    observations["landmark"][rows] = landmark
+    feature = observations["feature"][rows]
+    for index in keyframe.unique().tolist():
+        own = keyframe == index
+        tables.keyframes[index].landmarks[feature[own]] = landmark[own]
+    for counter in ("found", "visible"):
+        landmarks[counter][kept] += landmarks[counter][merged]
+    landmarks["active"][merged] = False
+
+
+def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:
+    """Remove inactive, unreferenced landmarks from the table, once the table is mostly unused.
+
+    Memory and time are then bounded by the current size of the map. The other landmarks get new IDs in the order of
+    the old ones; nothing else changes.
+
+    Args:
+        tables: Data of the map.
+        external_ids: Landmark IDs stored outside of the map, -1 for none, int64; updated in place.
+    """
+    if len(tables.landmarks) <= _MAX_LANDMARKS_PER_OBSERVATION * len(tables.observations):
+        return
+    tensors = [
+        tables.observations["landmark"],
+        *(keyframe.landmarks for keyframe in tables.keyframes),
+        *external_ids,
+    ]
+    distinct = {tensor.data_ptr(): tensor for tensor in tensors if len(tensor)}.values()  # some share their memory
+    needed = tables.landmarks["active"].clone()
+    for ids in distinct:
+        needed[ids[ids >= 0]] = True
+    tables.landmarks.keep_rows(needed)
+    new_id = needed.cumsum(0) - 1
+    for ids in distinct:
+        ids.copy_(torch.where(ids >= 0, new_id[ids], -1))

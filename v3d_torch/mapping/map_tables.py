@@ -1,0 +1,104 @@
+"""Data of the sparse map: keyframes, landmarks, observations and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from v3d_torch.mapping.keyframe import Keyframe, Loop, stack_poses
+from v3d_torch.mapping.tensor_table import TensorTable
+from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
+
+
+class MapTables:
+    """Keyframes, landmarks and observations of a sparse map, without operations that need a camera.
+
+    A landmark ID is a row of ``landmarks``.
+
+    Attributes:
+        keyframes: All keyframes, also culled ones, in order of their index.
+        landmarks: Table of landmarks.
+
+            - ``point``: Position, world frame, metres, float64, :math:`(3,)`.
+            - ``direction``: Unit viewing direction from the keyframe that created the landmark, world frame,
+              float64, :math:`(3,)`.
+            - ``reference_distance``: Distance at which the landmark appears on pyramid level 0, metres, float64.
+            - ``descriptor``: ORB descriptor, uint8, :math:`(32,)`.
+            - ``keyframe``: Index of the keyframe that created the landmark, int64. The landmark moves with it.
+            - ``found``: Number of frames that matched the landmark, int64.
+            - ``visible``: Number of frames that should have matched the landmark, int64.
+            - ``active``: False once the landmark is culled or merged into another one, bool.
+        observations: Table of observations of landmarks by keyframes.
+
+            - ``keyframe``: Index of the keyframe, int64.
+            - ``landmark``: ID of the landmark, int64.
+            - ``feature``: Index of the feature in the keyframe, int64.
+            - ``uv``: Undistorted pixel, float64, :math:`(2,)`.
+            - ``readout_jacobian``: Derivative of ``uv`` with respect to the readout, pixels/s, float64, :math:`(2,)`.
+            - ``inverse_depth``: 1/m, float64; 0 without a depth measurement.
+            - ``octave``: Pyramid level, int64.
+            - ``valid``: False once the observation is removed as an outlier, bool.
+        loops: Closed loops, oldest first.
+        readout: Readout of the camera with which the stored features were compensated.
+    """
+
+    def __init__(self) -> None:
+        self.keyframes: list[Keyframe] = []
+        self.landmarks = TensorTable(
+            point=((3,), torch.float64),
+            direction=((3,), torch.float64),
+            reference_distance=((), torch.float64),
+            descriptor=((32,), torch.uint8),
+            keyframe=((), torch.int64),
+            found=((), torch.int64),
+            visible=((), torch.int64),
+            active=((), torch.bool),
+        )
+        self.observations = TensorTable(
+            keyframe=((), torch.int64),
+            landmark=((), torch.int64),
+            feature=((), torch.int64),
+            uv=((2,), torch.float64),
+            readout_jacobian=((2,), torch.float64),
+            inverse_depth=((), torch.float64),
+            octave=((), torch.int64),
+            valid=((), torch.bool),
+        )
+        self.loops: list[Loop] = []
+        self.readout: Readout = GLOBAL_SHUTTER
+
+    @property
+    def active_keyframes(self) -> list[Keyframe]:
+        """Keyframes that are not culled."""
+        return [keyframe for keyframe in self.keyframes if not keyframe.is_culled]
+
+    @property
+    def T_cw(self) -> Tensor:
+        """World-to-camera poses of all keyframes, also culled ones, float64, shape :math:`(K, 4, 4)`; K can be 0."""
+        return stack_poses(self.keyframes)
+
+    @property
+    def references(self) -> Tensor:
+        """Index of the reference keyframe of each keyframe, int64, shape :math:`(K,)`."""
+        return torch.tensor([keyframe.reference for keyframe in self.keyframes], dtype=torch.int64)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the data of the map by attribute name, as live objects."""
+        return {
+            "keyframes": self.keyframes,
+            "landmarks": self.landmarks,
+            "observations": self.observations,
+            "loops": self.loops,
+            "readout": self.readout,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Replace the data of the map by what `state_dict` returned; the objects are shared, not copied."""
+        self.keyframes = state["keyframes"]
+        self.landmarks = state["landmarks"]
+        self.observations = state["observations"]
+        self.loops = state["loops"]
+        self.readout = state["readout"]
