@@ -149,7 +149,7 @@ def test_a_map_that_drops_what_nobody_needs_tracks_the_same_to_the_bit(
     """Landmarks that are dead and that nobody refers to go; the others get other ids, and nothing else changes."""
     runs = {}
     for name, worth in (("never", math.inf), ("with every keyframe", 0)):
-        monkeypatch.setattr("v3d_torch.mapping.sparse_map._LANDMARKS", worth)
+        monkeypatch.setattr("v3d_torch.mapping.landmark_ids._MAX_LANDMARKS_PER_OBSERVATION", worth)
         slam = V3DSLAM(demo.camera, config=load_config(None, ("segmentation.source=none",)))
         for index in range(60):
             slam(demo[index])
@@ -160,6 +160,6 @@ def test_a_map_that_drops_what_nobody_needs_tracks_the_same_to_the_bit(
     assert len(packed.landmarks) < 0.9 * len(whole.landmarks)
     assert torch.equal(*(slam.poses.trajectory().T_wc for slam in runs.values()))
     for name, column in packed.landmarks.columns.items():
-        assert torch.equal(column[packed.landmarks["alive"]], whole.landmarks[name][whole.landmarks["alive"]])
+        assert torch.equal(column[packed.landmarks["active"]], whole.landmarks[name][whole.landmarks["active"]])
     places = [known.landmarks["point"][known.observations["landmark"]] for known in (packed, whole)]
     assert torch.equal(*places)

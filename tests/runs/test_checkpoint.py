@@ -120,7 +120,7 @@ def test_the_scene_has_all_that_may_be_remembered(whole: Pipeline) -> None:
         TrackingStatus.LOST,
     }
     assert slam.loop_closer.loop_count > 0 and len(slam.mapper.map.keyframes) > 10
-    assert not slam.mapper.map.landmarks["alive"].all()
+    assert not slam.mapper.map.landmarks["active"].all()
     assert {"person", "unnamed"} <= {str(row["class"]) for row in rows}
     assert {"dynamic", "static"} <= {str(row["motion_state"]) for row in rows}
     assert any(row["missed"] for row in rows) and any(row["votes"] for row in rows)

@@ -84,6 +84,6 @@ def test_who_stands_before_landmarks_for_long_does_not_make_the_map_forget_them(
         wall.map.count_matches(found.found, found.visible)
     wall.map.insert_keyframe(1, 1.0, EYE, wall.seen[~left], found.landmarks)
     wall.map.cull_landmarks()
-    alive = wall.map.landmarks["alive"][wall.first.landmarks]
+    alive = wall.map.landmarks["active"][wall.first.landmarks]
     assert alive[~left].all()
     assert alive[left].all() if told else not alive[left].any()

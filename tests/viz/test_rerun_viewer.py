@@ -92,7 +92,7 @@ class RunLog:
         self.T_wc.append(invert(self._slam.poses.T_cw).numpy())
         self.positions.append(self._slam.poses.trajectory().T_wc[:, :3, 3].numpy())
         self.keyframes.append([keyframe.frame for keyframe in self._slam.mapper.map.keyframes])
-        self.landmarks.append(int(self._slam.mapper.map.landmarks["alive"].sum()))
+        self.landmarks.append(int(self._slam.mapper.map.landmarks["active"].sum()))
 
 
 CONFIG = (

@@ -29,7 +29,7 @@ from v3d_torch.optim.reprojection import (
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations
 
 _NEGLIGIBLE_DAMPING = 1e-9
-"""Damping for an undamped Gauss-Newton step; not zero, as the solver expects a damping."""
+"""Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
 
 State = tuple[Tensor, Tensor]
 """Poses ``T_cw``, shape :math:`(K, 4, 4)`, and points, shape :math:`(P, 3)`."""

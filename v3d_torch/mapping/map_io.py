@@ -115,7 +115,7 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
             _check_unpacked_size(archive, path.stat().st_size)
             about = json.loads(_read_array(archive, "about").tobytes())
             if about["format"] != _FORMAT:
-                raise ValueError(f"it has no format {_FORMAT!r}")
+                raise ValueError(f"its format is not {_FORMAT!r}")
             _check_compatibility(path, about, camera, config)
             stored.map.readout = Readout.from_dict(about["readout"])
             names = to_columns(stored.map, stored.views)

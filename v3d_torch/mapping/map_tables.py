@@ -1,4 +1,4 @@
-"""Data of the sparse map: keyframes, landmarks, observations and loops (Mur-Artal and Tardos, T-RO 2017, Sec. III)."""
+"""Data of the sparse map: keyframes, landmarks, observations and loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sparse map: keyframes, landmarks and their observations (ORB-SLAM2, Mur-Artal and Tardos, T-RO 2017, Sec. III)."""
+"""Sparse map: keyframes, landmarks and observations (ORB-SLAM2, Mur-Artal and Tardos, T-RO 2017, Sec. III)."""
 
 from __future__ import annotations
 

@@ -57,8 +57,8 @@ class StaticViews:
     Attributes:
         stride: Stride of the views, pixels of the frames.
         camera: Camera of the views, without distortion.
-        rays: Viewing ray of each pixel at unit depth, float32, shape :math:`(h, w, 3)`. The rays are exact: they
-            belong to the pixel of the frame nearest to the undistorted pixel.
+        rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a view's pixel is the exact ray
+            of the frame's pixel that it was taken from.
     """
 
     UNIT = 0.0002

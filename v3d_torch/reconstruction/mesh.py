@@ -1,4 +1,4 @@
-"""A triangle mesh of what stands still: marching cubes through the truncated signed distances, tile by tile."""
+"""Triangle mesh of the static scene: marching cubes on the truncated signed distances, tile by tile."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction.tsdf import BLOCK, integrate, surface_blocks
 
 _TILE = 16
-"""Blocks along a side of a tile, 2.6 m at 2 cm: a tile's 2 million voxels are what is in memory at a time."""
+"""Blocks along a side of a tile, 2.6 m at 2 cm per voxel. The 2 million voxels of one tile are in memory at a time."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles in colour.
+    """Coloured triangle mesh.
 
     Attributes:
-        vertices: world frame, metres, float32, shape :math:`(V, 3)`.
-        faces: vertices of each triangle, counterclockwise as seen from free space, int64, shape :math:`(F, 3)`.
-        normals: unit vectors out of the surface, one per vertex, float32, shape :math:`(V, 3)`.
-        colours: RGB, one per vertex, uint8, shape :math:`(V, 3)`.
+        vertices: Positions, world frame, metres, float32, shape :math:`(V, 3)`.
+        faces: Vertex indices of each triangle, counterclockwise when viewed from free space, int64,
+            shape :math:`(F, 3)`.
+        normals: Unit normal of each vertex that points out of the surface, float32, shape :math:`(V, 3)`.
+        colours: RGB of each vertex, uint8, shape :math:`(V, 3)`.
     """
 
     vertices: Tensor
@@ -37,76 +38,77 @@ class Mesh:
 
 @torch.no_grad()
 def fuse_mesh(views: StaticViews, config: DenseMapConfig) -> Mesh:
-    """The surface on which the mean signed distance of all views is zero.
+    """Extract the zero level of the mean signed distance of all views.
 
     Args:
-        views: of keyframes.
-        config: of the dense map.
+        views: Static views of the keyframes.
+        config: Configuration of the dense map and the mesh.
     """
     blocks = surface_blocks(views, config)
-    found_vertices, found_faces = [torch.zeros(0, 3, dtype=torch.float64)], [torch.zeros(0, 3, dtype=torch.int64)]
+    tile_vertices, tile_faces = [torch.zeros(0, 3, dtype=torch.float64)], [torch.zeros(0, 3, dtype=torch.int64)]
     count = 0
     for tile in blocks.div(_TILE, rounding_mode="floor").unique(dim=0):
-        vertices, faces = _march(tile, blocks, views, config)
-        found_vertices.append(vertices)
-        found_faces.append(faces + count)
+        vertices, faces = _extract_tile(tile, blocks, views, config)
+        tile_vertices.append(vertices)
+        tile_faces.append(faces + count)
         count += len(vertices)
-    # Neighbouring tiles share the voxels of the face between them: there they have the same vertices, bit for bit.
-    vertices, same = torch.cat(found_vertices).unique(dim=0, return_inverse=True)
-    faces = same[torch.cat(found_faces)]
-    faces = faces[(faces != faces.roll(1, dims=1)).all(dim=1)]  # some have no area, where the surface meets a voxel
+    # Adjacent tiles share the voxels of their common side, so that their vertices there are bit-identical.
+    vertices, merged = torch.cat(tile_vertices).unique(dim=0, return_inverse=True)
+    faces = merged[torch.cat(tile_faces)]
+    faces = faces[(faces != faces.roll(1, dims=1)).all(dim=1)]  # drop triangles without area
     vertices = vertices * config.mesh.voxel_size
-    normals = _normals(vertices, faces)
-    return Mesh(vertices.to(torch.float32), faces, normals.to(torch.float32), _colours(vertices, views, config))
+    normals = _vertex_normals(vertices, faces)
+    colours = _vertex_colours(vertices, views, config)
+    return Mesh(vertices.to(torch.float32), faces, normals.to(torch.float32), colours)
 
 
-def _march(tile: Tensor, blocks: Tensor, views: StaticViews, config: DenseMapConfig) -> tuple[Tensor, Tensor]:
-    """Surface in a tile: vertices in voxels from the world's origin, float64, (V, 3), and triangles of them, (F, 3)."""
-    places = blocks - tile * _TILE
-    within = ((places >= 0) & (places <= _TILE)).all(dim=1)  # with the first voxels of the tiles behind it
-    places = places[within]
-    distances, weights = integrate(blocks[within], views, config)
-    volume, known = (_assembled(values, places) for values in (distances, weights > 0))
-    cubes = known
+def _extract_tile(tile: Tensor, blocks: Tensor, views: StaticViews, config: DenseMapConfig) -> tuple[Tensor, Tensor]:
+    """Surface in a tile: vertices in voxels from the world's origin, float64, (V, 3), and triangles, (F, 3)."""
+    positions = blocks - tile * _TILE
+    inside = ((positions >= 0) & (positions <= _TILE)).all(dim=1)  # including the first blocks of the next tiles
+    positions = positions[inside]
+    distances, weights = integrate(blocks[inside], views, config)
+    volume, measured = (_assemble(values, positions) for values in (distances, weights > 0))
+    cubes = measured  # cubes whose eight corners are measured
     for axis in range(3):
-        cubes = cubes.narrow(axis, 0, known.shape[axis] - 1) & cubes.narrow(axis, 1, known.shape[axis] - 1)
-    nothing = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.int64)
-    if not (cubes.any() and volume[known].min() < 0 < volume[known].max()):
-        return nothing
-    # The mask of a cube is at its last corner. Distances grow towards free space, where the triangles' front is.
+        cubes = cubes.narrow(axis, 0, measured.shape[axis] - 1) & cubes.narrow(axis, 1, measured.shape[axis] - 1)
+    empty = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.int64)
+    if not (cubes.any() and volume[measured].min() < 0 < volume[measured].max()):
+        return empty
+    # marching_cubes reads the mask of a cube at its last corner. Distances increase towards the front of the triangles.
     mask = pad(cubes, (1, 0, 1, 0, 1, 0)).numpy()
     try:
         vertices, faces, _, _ = marching_cubes(volume.numpy(), 0.0, gradient_direction="descent", mask=mask)
-    except RuntimeError:  # no cube that is known has a surface in it
-        return nothing
-    first = (tile * _TILE * BLOCK).to(torch.float64)
-    return torch.from_numpy(vertices.astype(np.float64)) + first, torch.from_numpy(faces.astype(np.int64))
+    except RuntimeError:  # no surface in any measured cube
+        return empty
+    origin = (tile * _TILE * BLOCK).to(torch.float64)
+    return torch.from_numpy(vertices.astype(np.float64)) + origin, torch.from_numpy(faces.astype(np.int64))
 
 
-def _assembled(values: Tensor, places: Tensor) -> Tensor:
-    """Blocks put together at their places in a tile, up to the last; 0 where there is no block."""
-    sides = places.amax(dim=0) + 1
+def _assemble(values: Tensor, positions: Tensor) -> Tensor:
+    """Dense volume of the blocks at their positions in a tile; 0 where no block is."""
+    sides = positions.amax(dim=0) + 1
     box = values.new_zeros(*sides.tolist(), BLOCK, BLOCK, BLOCK)
-    box[tuple(places.unbind(dim=1))] = values
-    # Of the tiles behind it a tile has the first layer of voxels, for the cubes in between.
+    box[tuple(positions.unbind(dim=1))] = values
+    # Of the next tiles only the first layer of voxels is used, for the cubes between two tiles.
     x, y, z = (BLOCK * sides).clamp(max=BLOCK * _TILE + 1).tolist()
     return box.permute(0, 3, 1, 4, 2, 5).reshape((BLOCK * sides).tolist())[:x, :y, :z].contiguous()
 
 
-def _normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Of vertices: the mean of their triangles' normals, by area."""
+def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Mean normal of the triangles at each vertex, weighted by area, shape (V, 3)."""
     a, b, c = vertices[faces].unbind(dim=1)
-    twice = torch.linalg.cross(b - a, c - a)
+    area_normals = torch.linalg.cross(b - a, c - a)  # length: twice the area
     sums = torch.zeros_like(vertices)
     for corner in faces.unbind(dim=1):
-        sums.index_add_(0, corner, twice)
+        sums.index_add_(0, corner, area_normals)
     return normalize(sums, dim=1)
 
 
-def _colours(vertices: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
-    """Mean colour of each vertex in the views that see it, nearer ones before farther ones; uint8, (V, 3).
+def _vertex_colours(vertices: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
+    """Mean colour of each vertex in the views that observe it, weighted by inverse squared depth; uint8, (V, 3).
 
-    Vertices are a tenth of the voxels: colours are theirs alone, and not taken along through the voxels.
+    Colours are fused for vertices and not for voxels, because there are far fewer vertices.
     """
     sums, weights = vertices.new_zeros(len(vertices), 3), vertices.new_zeros(len(vertices), 1)
     for view in views:
@@ -116,8 +118,8 @@ def _colours(vertices: Tensor, views: StaticViews, config: DenseMapConfig) -> Te
         u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
         z = in_camera[:, 2]
         depth = view.depth[v, u]
-        seen = inside & (depth > 0) & ((depth - z).abs() < config.mesh.truncation)
-        weight = torch.where(seen, 1 / z.square(), 0.0)[:, None]
+        observed = inside & (depth > 0) & ((depth - z).abs() < config.mesh.truncation)
+        weight = torch.where(observed, 1 / z.square(), 0.0)[:, None]
         sums += weight * view.colour[:, v, u].T
         weights += weight
     return torch.where(weights > 0, sums / weights, 0.0).round().to(torch.uint8)

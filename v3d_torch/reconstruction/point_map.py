@@ -1,4 +1,4 @@
-"""The coloured map of what stands still: keyframes' static pixels, fused by voxels after all corrections."""
+"""Coloured point map of the static scene, fused by voxels from the static views of the keyframes."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from v3d_torch.config import Config
+from v3d_torch.config import Config, FreeSpaceConfig
 from v3d_torch.geometry.camera import back_project
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.mapping.static_views import StaticView, StaticViews
-from v3d_torch.reconstruction.free_space import seen_as_free
+from v3d_torch.objects.free_space_check import DepthView, is_free_space
 
 _BATCH = 1_000_000
-"""Points that wait to be taken into the map: hundreds of MB less than all at once, and as fast."""
+"""Points that are collected before they are fused. Batches bound the memory, and are as fast as a single fusion."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class PointMap:
     """Coloured points with normals.
 
     Attributes:
-        points: world frame, metres, float32, shape :math:`(N, 3)`.
+        points: Positions, world frame, metres, float32, shape :math:`(N, 3)`.
         colours: RGB, uint8, shape :math:`(N, 3)`.
-        normals: unit vectors out of the surface, float32, shape :math:`(N, 3)`.
+        normals: Unit normals that point out of the surface, world frame, float32, shape :math:`(N, 3)`.
     """
 
     points: Tensor
@@ -40,25 +40,27 @@ class PointMap:
 
 @torch.no_grad()
 def fuse_points(views: StaticViews, config: Config) -> PointMap:
-    """All views in the world, one point per voxel: the mean of place, colour and normal.
+    """Fuse all views into one point per voxel: the mean position, colour and normal.
 
-    What has no normal lies on the edge of a surface and stays out: depth there is a mean of what is before and behind.
-    So does what as many views look through as see it: people whom a mask missed are there in a few views only.
+    Pixels without a normal are excluded. They lie at the edge of a surface, where depth is a mean of foreground and
+    background. A fused point is removed if at least as many views observe free space at its position as observe a
+    surface there. This removes people that a mask missed, because they are at one position in few views only.
 
     Args:
-        views: of keyframes.
-        config: of the dense map, and of what counts as looked through.
+        views: Static views of the keyframes.
+        config: Configuration of the whole system: dense map, depth smoothing and free-space check.
     """
     size = config.dense_map.voxel_size
     sums, counts = torch.zeros(0, 9, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
-    waiting: list[Tensor] = []
+    batch: list[Tensor] = []
     for view in views:
-        waiting.append(_rows(view, views, config))
-        if sum(map(len, waiting)) > max(_BATCH, len(sums)):  # a map that grows is gone through ever more seldom
-            sums, counts, waiting = *_take_in(sums, counts, waiting, size), []
-    sums, counts = _take_in(sums, counts, waiting, size)
+        batch.append(_point_rows(view, views, config))
+        # The threshold grows with the map, so that a large map is not processed again for each view.
+        if sum(map(len, batch)) > max(_BATCH, len(sums)):
+            sums, counts, batch = *_fuse_batch(sums, counts, batch, size), []
+    sums, counts = _fuse_batch(sums, counts, batch, size)
     means = sums / counts[:, None]
-    means = means[~seen_as_free(means[:, :3], views, config.objects.free_space)]
+    means = means[~_is_observed_free(means[:, :3], views, config.objects.free_space)]
     return PointMap(
         points=means[:, :3].to(torch.float32),
         colours=means[:, 3:6].round().to(torch.uint8),
@@ -66,8 +68,8 @@ def fuse_points(views: StaticViews, config: Config) -> PointMap:
     )
 
 
-def _rows(view: StaticView, views: StaticViews, config: Config) -> Tensor:
-    """What a view adds to the map: place, colour and normal of its points, float64, shape (N, 9)."""
+def _point_rows(view: StaticView, views: StaticViews, config: Config) -> Tensor:
+    """Position, colour and normal of the points of a view, world frame, float64, shape (N, 9)."""
     depth = view.depth[None, None]
     smooth = smooth_depth(depth, config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio)
     normals = surface_normals(back_project(smooth, views.rays))[0]
@@ -78,14 +80,38 @@ def _rows(view: StaticView, views: StaticViews, config: Config) -> Tensor:
     return torch.cat([points @ R_wc.T + t_wc, colours, normals[keep].to(torch.float64) @ R_wc.T], dim=1)
 
 
-def _take_in(sums: Tensor, counts: Tensor, waiting: list[Tensor], size: float) -> tuple[Tensor, Tensor]:
-    """Sums and numbers of points per voxel, with those that wait."""
-    sums = torch.cat([sums, *waiting])
+def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) -> tuple[Tensor, Tensor]:
+    """Sums and numbers of points per voxel, after a batch of points is added."""
+    sums = torch.cat([sums, *batch])
     counts = torch.cat([counts, torch.ones(len(sums) - len(counts), dtype=counts.dtype)])
-    places = (sums[:, :3] / counts[:, None])[None]
-    voxels = voxel_pool(places, torch.ones(places.shape[:2], dtype=torch.bool), size)
+    means = (sums[:, :3] / counts[:, None])[None]
+    voxels = voxel_pool(means, torch.ones(means.shape[:2], dtype=torch.bool), size)
     occupied = voxels.counts.shape[1]
     return (
         sums.new_zeros(occupied, 9).index_add_(0, voxels.voxel_index[0], sums),
         counts.new_zeros(occupied).index_add_(0, voxels.voxel_index[0], counts),
     )
+
+
+def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) -> Tensor:
+    """Check which points lie where at least one view, and at least as many as observe a surface, observe free space.
+
+    Points closer together than the depth tolerance share one check, which is faster.
+
+    Args:
+        points: Positions, world frame, metres, float64, shape :math:`(P, 3)`.
+        views: Static views of the keyframes.
+        config: Tolerances of the free-space check.
+
+    Returns:
+        Bool, shape :math:`(P,)`.
+    """
+    cells = voxel_pool(points[None], torch.ones(1, len(points), dtype=torch.bool), config.min_tolerance / 2)
+    centres = cells.means[0]
+    free, occupied = torch.zeros(2, len(centres), dtype=torch.int32)
+    for view in views:
+        depth_view = DepthView(view.keyframe.stamp, view.depth[None], view.T_cw)
+        state = is_free_space(centres, depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
+        free += state == 1
+        occupied += state == 0
+    return ((free > 0) & (free >= occupied))[cells.voxel_index[0]]

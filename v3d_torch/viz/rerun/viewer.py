@@ -135,7 +135,7 @@ class RerunViewer:
     def _log_map(self, slam: V3DSLAM) -> None:
         """Log the whole map and all poses after the latest correction."""
         landmarks = slam.mapper.map.landmarks
-        points = landmarks["point"][landmarks["alive"]].numpy()
+        points = landmarks["point"][landmarks["active"]].numpy()
         grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/landmarks", grey)
         frustums = _frustums(self._camera, invert(stack_poses(slam.mapper.map.active_keyframes)))
