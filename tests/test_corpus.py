@@ -124,7 +124,7 @@ def test_damaged_input_ends_as_expected_in_a_subprocess(category: str, name: str
     case = next(case for case in CATEGORIES[category] if case.name == name)
     case.damage(place)
     command = [sys.executable, "-m", "v3d_torch.run", *arguments(place)]
-    environment = os.environ | {"PYTHONPATH": str(Path(run.__file__).parents[1]), "COLUMNS": "200", "NO_COLOR": "1"}
+    environment = os.environ | {"PYTHONPATH": str(Path(run.__file__).parents[2]), "COLUMNS": "200", "NO_COLOR": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)  # noqa: S603
     assert_expected_end(place, case.expected, done.returncode, done.stdout, done.stderr)
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, camera_position, colour, depth, png
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, write
+from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, colour, depth, png, camera_position
+from helpers.corpus.case import Case, Damage, Workspace, Succeeds, Fails, all_of, first_half, add_options, write
 
 MILLIMETRES = png((depth() // 5).astype(np.uint16))
 CAMERA_MATRIX = f"{FOCAL} 0 {(WIDTH - 1) / 2} 0\n0 {FOCAL} {(HEIGHT - 1) / 2} 0\n0 0 1 0\n0 0 0 1\n"
@@ -20,7 +20,7 @@ def pose(frame: int) -> str:
     return f"1 0 0 {x / FOCAL}\n0 1 {-1e-6 * frame} {y / FOCAL}\n0 {1e-6 * frame} 1 0\n0 0 0 1\n"
 
 
-def take(files: dict[str, bytes]) -> Damage:
+def use_files(files: dict[str, bytes]) -> Damage:
     """Write these files to a new folder and use it as the sequence."""
 
     def make(place: Workspace) -> None:
@@ -65,7 +65,7 @@ def images() -> dict[str, bytes]:
 
 def changed(files: dict[str, bytes], name: str, change: Callable[[bytes], bytes]) -> Damage:
     """Use these files as the sequence, after a change of one of them."""
-    return take(files | {name: change(files[name])})
+    return use_files(files | {name: change(files[name])})
 
 
 def larger_colour(files: dict[str, bytes]) -> dict[str, bytes]:
@@ -96,9 +96,9 @@ def icl_nuim(groundtruth: str) -> Damage:
 
 
 CASES = [
-    Case("ScanNet", take(scannet()), Succeeds()),
+    Case("ScanNet", use_files(scannet()), Succeeds()),
     Case("ScanNet, lost pose", changed(scannet(), "pose/3.txt", lambda content: LOST), Succeeds()),
-    Case("ScanNet, no poses", take(without(scannet(), "pose")), Succeeds(max_ate=None)),
+    Case("ScanNet, no poses", use_files(without(scannet(), "pose")), Succeeds(max_ate=None)),
     Case(
         "ScanNet, truncated pose",
         changed(scannet(), "pose/3.txt", first_half),
@@ -138,13 +138,13 @@ CASES = [
     ),
     Case(
         "ScanNet, no depth",
-        take(without(scannet(), "depth") | {"depth/x.txt": b""}),
+        use_files(without(scannet(), "depth") | {"depth/x.txt": b""}),
         Fails(
             "{root}/take: no colour image has the same frame number as a depth image; check that both belong to"
             " the same recording"
         ),
     ),
-    Case("7-Scenes", take(seven_scenes()), Succeeds()),
+    Case("7-Scenes", use_files(seven_scenes()), Succeeds()),
     Case(
         "7-Scenes, pose of words",
         changed(seven_scenes(), "frame-000003.pose.txt", lambda content: b"lost\n"),
@@ -164,7 +164,7 @@ CASES = [
     ),
     Case(
         "7-Scenes, colour without depth",
-        take(without(seven_scenes(), *(f"frame-{i:06d}.depth" for i in range(1, FRAMES)))),
+        use_files(without(seven_scenes(), *(f"frame-{i:06d}.depth" for i in range(1, FRAMES)))),
         Succeeds(1, max_ate=None),
     ),
     Case(
@@ -207,22 +207,18 @@ CASES = [
     ),
     Case(
         "images without timestamps",
-        take(images()),
+        use_files(images()),
         Fails("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
     ),
-    Case(
-        "images without timestamps, with --fps",
-        all_of(take(images()), add_options("--fps", "10")),
-        Succeeds(max_ate=None),
-    ),
+    Case("images without timestamps, with --fps", all_of(use_files(images()), add_options("--fps", "10")), Succeeds(max_ate=None)),
     Case(
         "images, one without depth",
-        all_of(take(without(images(), "depth/7")), add_options("--fps", "10")),
+        all_of(use_files(without(images(), "depth/7")), add_options("--fps", "10")),
         Succeeds(7, max_ate=None),
     ),
     Case(
         "images that cannot be paired",
-        all_of(take(without(images(), "depth") | {"depth/a.png": png(depth())}), add_options("--fps", "10")),
+        all_of(use_files(without(images(), "depth") | {"depth/a.png": png(depth())}), add_options("--fps", "10")),
         Fails(
             "{root}/take: has 8 colour and 1 depth images that cannot be paired by name; give the two images of"
             " a frame the same name"
@@ -230,7 +226,7 @@ CASES = [
     ),
     Case(
         "images in too many folders",
-        all_of(take(images() | {"rgb_right/0.png": png(colour(0))}), add_options("--fps", "10")),
+        all_of(use_files(images() | {"rgb_right/0.png": png(colour(0))}), add_options("--fps", "10")),
         Fails(
             "{root}/take: has too many image folders (rgb, rgb_right, depth); keep one folder of colour and one"
             " of depth images"
