@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from v3d_torch import V3DSLAM
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.demo import materials
-from v3d_torch.datasets.demo.camera_trajectory import LEVEL
+from v3d_torch.datasets.demo.camera_trajectory import R_WC_LEVEL
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.room import HIGH, LOW, build_room
+from v3d_torch.datasets.demo.room import ROOM_MAX, ROOM_MIN, build_room
 from v3d_torch.datasets.demo.scene import Rectangle, Scene
-from v3d_torch.datasets.demo.sensor_model import sense_colour, sense_depth
+from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.types import RGBDFrame, TrackingStatus
@@ -30,7 +30,7 @@ def true_pose(frame: int) -> np.ndarray:
     yaw, pitch = np.degrees(angle) - 90 + 6 * np.sin(3 * angle), -6 + 3 * np.sin(5 * angle)
     roll = 2 * np.sin(4 * angle)
     T_wc = np.eye(4)
-    T_wc[:3, :3] = Rotation.from_euler("ZXY", (yaw, pitch, roll), degrees=True).as_matrix() @ LEVEL
+    T_wc[:3, :3] = Rotation.from_euler("ZXY", (yaw, pitch, roll), degrees=True).as_matrix() @ R_WC_LEVEL
     T_wc[:3, 3] = 0.7 * np.cos(angle), 0.9 + 0.8 * np.sin(angle), 1.45 + 0.05 * np.sin(3 * angle)
     return T_wc
 
@@ -38,10 +38,10 @@ def true_pose(frame: int) -> np.ndarray:
 def empty_room() -> Scene:
     """The demo room without moving people, and with the wall behind the demo's camera."""
     room = build_room(7)
-    width, height = HIGH[0] - LOW[0], HIGH[2] - LOW[2]
+    width, height = ROOM_MAX[0] - ROOM_MIN[0], ROOM_MAX[2] - ROOM_MIN[2]
     bricks = materials.bricks(np.random.default_rng(0), width, height, 330, (0.6, 0.5, 0.5))
-    back_wall = Rectangle((HIGH[0], LOW[1], HIGH[2]), (-width, 0, 0), (0, 0, -height), bricks)
-    return Scene([*room.rectangles, back_wall], [figure for figure in room.figures if figure.mover == 0])
+    back_wall = Rectangle((ROOM_MAX[0], ROOM_MIN[1], ROOM_MAX[2]), (-width, 0, 0), (0, 0, -height), bricks)
+    return Scene([*room.rectangles, back_wall], [figure for figure in room.figures if figure.mask_id == 0])
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +52,8 @@ def frames() -> list[RGBDFrame]:
     for index in range(2 * FRAMES):
         rendering = renderer(true_pose(index), 0.0)
         noise = torch.Generator().manual_seed(index)
-        colour = sense_colour(rendering.colour, noise).permute(2, 0, 1).contiguous()
-        depth = sense_depth(rendering.depth, CAMERA, noise).to(torch.float32)[None]
+        colour = simulate_colour(rendering.colour, noise).permute(2, 0, 1).contiguous()
+        depth = simulate_depth(rendering.depth, CAMERA, noise).to(torch.float32)[None]
         frames.append(RGBDFrame(index, index / 15, colour, depth, camera=CAMERA))
     return frames
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.bags import DEPTH, INFO, RGB, Messages
+from helpers.bags import DEPTH, INFO, RGB, MessageFactory
 from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
 from typer.testing import CliRunner, Result
 
@@ -56,7 +56,7 @@ def assert_equal(saved: RGBDSequence, source: RGBDSequence) -> None:
 
 
 def test_bag_is_saved_as_folder(tmp_path: Path) -> None:
-    make = Messages("bag")
+    make = MessageFactory("bag")
     info = make.info(WIDTH, HEIGHT, K, [0.1, -0.2, 0.003, 0.004, 0.05], K[:3] * 4)
     messages = [(INFO, 10.0, info)]
     for i in range(3):

@@ -20,12 +20,12 @@ import numpy as np
 import pandas as pd
 import plyfile
 import pytest
-from helpers.commands import assert_one_sentence, call, command, environment, files_in
+from helpers.commands import assert_error_line, call, command, environment, files_in
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
 from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
-from v3d_torch.datasets.demo.sequence import FRAMES, RATE, write_sequence
+from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE, write_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.runs import result_folder
@@ -221,30 +221,30 @@ def test_a_configuration_file_and_the_command_line_over_it(moment: Path, tmp_pat
 
 def test_an_unknown_key_is_answered_with_the_nearest(sequence: Path, tmp_path: Path) -> None:
     done = call("--seq", sequence, "--set", "objects.voting.vote_treshold=3", cwd=tmp_path)
-    assert_one_sentence(done, "objects.voting.vote_treshold", "objects.voting.vote_threshold")
+    assert_error_line(done, "objects.voting.vote_treshold", "objects.voting.vote_threshold")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_sequence_is_answered_with_the_nearest(tmp_path: Path) -> None:
-    assert_one_sentence(call_here("--seq", "fr3/w/xzy", cwd=tmp_path), "fr3/w/xzy", "fr3/w/xyz")
+    assert_error_line(call_here("--seq", "fr3/w/xzy", cwd=tmp_path), "fr3/w/xzy", "fr3/w/xyz")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_path_that_is_not_there(tmp_path: Path) -> None:
-    assert_one_sentence(call_here("--seq", tmp_path / "nowhere", cwd=tmp_path), str(tmp_path / "nowhere"))
+    assert_error_line(call_here("--seq", tmp_path / "nowhere", cwd=tmp_path), str(tmp_path / "nowhere"))
 
 
 def test_a_folder_without_depth(copy: Path, tmp_path: Path) -> None:
     (copy / "associations.txt").unlink()
     (copy / "depth.txt").unlink()
-    assert_one_sentence(call_here("--seq", copy, "--segmenter", "none", cwd=tmp_path), str(copy), "depth.txt")
+    assert_error_line(call_here("--seq", copy, "--segmenter", "none", cwd=tmp_path), str(copy), "depth.txt")
 
 
 def test_masks_of_another_folder(sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     arguments = ("--seq", sequence, "--segmenter", "masks")
-    assert_one_sentence(call_here(*arguments, "--masks", tmp_path / "empty", cwd=tmp_path), str(tmp_path / "empty"))
-    assert_one_sentence(call_here(*arguments, cwd=tmp_path), "folder of the id images")
+    assert_error_line(call_here(*arguments, "--masks", tmp_path / "empty", cwd=tmp_path), str(tmp_path / "empty"))
+    assert_error_line(call_here(*arguments, cwd=tmp_path), "folder of the id images")
 
 
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
@@ -254,7 +254,7 @@ def test_a_truncated_image(kind: str, index: int, copy: Path, tmp_path: Path) ->
     broken = sorted((copy / kind).iterdir())[index]
     rewrite(broken, lambda content: content[: len(content) // 2])
     done = call_here("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
-    assert_one_sentence(done, str(broken))
+    assert_error_line(done, str(broken))
     trajectory = tmp_path / "out" / "trajectory.txt"
     assert len(trajectory.read_text().splitlines() if trajectory.exists() else []) == index
     if index:
@@ -269,7 +269,7 @@ def test_colour_and_depth_swapped(copy: Path, tmp_path: Path) -> None:
     rewrite(copy / "rgb.txt", lambda _: depth)
     rewrite(copy / "depth.txt", lambda _: colour)
     done = call_here("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
-    assert_one_sentence(done, str(sorted((copy / "depth").iterdir())[0]), "swapped")
+    assert_error_line(done, str(sorted((copy / "depth").iterdir())[0]), "swapped")
 
 
 def test_depth_with_8_bits(copy: Path, tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_depth_with_8_bits(copy: Path, tmp_path: Path) -> None:
     grey = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
     rewrite(path, lambda _: cv2.imencode(".png", grey)[1].tobytes())
     done = call_here("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
-    assert_one_sentence(done, str(path), "8-bit", "16 bits")
+    assert_error_line(done, str(path), "8-bit", "16 bits")
 
 
 @pytest.mark.parametrize("below", [False, True])
@@ -285,7 +285,7 @@ def test_a_file_where_the_results_belong(below: bool, sequence: Path, tmp_path: 
     (tmp_path / "taken").write_text("")
     out = tmp_path / "taken" / "out" if below else tmp_path / "taken"
     done = call_here("--seq", sequence, "--segmenter", "none", "--out", out, cwd=tmp_path)
-    assert_one_sentence(done, str(tmp_path / "taken"))
+    assert_error_line(done, str(tmp_path / "taken"))
 
 
 def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
@@ -297,7 +297,7 @@ def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
     done = call_here("--seq", "fr3/w/xyz", cwd=tmp_path, **variables)
     assert time.monotonic() - start < 20
     name = "rgbd_dataset_freiburg3_walking_xyz"
-    assert_one_sentence(done, "fr3/w/xyz", f"{name}.tgz", "https://", str(tmp_path / "data"))
+    assert_error_line(done, "fr3/w/xyz", f"{name}.tgz", "https://", str(tmp_path / "data"))
     assert not list((tmp_path / "data").iterdir())
 
 
@@ -313,7 +313,7 @@ def test_ctrl_c_keeps_what_was_computed(sequence: Path, tmp_path: Path) -> None:
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
         stdout, stderr = process.communicate(timeout=100)
-    assert_one_sentence(subprocess.CompletedProcess(arguments, process.returncode, stdout, stderr), "interrupted after")
+    assert_error_line(subprocess.CompletedProcess(arguments, process.returncode, stdout, stderr), "interrupted after")
     assert "results" in stderr
     metrics = json.loads((out / "metrics.json").read_text())
     assert 3 <= metrics["processed"] < 30
@@ -378,7 +378,7 @@ def near(people: pd.DataFrame, x: pd.Series | float, y: float, within: float) ->
 def test_demo_every_file_every_frame(demo: tuple[Path, str]) -> None:
     out, stdout = demo
     assert files_in(out) == FILES | OBJECTS
-    assert len((out / "trajectory.txt").read_text().splitlines()) == FRAMES == 120
+    assert len((out / "trajectory.txt").read_text().splitlines()) == FRAME_COUNT == 120
     assert "ATE rmse" in stdout
     for name in ("figures/trajectory.png", "figures/masks.png", *OBJECTS):
         image = cv2.imread(str(out / name))
@@ -393,7 +393,7 @@ def test_demo_trajectory(demo: tuple[Path, str]) -> None:
 
 
 def test_demo_the_walker_is_voted_dynamic(people: pd.DataFrame) -> None:
-    way = WALKER_FROM + WALK_SPEED * (people["frame"] / RATE - WALK_START)
+    way = WALKER_FROM + WALK_SPEED * (people["frame"] / FRAME_RATE - WALK_START)
     walker = near(people, way, WALKER_Y, within=0.3)
     walker = walker[walker["frame"].between(30, 105)]  # in view from head to hip
     assert walker["frame"].nunique() >= 60

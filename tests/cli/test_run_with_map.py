@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 import pytest
 import torch
-from helpers.commands import assert_one_sentence, call, files_in
+from helpers.commands import assert_error_line, call, files_in
 from helpers.walls import CAMERA, Slide
 
 from v3d_torch.datasets.tum_trajectory import read_trajectory
@@ -91,14 +91,14 @@ def test_the_second_half_is_tracked_in_the_map_of_the_first(
 
 
 def test_localise_without_a_map(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    assert_one_sentence(call("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
+    assert_error_line(call("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_that_is_no_map(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "half.map").write_bytes(first[1].read_bytes()[:5000])
     done = call("--seq", halves[1], *OPTIONS, "--load-map", "half.map", cwd=tmp_path)
-    assert_one_sentence(done, "half.map", "--save-map")
+    assert_error_line(done, "half.map", "--save-map")
     assert files_in(tmp_path) == {"half.map"}
 
 
@@ -106,11 +106,11 @@ def test_a_map_of_another_room(first: tuple[Path, Path], tmp_path: Path) -> None
     """The results are written all the same: they say that every frame is lost."""
     other = written(tmp_path / "other", Slide(0, 60, step=12, seed=3))
     done = call("--seq", other, *OPTIONS, "--load-map", first[1], "--out", tmp_path / "out", cwd=tmp_path)
-    assert_one_sentence(done, str(first[1]), str(tmp_path / "out"))
+    assert_error_line(done, str(first[1]), str(tmp_path / "out"))
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["lost"] == 6
 
 
 def test_a_map_that_could_not_be_written_is_told_before_the_run(halves: tuple[Path, Path], tmp_path: Path) -> None:
     done = call("--seq", halves[0], *OPTIONS, "--save-map", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
-    assert_one_sentence(done, f"{tmp_path}: cannot be written")
+    assert_error_line(done, f"{tmp_path}: cannot be written")
     assert list(tmp_path.iterdir()) == []

@@ -24,7 +24,7 @@ Message = tuple[str, float, Any]
 """Topic, arrival time (seconds), and message made by `Messages`."""
 
 
-class Messages:
+class MessageFactory:
     """Factory of the messages of one kind of bag, and writer of such bags."""
 
     def __init__(self, kind: Kind) -> None:

@@ -26,7 +26,7 @@ def call(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.Comp
     )
 
 
-def assert_one_sentence(done: subprocess.CompletedProcess[str] | Result, *words: str) -> None:
+def assert_error_line(done: subprocess.CompletedProcess[str] | Result, *words: str) -> None:
     assert (done.exit_code if isinstance(done, Result) else done.returncode) == 2, done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
     assert "Traceback" not in done.stdout + done.stderr

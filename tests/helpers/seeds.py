@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import torch
 from PIL import Image
 
-from helpers.bags import DEPTH, INFO, RGB, Kind, Messages
+from helpers.bags import DEPTH, INFO, RGB, Kind, MessageFactory
 from helpers.parsers import CAMERA
 from v3d_torch.config import Config
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
@@ -53,7 +53,7 @@ def _table() -> bytes:
 
 def _bag(kind: Kind) -> bytes:
     """Bag with one frame of 8x6 pixels."""
-    make_message = Messages(kind)
+    make_message = MessageFactory(kind)
     matrix = [8.0, 0, 3.5, 0, 8.0, 2.5, 0, 0, 1]
     pixels = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
     messages = [

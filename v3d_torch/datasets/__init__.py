@@ -9,7 +9,7 @@ from pathlib import Path
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
 from v3d_torch.datasets.cameras import CameraChoice, load_camera
 from v3d_torch.datasets.locate import find_or_download
-from v3d_torch.datasets.realsense import open_camera
+from v3d_torch.datasets.realsense import open_realsense_camera
 from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, canonical_name, short_name
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredSequence
@@ -150,7 +150,7 @@ def _open_by_name(
         return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
     if name.partition(":")[0] == "realsense":
         reject_options(name, "a live camera", options, frozenset({"fps"}))
-        return open_camera(name, camera, fps=options.fps)
+        return open_realsense_camera(name, camera, fps=options.fps)
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)
     source = open_path(path, camera, options, progress)
     if isinstance(source, StoredSequence):

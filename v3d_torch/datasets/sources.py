@@ -12,7 +12,7 @@ from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.icl_nuim import ICLNUIMSequence, is_icl_nuim
 from v3d_torch.datasets.image_folder import ImageFolder, is_image_folder
 from v3d_torch.datasets.openloris import OpenLORISSequence, is_openloris
-from v3d_torch.datasets.realsense import is_recording, open_recording
+from v3d_torch.datasets.realsense import is_realsense_recording, open_realsense_recording
 from v3d_torch.datasets.ros import BagSequence, is_bag
 from v3d_torch.datasets.scannet import ScanNetSequence, is_scannet
 from v3d_torch.datasets.seven_scenes import SevenScenesSequence, is_seven_scenes
@@ -66,7 +66,9 @@ def _open_bag(path: Path, camera: CameraChoice, options: SourceOptions, progress
 
 
 SOURCES = (
-    Source("a RealSense recording", is_recording, lambda path, camera, *_: open_recording(path, camera)),
+    Source(
+        "a RealSense recording", is_realsense_recording, lambda path, camera, *_: open_realsense_recording(path, camera)
+    ),
     Source("a bag", is_bag, _open_bag, _TOPICS),
     Source("an OpenLORIS-Scene package", is_openloris, lambda path, camera, *_: OpenLORISSequence(path, camera)),
     Source("an ICL-NUIM sequence", is_icl_nuim, lambda path, camera, *_: ICLNUIMSequence(path, camera)),

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.images import depth_to_metres
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.stored import Cursor, StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress

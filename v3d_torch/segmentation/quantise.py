@@ -72,10 +72,10 @@ def quantised_path(path: Path) -> Path:
 def _calibration_images() -> list[Tensor]:
     """Rendered colour images of the demo, each uint8, shape (3, H, W)."""
     # A slow import, needed only when a network is quantised.
-    from v3d_torch.datasets.demo.sequence import FRAMES, write_sequence
+    from v3d_torch.datasets.demo.sequence import FRAME_COUNT, write_sequence
 
     with tempfile.TemporaryDirectory() as folder:
-        write_sequence(Path(folder), range(0, FRAMES, _CALIBRATION_INTERVAL))
+        write_sequence(Path(folder), range(0, FRAME_COUNT, _CALIBRATION_INTERVAL))
         return [read_colour(image) for image in sorted((Path(folder) / "rgb").iterdir())]
 
 

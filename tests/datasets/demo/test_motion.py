@@ -11,7 +11,7 @@ from v3d_torch.datasets.demo.camera_trajectory import camera_pose
 from v3d_torch.datasets.demo.people import WALK_SPEED, sway, walk
 from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.room import build_room
-from v3d_torch.datasets.demo.sequence import FRAMES, RATE, SEED
+from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE, SEED
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_walker_starts_out_of_view(renderer: Renderer) -> None:
 
 
 def test_camera_moves_like_a_hand_held_one() -> None:
-    poses = np.stack([camera_pose(i / RATE) for i in range(FRAMES)])
+    poses = np.stack([camera_pose(i / FRAME_RATE) for i in range(FRAME_COUNT)])
     assert np.allclose(poses[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1), np.eye(3), atol=1e-12)
     assert (np.ptp(poses[:, :3, 3], axis=0) > (0.25, 0.1, 0.06)).all()
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)

@@ -71,7 +71,7 @@ def test_figure_leans_about_its_pivot() -> None:
     """The rows above and below the pivot move sideways as the geometry predicts; the row of the pivot stays."""
     rgba = np.ones((100, 50, 4), np.float32)
     wall = Rectangle((-5, 4.0, 5.0), (10.0, 0, 0), (0, 0, -10.0), np.zeros((8, 8, 3), np.float32))
-    figure = Figure(rgba, (0.0, 2.0, -0.5), 1.0, 0.001, mover=7, pivot=(0.5, 0.5))
+    figure = Figure(rgba, (0.0, 2.0, -0.5), 1.0, 0.001, mask_id=7, pivot=(0.5, 0.5))
     T_wc = np.eye(4)
     T_wc[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     mean_columns = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from v3d_torch.datasets.demo.sensor_model import MAX_DEPTH, grazing_incidence, projector_shadow, sense_depth
+from v3d_torch.datasets.demo.sensor_model import MAX_DEPTH, grazing_incidence, projector_shadow, simulate_depth
 from v3d_torch.datasets.demo.sequence import CAMERA
 
 
@@ -14,7 +14,7 @@ def test_depth_noise_grows_with_the_square_of_depth() -> None:
     """The standard deviation is about 1.4e-3 z^2 metres (Khoshelham and Elberink), and disparity is quantised."""
     for z in (1.0, 2.0, 3.0, 4.0):
         depth = z * (1.0 + 0.02 * torch.linspace(-1, 1, 640).expand(480, 640))  # a range of many disparity steps
-        measured = sense_depth(depth, CAMERA, torch.Generator().manual_seed(3))
+        measured = simulate_depth(depth, CAMERA, torch.Generator().manual_seed(3))
         error = (measured - depth)[measured > 0]
         assert float(error.std()) == pytest.approx(1.4e-3 * z**2, rel=0.05)
         assert abs(float(error.mean())) < 0.5e-3 * z**2
@@ -31,7 +31,7 @@ def test_depth_is_missing_in_projector_shadow_and_out_of_range() -> None:
     assert shadow[240].sum() == pytest.approx(width, abs=2.5)
     assert shadow[240, 200 - int(width) + 3 : 200].all() and not shadow[50].any()
     depth[:, 600:] = MAX_DEPTH + 0.1
-    measured = sense_depth(depth, CAMERA, torch.Generator().manual_seed(0))
+    measured = simulate_depth(depth, CAMERA, torch.Generator().manual_seed(0))
     assert (measured[:, 602:] == 0).all()
     assert 0.85 < float((measured > 0).float().mean()) < 0.95
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.bags import Messages, compressed_depth, png
+from helpers.bags import MessageFactory, compressed_depth, png
 from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of
 from PIL import Image
 
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.errors import InputError
 
-ROS2 = Messages("db3")
+ROS2 = MessageFactory("db3")
 
 
 @pytest.mark.parametrize(

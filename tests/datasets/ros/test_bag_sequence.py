@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.bags import DEPTH, INFO, KINDS, RGB, Kind, Message, Messages
+from helpers.bags import DEPTH, INFO, KINDS, RGB, Kind, Message, MessageFactory
 from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of
 
 from v3d_torch.datasets import SourceOptions, load_sequence
@@ -26,10 +26,10 @@ from v3d_torch.geometry.camera import PinholeCamera
 K = [30.0, 0, 15.5, 0, 31.0, 11.5, 0, 0, 1]
 P = [28.0, 0, 15.0, 0, 0, 29.0, 11.0, 0, 0, 0, 1, 0]
 D = [0.1, -0.2, 0.003, 0.004, 0.05]
-ROS2 = Messages("db3")
+ROS2 = MessageFactory("db3")
 
 
-def valid_messages(make: Messages, frames: int = 3) -> list[Message]:
+def valid_messages(make: MessageFactory, frames: int = 3) -> list[Message]:
     """Colour at 10, 10.1, ... seconds and depth 4 ms later; all messages arrive half a second after their stamps."""
     messages: list[Message] = [(INFO, 10.5, make.info(WIDTH, HEIGHT, K, D, P)), ("/imu", 10.5, make.header(10, ""))]
     for i in range(frames):
@@ -51,7 +51,7 @@ def assert_frame(sequence: BagSequence, index: int, seed: int) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_frames_can_be_read_in_any_order(kind: Kind, tmp_path: Path) -> None:
-    make = Messages(kind)
+    make = MessageFactory(kind)
     path = make.write(tmp_path / "take", valid_messages(make))
     sequence = load_sequence(str(path))
     assert isinstance(sequence, BagSequence)
@@ -65,7 +65,7 @@ def test_frames_can_be_read_in_any_order(kind: Kind, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
 def test_file_inside_a_ros2_bag_can_be_opened(kind: Kind, tmp_path: Path) -> None:
-    make = Messages(kind)
+    make = MessageFactory(kind)
     (file,) = make.write(tmp_path / "take", valid_messages(make)).glob(f"*.{kind}")
     sequence = load_sequence(str(file))
     assert isinstance(sequence, BagSequence)
@@ -201,7 +201,7 @@ def test_depth_without_common_stamps_is_an_input_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("keep", [0, 60, 0.5])
 def test_truncated_bag_is_an_input_error(kind: Kind, keep: float, tmp_path: Path) -> None:
-    make = Messages(kind)
+    make = MessageFactory(kind)
     path = make.write(tmp_path / "take", valid_messages(make))
     file = path if kind == "bag" else next(path.glob(f"*.{kind}"))
     content = file.read_bytes()
@@ -225,7 +225,7 @@ def test_run_on_a_bag_of_the_demo_is_accurate(tmp_path: Path) -> None:
     """Run the command on ten frames of the demo as a ROS 1 bag."""
     write_sequence(tmp_path / "folder", range(10))
     folder = load_sequence(str(tmp_path / "folder"))
-    make, camera = Messages("bag"), folder.camera
+    make, camera = MessageFactory("bag"), folder.camera
     intrinsics = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
     messages: list[Message] = [("/kinect/rgb/info", 1.0, make.info(640, 480, intrinsics, [], P))]
     for frame in folder:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, colour, depth, png, camera_position
-from helpers.corpus.case import Case, Damage, Workspace, Succeeds, Fails, all_of, first_half, add_options, write
+from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, camera_position, colour, depth, png
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, write
 
 MILLIMETRES = png((depth() // 5).astype(np.uint16))
 CAMERA_MATRIX = f"{FOCAL} 0 {(WIDTH - 1) / 2} 0\n0 {FOCAL} {(HEIGHT - 1) / 2} 0\n0 0 1 0\n0 0 0 1\n"
@@ -210,7 +210,11 @@ CASES = [
         use_files(images()),
         Fails("{root}/take: file names such as 0.png are not timestamps; pass the frame rate with --fps"),
     ),
-    Case("images without timestamps, with --fps", all_of(use_files(images()), add_options("--fps", "10")), Succeeds(max_ate=None)),
+    Case(
+        "images without timestamps, with --fps",
+        all_of(use_files(images()), add_options("--fps", "10")),
+        Succeeds(max_ate=None),
+    ),
     Case(
         "images, one without depth",
         all_of(use_files(without(images(), "depth/7")), add_options("--fps", "10")),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from helpers.bags import DEPTH, INFO, RGB, Kind, Message, Messages
+from helpers.bags import DEPTH, INFO, RGB, Kind, Message, MessageFactory
 from helpers.corpus.base import FOCAL, FRAMES, HEIGHT, NOISE, WIDTH, camera_position, colour, depth
 from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, set_sequence
 
@@ -16,14 +16,14 @@ K = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
 P = [*K[:3], 0, *K[3:6], 0, *K[6:], 0]
 MILLIMETRES = (depth() // 5).astype(np.uint16)
 
-Change = Callable[[Messages, list[Message]], list[Message]]
+Change = Callable[[MessageFactory, list[Message]], list[Message]]
 
 
 def bag(kind: Kind, change: Change | None = None) -> Damage:
     """Write the sequence as a bag with changed messages; of a ROS 2 bag, give its file next to metadata.yaml."""
 
     def make(place: Workspace) -> None:
-        make_message = Messages(kind)
+        make_message = MessageFactory(kind)
         messages: list[Message] = [(INFO, 10.0, make_message.info(WIDTH, HEIGHT, K, [], P))]
         for i in range(FRAMES):
             stamp = 10 + i / 10
@@ -41,10 +41,10 @@ def remove_topic(topic: str) -> Change:
     return lambda to, messages: [message for message in messages if message[0] != topic]
 
 
-def replace_messages(topic: str, content: Callable[[Messages, float], object]) -> Change:
+def replace_messages(topic: str, content: Callable[[MessageFactory, float], object]) -> Change:
     """Replace all messages on a topic."""
 
-    def change(to: Messages, messages: list[Message]) -> list[Message]:
+    def change(to: MessageFactory, messages: list[Message]) -> list[Message]:
         return [(name, at, content(to, at) if name == topic else message) for name, at, message in messages]
 
     return change
@@ -54,20 +54,20 @@ def replace_camera(k: list[float], d: tuple[float, ...] = (), model: str = "plum
     return replace_messages(INFO, lambda to, at: to.info(WIDTH, HEIGHT, k, list(d), P, model))
 
 
-def image_shorter_than_its_height(to: Messages, at: float) -> object:
+def image_shorter_than_its_height(to: MessageFactory, at: float) -> object:
     message = to.image(at, "bgr8", colour(0))
     message.height = 10**6
     return message
 
 
-def image_without_pixels(to: Messages, at: float) -> object:
+def image_without_pixels(to: MessageFactory, at: float) -> object:
     message = to.image(at, "bgr8", colour(0))
     message.height = message.width = message.step = 0
     message.data = np.zeros(0, np.uint8)
     return message
 
 
-def depth_with_nan(to: Messages, at: float) -> object:
+def depth_with_nan(to: MessageFactory, at: float) -> object:
     metres = (depth() / 5000).astype(np.float32)
     metres[:, ::8] = np.nan
     return to.image(at, "32FC1", metres)

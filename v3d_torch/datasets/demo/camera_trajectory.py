@@ -24,7 +24,7 @@ _OSCILLATIONS: dict[str, tuple[tuple[float, float, float], ...]] = {
 The third sine of each is the tremor of the hand.
 """
 
-LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+R_WC_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Camera-to-world rotation of a level camera that looks along +y of the world (x right, y forward, z up)."""
 
 
@@ -45,6 +45,6 @@ def camera_pose(t: float) -> NDArray[np.float64]:
     # Intrinsic rotations: yaw about the vertical (positive to the left), then pitch (up), then roll (optical axis).
     rotation = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
     T_wc = np.eye(4)
-    T_wc[:3, :3] = rotation @ LEVEL
+    T_wc[:3, :3] = rotation @ R_WC_LEVEL
     T_wc[:3, 3] = np.add(_REST_POSITION, (value["x"], value["y"], value["z"]))
     return T_wc

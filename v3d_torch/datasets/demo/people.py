@@ -72,7 +72,7 @@ def build_people(walker: Vector, stander: Vector, swayer: Vector) -> list[Figure
     astronaut, photographer = load_photograph("astronaut.png"), load_photograph("photographer.png")
     second_astronaut = recolour(astronaut, 165.0, 0.5)
     return [
-        Figure(astronaut[:, ::-1], walker, 1.06, 0.20, motion=walk, mover=1),
+        Figure(astronaut[:, ::-1], walker, 1.06, 0.20, motion=walk, mask_id=1),
         Figure(photographer, stander, 0.93, 0.18),
-        Figure(second_astronaut, swayer, 1.00, 0.20, yaw=-0.15, motion=sway, mover=2, pivot=(0.40, 0.57)),
+        Figure(second_astronaut, swayer, 1.00, 0.20, yaw=-0.15, motion=sway, mask_id=2, pivot=(0.40, 0.57)),
     ]

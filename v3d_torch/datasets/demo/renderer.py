@@ -57,7 +57,9 @@ class Renderer:
         densities = [r.texture.shape[1] / float(np.linalg.norm(r.across)) for r in surfaces]
         self.textures = TextureAtlas([r.texture for r in surfaces], densities)
         self.displacements = [displacement_map(figure) for figure in scene.figures]
-        self.mask_ids = torch.tensor([0] * len(scene.rectangles) + [f.mover for f in scene.figures], dtype=torch.uint8)
+        self.mask_ids = torch.tensor(
+            [0] * len(scene.rectangles) + [f.mask_id for f in scene.figures], dtype=torch.uint8
+        )
         self.rays = RayGrid.from_camera(camera)
 
     def __call__(self, T_wc: NDArray[np.float64], time: float) -> Rendering:

@@ -10,7 +10,7 @@ from v3d_torch.datasets.demo.lighting import bake_lighting
 from v3d_torch.datasets.demo.people import build_people, walk
 from v3d_torch.datasets.demo.scene import Box, Figure, Rectangle, Scene
 
-LOW, HIGH = (-2.35, -1.5, 0.0), (2.35, 4.2, 2.75)
+ROOM_MIN, ROOM_MAX = (-2.35, -1.5, 0.0), (2.35, 4.2, 2.75)
 """Corners of the room with the smallest and largest coordinates, world frame, metres."""
 _PAGES = ((-0.22, 1.10, 0.30), (-0.12, 0.92, -0.15), (0.75, 1.02, 0.5), (-1.05, 1.22, -0.4), (0.15, 1.28, 0.1))
 """Pages on the counter: x and y of the top left corner (metres), and rotation about the vertical (radians)."""
@@ -43,13 +43,13 @@ def build_room(seed: int) -> Scene:
     books_and_pages, book_boxes = _build_books_and_pages(rng)
     occluders = [*boxes, *book_boxes, *(f.shadow_box() for f in figures if f.motion is not walk)]
     surfaces = [*_build_walls(rng), *_build_wall_pictures(rng), *furniture, *books_and_pages]
-    rectangles = bake_lighting(surfaces, occluders, LOW, HIGH, seed)
+    rectangles = bake_lighting(surfaces, occluders, ROOM_MIN, ROOM_MAX, seed)
     return Scene(rectangles, figures)
 
 
 def _build_walls(rng: np.random.Generator) -> list[Rectangle]:
     """Build back wall, side walls, floor and ceiling; the camera never looks at the front wall."""
-    (x0, y0, z0), (x1, y1, z1) = LOW, HIGH
+    (x0, y0, z0), (x1, y1, z1) = ROOM_MIN, ROOM_MAX
     width, depth, height = x1 - x0, y1 - y0, z1 - z0
     wall = materials.plaster(rng, depth, height, 250, (0.80, 0.77, 0.68))
     brick = materials.bricks(rng, width, height, 330, (0.72, 0.45, 0.34))
@@ -92,12 +92,12 @@ def _build_wall_pictures(rng: np.random.Generator) -> list[Rectangle]:
 
     def back(x: float, z: float, width: float, picture: NDArray[np.float32]) -> Rectangle:
         height = width * picture.shape[0] / picture.shape[1]
-        return Rectangle((x, HIGH[1] - 0.02, z), (width, 0, 0), (0, 0, -height), picture)
+        return Rectangle((x, ROOM_MAX[1] - 0.02, z), (width, 0, 0), (0, 0, -height), picture)
 
     def side(sign: int, y: float, z: float, width: float, picture: NDArray[np.float32]) -> Rectangle:
         height = width * picture.shape[0] / picture.shape[1]
         start = y if sign < 0 else y + width
-        return Rectangle((sign * (HIGH[0] - 0.02), start, z), (0, -sign * width, 0), (0, 0, -height), picture)
+        return Rectangle((sign * (ROOM_MAX[0] - 0.02), start, z), (0, -sign * width, 0), (0, 0, -height), picture)
 
     return [
         back(-1.95, 2.56, 1.00, cat),

@@ -108,7 +108,7 @@ class Figure:
     thickness: float
     yaw: float = 0.0
     motion: Callable[[float], FigurePose] = stand_still
-    mover: int = 0
+    mask_id: int = 0
     pivot: tuple[float, float] = (0.5, 0.5)
 
     @property

@@ -37,7 +37,7 @@ _COLOUR_SIGMA = 0.008
 """Noise of the colour image, as a fraction of its full range."""
 
 
-def sense_depth(depth: Tensor, camera: PinholeCamera, generator: torch.Generator) -> Tensor:
+def simulate_depth(depth: Tensor, camera: PinholeCamera, generator: torch.Generator) -> Tensor:
     """Simulate the depth image of a Kinect.
 
     Args:
@@ -68,7 +68,7 @@ def sense_depth(depth: Tensor, camera: PinholeCamera, generator: torch.Generator
     return measured.masked_fill(invalid | mixed | specks, 0.0)
 
 
-def sense_colour(colour: Tensor, generator: torch.Generator) -> Tensor:
+def simulate_colour(colour: Tensor, generator: torch.Generator) -> Tensor:
     """Simulate the colour image of a Kinect: add noise and quantise.
 
     Args:

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from v3d_torch.datasets.demo.camera_trajectory import camera_pose
 from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.room import build_room
-from v3d_torch.datasets.demo.sensor_model import sense_colour, sense_depth
+from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, readout=0.0)
 """Default calibration of a Kinect, with a global shutter: all rows of a rendered image have the same time."""
-FRAMES = 120
+FRAME_COUNT = 120
 """Number of frames."""
-RATE = 30.0
+FRAME_RATE = 30.0
 """Frame rate, Hz."""
 START_STAMP = 1.0
 """Timestamp of the first frame, seconds."""
@@ -34,7 +34,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of frames done and the number of all frames."""
 
 
-def write_sequence(folder: Path, frames: range = range(FRAMES), progress: Progress | None = None) -> None:
+def write_sequence(folder: Path, frames: range = range(FRAME_COUNT), progress: Progress | None = None) -> None:
     """Render frames of the demo into an empty folder.
 
     Args:
@@ -65,15 +65,15 @@ def _single_thread() -> Iterator[None]:
 
 
 def _stamp(index: int) -> str:
-    return f"{START_STAMP + index / RATE:.6f}"
+    return f"{START_STAMP + index / FRAME_RATE:.6f}"
 
 
 def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:
-    time = index / RATE
+    time = index / FRAME_RATE
     rendering = renderer(camera_pose(time), time)
     generator = torch.Generator().manual_seed(SEED * 100_003 + index)  # a different seed for each frame
-    colour = sense_colour(rendering.colour, generator).numpy()
-    depth = sense_depth(rendering.depth, CAMERA, generator).numpy()
+    colour = simulate_colour(rendering.colour, generator).numpy()
+    depth = simulate_depth(rendering.depth, CAMERA, generator).numpy()
     stamp = _stamp(index)
     _write_image(folder / "rgb" / f"{stamp}.jpg", np.ascontiguousarray(colour[..., ::-1]))
     _write_image(folder / "depth" / f"{stamp}.png", (depth * CAMERA.depth_scale).round().astype(np.uint16))
@@ -89,7 +89,7 @@ def _write_image(path: Path, image: Image) -> None:
 def _write_lists(folder: Path, frames: range) -> None:
     """Write the image lists, the ground truth and the camera file."""
     stamps = [_stamp(index) for index in frames]
-    poses = np.stack([camera_pose(index / RATE) for index in frames])
+    poses = np.stack([camera_pose(index / FRAME_RATE) for index in frames])
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     groundtruth = [
         f"{stamp} " + " ".join(f"{value:.9f}" for value in (*T_wc[:3, 3], *q))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from v3d_torch.datasets.realsense.realsense_stream import (
     RealSenseStream,
-    is_recording,
-    open_camera,
-    open_recording,
+    is_realsense_recording,
+    open_realsense_camera,
+    open_realsense_recording,
 )
 
-__all__ = ["RealSenseStream", "is_recording", "open_camera", "open_recording"]
+__all__ = ["RealSenseStream", "is_realsense_recording", "open_realsense_camera", "open_realsense_recording"]

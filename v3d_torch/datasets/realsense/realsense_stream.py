@@ -106,7 +106,7 @@ class RealSenseStream:
         )
 
 
-def open_camera(name: str, camera: CameraChoice = None, *, fps: float | None = None) -> RealSenseStream:
+def open_realsense_camera(name: str, camera: CameraChoice = None, *, fps: float | None = None) -> RealSenseStream:
     """Open a connected camera as a stream.
 
     Args:
@@ -122,12 +122,12 @@ def open_camera(name: str, camera: CameraChoice = None, *, fps: float | None = N
     return RealSenseStream(label, partial(open_live_device, label, serial, fps), camera)
 
 
-def open_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:
+def open_realsense_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:
     """Open a file that RealSense software recorded as a stream, see `open_recorded_device`."""
     return RealSenseStream(path.resolve().stem, partial(open_recorded_device, path), camera)
 
 
-def is_recording(path: Path) -> bool:
+def is_realsense_recording(path: Path) -> bool:
     """Check whether a bag was recorded by RealSense software.
 
     Such a bag needs librealsense: its depth is not aligned to colour, and it has no CameraInfo of ROS.
