@@ -181,24 +181,22 @@ class V3DSLAM:
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
-            landmarks, features = (
-                motion.propagate_landmarks(self._previous, len(features))[is_static],
-                preprocessed.features[is_static],
-            )
-            features = self.compensate(features, depth, frame.depth_delay, motion.velocity, self.map.readout)
+            landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
+            static = preprocessed.features[is_static]
+            static = self.compensate(static, depth, frame.depth_delay, motion.velocity, self.map.readout)
             T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
-            pose = self.track_camera(features, depth, T_cw, landmarks, motion, self.poses)
+            pose = self.track_camera(static, depth, T_cw, landmarks, motion, self.poses)
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
             self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             reference = self.track_camera.reference_keyframe(pose)
-            keyframe = self.mapper(frame, features, pose, reference)
+            keyframe = self.mapper(frame, static, pose, reference)
             T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
             self._apply_world_correction(T_new_old)
             if pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view.with_pose(self.poses.T_cw))
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
-            self._previous = TrackedFrame(frame, depth, features, objects.static_mask, landmarks)
+            self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:
                 self.back_end.submit(keyframe)
         status = self.poses.statuses[-1]
