@@ -6,7 +6,7 @@ its results. Values that only an expert of one file would change are named const
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -101,9 +101,10 @@ class VotingConfig(Section):
     """T_d, metres: a larger change of the distance between two centroids is a vote."""
     vote_threshold: int = Field(2, gt=0)
     """T_v, votes that make an object dynamic (authors' code: more than one)."""
-    baselines: tuple[float, ...] = (0.0, 0.3, 0.9)
+    baselines: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
     """Distances are compared with those of so many seconds ago; 0 is the previous frame (the paper's rule). At 1 m/s a
-    person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s."""
+    person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections are
+    stored for 1 s."""
 
 
 class FreeSpaceConfig(Section):
@@ -144,8 +145,9 @@ class ChamferConfig(Section):
     """Root-mean-square nearest-neighbour distance above which an object deforms, metres: sqrt(D / 2), where D is the
     paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a Kinect
     at 3 m adds as much."""
-    baseline: float = Field(0.3, ge=0)
-    """The cloud is compared with that of so many seconds ago; 0 is the previous frame (the paper's rule)."""
+    baseline: float = Field(0.3, ge=0, le=1)
+    """The cloud is compared with that of so many seconds ago; 0 is the previous frame (the paper's rule). Detections are
+    stored for 1 s."""
     keep_deforming_features: bool = False
     """True to track features on deforming objects. The paper's text says both; its code masks them."""
 
