@@ -47,12 +47,12 @@ class Snapshot:
     Attributes:
         frame: Frame.
         T_cw: World-to-camera pose at that time, float64, shape :math:`(4, 4)`.
-        objects: Objects of the frame.
+        result: Result of the frame, with its objects.
     """
 
     frame: RGBDFrame
     T_cw: Tensor
-    objects: FrameObjects
+    result: FrameResult
 
 
 @dataclass
@@ -211,7 +211,7 @@ class Pipeline:
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
         """Keep frames at equal distances; the distance grows with a live stream. And keep the most dynamic one."""
         best = self.record.most_dynamic_snapshot
-        if best is None or _dynamic_votes(snapshot.objects) > _dynamic_votes(best.objects):
+        if best is None or _dynamic_votes(snapshot.result) > _dynamic_votes(best.result):
             self.record.most_dynamic_snapshot = snapshot
         snapshots = self.record.snapshots
         if isinstance(self.sequence, Sized):

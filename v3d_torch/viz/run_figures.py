@@ -32,10 +32,10 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
     save_trajectory_figure(sequence.groundtruth, trajectory, folder / "trajectory.png", sequence.name)
     if record.snapshots:
         images = [snapshot.frame.image for snapshot in record.snapshots]
-        overlays = [[_overlay(obj) for obj in snapshot.objects.objects] for snapshot in record.snapshots]
+        overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
         save_mask_figure(images, overlays, folder / "masks.png")
     snapshot = record.most_dynamic_snapshot
-    if snapshot is not None and snapshot.objects.vote_pairs:
+    if snapshot is not None and snapshot.result.vote_pairs:
         _draw_votes(folder / "voting.png", pipeline, snapshot)
     if snapshot is not None and (clusters := _clusters(pipeline, snapshot)):
         save_clusters_figure(clusters, folder / "clusters.png", _title(snapshot))
@@ -45,19 +45,19 @@ def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot) -> None:
     camera, T_cw = pipeline.sequence.camera, snapshot.T_cw
     objects: dict[int, Overlay] = {}
     centres: dict[int, Tensor] = {}
-    for obj in snapshot.objects.objects:
+    for obj in snapshot.result.objects:
         mask, label, motion_state = _overlay(obj)
         votes = f": {obj.votes} {'vote' if obj.votes == 1 else 'votes'}" if obj.votes else ""
         objects[obj.id] = (mask, f"{label}{votes}", motion_state)
         centroid = T_cw[:3, :3] @ obj.centroid + T_cw[:3, 3]
         if mask.any() and centroid[2] > 0:  # in view and in front of the camera; false for NaN, an unknown centroid
             centres[obj.id] = camera.distort(camera.project(centroid[None]))[0]
-    save_voting_figure(snapshot.frame.image, objects, centres, snapshot.objects.vote_pairs, path, _title(snapshot))
+    save_voting_figure(snapshot.frame.image, objects, centres, snapshot.result.vote_pairs, path, _title(snapshot))
 
 
 def _clusters(pipeline: Pipeline, snapshot: Snapshot) -> list[Cluster]:
     """Compute the clouds of a frame's objects again, with the points removed by outlier rejection."""
-    detected = [obj for obj in snapshot.objects.objects if not obj.missed]
+    detected = [obj for obj in snapshot.result.objects if not obj.missed]
     if not detected:
         return []
     slam, count = pipeline.slam, len(detected)

@@ -98,7 +98,7 @@ class RealSenseStream:
                 f"{self.name}: sends {width}x{height} pixels, --camera has {self.camera.width}x{self.camera.height};"
                 " remove --camera to use the calibration of the device"
             )
-        # librealsense reuses the memory of both images: convert_to_rgb and metres copy it.
+        # librealsense reuses the memory of both images: convert_to_rgb and depth_to_metres copy it.
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOUR_ENCODINGS[encoding][0])
         units = np.asanyarray(depth.get_data())
         return RGBDFrame(
