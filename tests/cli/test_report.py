@@ -27,11 +27,11 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.report_page import render_page
 from v3d_torch.runs.results import write_results
 from v3d_torch.runs.stored_run import read_run
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame
-from v3d_torch.viz.report_page import render_page
 
 VOID = {"meta", "link", "img", "br", "hr", "input"}
 OPTIONAL = {"tr", "td", "th", "p", "li"}  # their end tags are optional in HTML

@@ -39,6 +39,6 @@ def test_image_is_a_data_url_and_damaged_image_is_an_error(tmp_path: Path) -> No
 
 
 def test_pyplot_is_not_imported() -> None:
-    probe = "import sys, v3d_torch.viz.report_page; print('matplotlib.pyplot' in sys.modules)"
+    probe = "import sys, v3d_torch.runs.report_page; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "False"

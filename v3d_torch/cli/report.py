@@ -27,8 +27,8 @@ def main(
     """
     from v3d_torch.io.files import write_text
     from v3d_torch.runs.console import exit_on_error
+    from v3d_torch.runs.report_page import render_page
     from v3d_torch.runs.stored_run import read_run
-    from v3d_torch.viz.report_page import render_page
 
     with exit_on_error():
         run = read_run(folder, groundtruth)

@@ -59,7 +59,7 @@ def render_page(run: StoredRun) -> str:
         lstrip_blocks=True,
     )
     stages = _stage_times(run)
-    return environment.get_template("page.html").render(
+    return environment.get_template("report_page.html").render(
         metrics=run.metrics,
         folder=run.folder.resolve().name,  # resolved, because "latest" will be another run and "." has no name
         evaluation=run.evaluation,
