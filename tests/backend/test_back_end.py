@@ -34,7 +34,7 @@ def make_config(*, in_background: bool) -> Config:
 
 
 def keyframe_poses(slam: V3DSLAM) -> Tensor:
-    return slam.mapper.map.T_cw
+    return slam.map.T_cw
 
 
 @pytest.mark.parametrize("in_background", [True, False])
@@ -62,7 +62,7 @@ def test_result_is_applied_with_the_next_frame(
     for index in range(FRAMES):
         slam(demo[index])
         poses.append(keyframe_poses(slam))
-    assert [keyframe.frame for keyframe in slam.mapper.map.keyframes] == [0, 2, 4]
+    assert [keyframe.frame for keyframe in slam.map.keyframes] == [0, 2, 4]
     assert [frame for frame, _ in adjusted] == [0, 2, 4]
     assert applied == [3, 5]  # for the first keyframe there is nothing to adjust
     assert torch.equal(poses[2][:1], poses[1]) and torch.equal(poses[4][:2], poses[3])
@@ -73,18 +73,18 @@ def test_result_is_applied_with_the_next_frame(
 
 def test_flush_applies_the_pending_result_once(demo: RGBDSequence) -> None:
     """A second flush, or one before any frame, has no effect."""
-    slam = V3DSLAM(config=make_config(in_background=True))
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=True))
     slam.flush()
     for index in range(5):
         slam(demo[index])
     before = keyframe_poses(slam)
-    assert slam.back_end.keyframe is slam.mapper.map.keyframes[-1]
+    assert slam.back_end.keyframe is slam.map.keyframes[-1]
     slam.flush()
     after = keyframe_poses(slam)
     assert slam.back_end.keyframe is None and not torch.equal(before, after)
     slam.flush()
     assert torch.equal(keyframe_poses(slam), after)
-    assert torch.equal(slam.poses.T_cw, slam.mapper.map.keyframes[-1].T_cw)  # the last frame moves with its keyframe
+    assert torch.equal(slam.poses.T_cw, slam.map.keyframes[-1].T_cw)  # the last frame moves with its keyframe
     assert slam(demo[5]).T_wc.isfinite().all()
 
 
@@ -135,7 +135,7 @@ def test_pipeline_in_inference_mode_equals_calls_outside_of_it(demo: RGBDSequenc
         slam(demo[index])
     slam.flush()
     assert torch.equal(slam.poses.trajectory().T_wc, pipeline.slam.poses.trajectory().T_wc)
-    assert torch.equal(slam.mapper.map.landmarks["point"], pipeline.slam.mapper.map.landmarks["point"])
+    assert torch.equal(slam.map.landmarks["point"], pipeline.slam.map.landmarks["point"])
 
 
 @pytest.mark.parametrize("in_background", [True, False])
@@ -145,8 +145,8 @@ def test_back_end_that_loads_a_state_gives_the_pending_result(in_background: boo
     for index in range(5):
         slam(demo[index])
     state = slam.back_end.state_dict()
-    assert state == {"keyframe": slam.mapper.map.keyframes[-1]} and state["keyframe"].frame == 4
-    loaded = BackEnd(config, slam.mapper.map.camera, slam.mapper.map, slam.loop_closer)
+    assert state == {"keyframe": slam.map.keyframes[-1]} and state["keyframe"].frame == 4
+    loaded = BackEnd(config, slam.map.camera, slam.map, slam.loop_closer)
     loaded.load_state_dict(state)
     assert loaded.keyframe is state["keyframe"]
     expected, result = slam.back_end.result(), loaded.result()

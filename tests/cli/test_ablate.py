@@ -17,11 +17,11 @@ from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import ablation_study
 from v3d_torch.cli.ablate import app
-from v3d_torch.config import Config
 from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation.ablation import VARIANTS
+from v3d_torch.runs.request import RunRequest
 from v3d_torch.types import RGBDFrame
 
 FRAMES = 6
@@ -184,30 +184,43 @@ def test_failed_run_is_reported_and_others_finish(sequence: Path, tmp_path: Path
     assert len((out / "broken" / "baseline" / "seed0" / "trajectory.txt").read_text().splitlines()) == 3
 
 
-class FakeTrack:
-    """Replacement of `ablation_study.track` that stores the seeds of its calls and raises an error at one of them."""
+class FakeRuns:
+    """Replacement of `ablation_study.Run` that stores the seeds of its runs; one run raises an error."""
 
     def __init__(self, error: BaseException, at: int) -> None:
         self.error, self.at, self.seeds = error, at, list[int]()
 
-    def __call__(self, sequence: object, segment: object, config: Config, folder: Path, console: object) -> Any:
-        self.seeds.append(config.seed)
-        if len(self.seeds) == self.at + 1:
-            raise self.error
-        (folder / "metrics.json").write_text(json.dumps({"ate": {"rmse": 0.01, "std": 0.002}, "rpe": None}))
-        return SimpleNamespace(record=SimpleNamespace(failure=None, interrupted=False)), None
+    def __call__(
+        self, request: RunRequest, sequence: Any, segment: Any, folder: Path, *, save_checkpoints: bool
+    ) -> Any:
+        assert not save_checkpoints
+        return FakeRun(self, request.config.seed, sequence, folder)
+
+
+class FakeRun:
+    """Run without tracking, which writes an ATE or raises the error of `FakeRuns`."""
+
+    def __init__(self, runs: FakeRuns, seed: int, sequence: Any, folder: Path) -> None:
+        self._runs, self._seed, self._folder = runs, seed, folder
+        self.pipeline = SimpleNamespace(sequence=sequence, record=SimpleNamespace(failure=None, interrupted=False))
+
+    def __call__(self, on_frame: object) -> None:
+        self._runs.seeds.append(self._seed)
+        if len(self._runs.seeds) == self._runs.at + 1:
+            raise self._runs.error
+        (self._folder / "metrics.json").write_text(json.dumps({"ate": {"rmse": 0.01, "std": 0.002}, "rpe": None}))
 
 
 def test_program_error_fails_only_its_run(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ablation_study, "track", FakeTrack(RuntimeError("shapes differ"), at=1))
+    monkeypatch.setattr(ablation_study, "Run", FakeRuns(RuntimeError("shapes differ"), at=1))
     result = call("--seq", sequence, "--variants", "baseline", "--out", tmp_path)
     assert_error_line(result, "1 of 3 runs failed", "RuntimeError: shapes differ")
     assert [row["failure"] for row in rows_of(tmp_path)] == ["", "RuntimeError: shapes differ", ""]
 
 
 def test_full_disk_ends_the_study(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    broken = FakeTrack(OutputError("x: cannot be written (No space left); free the disk"), at=1)
-    monkeypatch.setattr(ablation_study, "track", broken)
+    broken = FakeRuns(OutputError("x: cannot be written (No space left); free the disk"), at=1)
+    monkeypatch.setattr(ablation_study, "Run", broken)
     assert_error_line(call("--seq", sequence, "--variants", "baseline", "--out", tmp_path), "No space left")
     assert broken.seeds == [0, 1] and len(rows_of(tmp_path)) == 1
 

@@ -1,8 +1,8 @@
-"""Odometry falls back to dense alignment if features fail, and reports no motion if both fail."""
+"""Odometry: registration by features, else by dense alignment, else prediction; and results for the features."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -13,14 +13,17 @@ from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.evaluation import evaluate
 from v3d_torch.features.orb import ORB
 from v3d_torch.geometry.se3 import invert, se3_log
-from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion
-from v3d_torch.odometry.odometry import Odometry, TrackedFrame
+from v3d_torch.odometry.motion_estimator import MotionEstimator
+from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
 NO_FEATURES = "odometry.min_inliers=100000"
-IDENTITY = torch.eye(4, dtype=torch.float64)
+NO_MOTION = "odometry.max_speed=0.001"  # every measured motion is implausible
+PREDICTED_T_CP = torch.eye(4, dtype=torch.float64)
+PREDICTED_VELOCITY = torch.tensor([0.01, -0.02, 0.03, 0.04, -0.05, 0.06], dtype=torch.float64)  # m/s and rad/s
+PAIRS = torch.tensor([[4, 0], [2, 3], [0, 5]])
 
 
 @pytest.fixture(scope="module")
@@ -28,38 +31,98 @@ def demo() -> RGBDSequence:
     return load_sequence("demo")
 
 
-def estimate_motion(
-    demo: RGBDSequence, previous: int, current: int, *overrides: str
-) -> tuple[RelativeMotion | None, Tensor]:
-    """Estimated and true motion between two frames; all pixels of the first count as static."""
+@dataclass(frozen=True)
+class TwoFrames:
+    """Two frames of the demo sequence, their odometry and the true motion between them."""
+
+    odometry: Odometry
+    previous: TrackedFrame
+    current: TrackedFrame
+    T_cp: Tensor
+
+    @property
+    def elapsed(self) -> float:
+        return self.current.frame.stamp - self.previous.frame.stamp
+
+    def estimate(self) -> CameraMotion:
+        return self.odometry(self.previous, self.current, PREDICTED_T_CP, PREDICTED_VELOCITY)
+
+
+def two_frames(demo: RGBDSequence, previous: int, current: int, *overrides: str) -> TwoFrames:
+    """Two frames of the demo sequence; all pixels of the previous one count as static."""
     config = load_config(None, overrides)
     detect = ORB(config.features, demo.camera)
     a, b = (
         TrackedFrame(frame, frame.depth, detect(frame.image, frame.depth)) for frame in (demo[previous], demo[current])
     )
-    a = TrackedFrame(a.frame, a.depth, a.features, torch.ones(a.depth.shape[-2:], dtype=torch.bool))
+    a = replace(a, static_mask=torch.ones(a.depth.shape[-2:], dtype=torch.bool))
     register = MotionEstimator(config.odometry, config.features, demo.camera, config.seed)
     assert demo.groundtruth is not None
     rows = [int((demo.groundtruth.stamps - view.frame.stamp).abs().argmin()) for view in (a, b)]
-    T_wa, T_wb = demo.groundtruth.T_wc[rows]
-    return Odometry(config, demo.camera, register)(a, b, IDENTITY), invert(T_wb) @ T_wa
+    T_wp, T_wc = demo.groundtruth.T_wc[rows]
+    return TwoFrames(Odometry(config, demo.camera, register), a, b, invert(T_wc) @ T_wp)
 
 
 @pytest.mark.parametrize("current", [1, 3])
 def test_dense_alignment_gives_the_motion_without_features(demo: RGBDSequence, current: int) -> None:
-    motion, T_ba = estimate_motion(demo, 0, current, NO_FEATURES)
-    assert motion is not None and motion.pairs.shape == (0, 2)
-    error = se3_log(motion.T_ba @ invert(T_ba))
+    frames = two_frames(demo, 0, current, NO_FEATURES)
+    motion = frames.estimate()
+    assert motion.is_measured and motion.pairs.shape == (0, 2)
+    error = se3_log(motion.T_cp @ invert(frames.T_cp))
     assert float(error[:3].norm()) < 0.003 and float(error[3:].norm()) < 0.002
 
 
 def test_features_are_tried_first(demo: RGBDSequence) -> None:
-    motion, _ = estimate_motion(demo, 0, 1)
-    assert motion is not None and len(motion.pairs) > 100
+    motion = two_frames(demo, 0, 1).estimate()
+    assert motion.is_measured and len(motion.pairs) > 100
 
 
-def test_implausible_motion_is_rejected(demo: RGBDSequence) -> None:
-    assert estimate_motion(demo, 0, 3, NO_FEATURES, "odometry.max_speed=0.001")[0] is None
+@pytest.mark.parametrize("overrides", [(), (NO_FEATURES,)], ids=["features", "dense"])
+def test_velocity_of_a_measured_motion_is_its_mean_twist_per_second(
+    demo: RGBDSequence, overrides: tuple[str, ...]
+) -> None:
+    frames = two_frames(demo, 0, 3, *overrides)
+    motion = frames.estimate()
+    assert motion.is_measured
+    torch.testing.assert_close(motion.velocity * frames.elapsed, se3_log(motion.T_cp), rtol=1e-12, atol=1e-15)
+
+
+def test_measured_motion_is_that_of_the_registration(demo: RGBDSequence) -> None:
+    frames = two_frames(demo, 0, 1)
+    motion = frames.estimate()
+    registered = frames.odometry.register(frames.previous, frames.current, PREDICTED_T_CP)
+    assert registered is not None
+    assert torch.equal(motion.T_cp, registered.T_ba) and torch.equal(motion.pairs, registered.pairs)
+
+
+def test_implausible_motion_is_rejected_and_the_prediction_returned(demo: RGBDSequence) -> None:
+    frames = two_frames(demo, 0, 3, NO_FEATURES, NO_MOTION)
+    assert frames.odometry.register(frames.previous, frames.current, PREDICTED_T_CP) is None
+    assert_predicted(frames.estimate())
+
+
+def test_motion_of_the_first_frame_is_the_prediction(demo: RGBDSequence) -> None:
+    frames = two_frames(demo, 0, 1)
+    assert_predicted(frames.odometry(None, frames.current, PREDICTED_T_CP, PREDICTED_VELOCITY))
+
+
+def assert_predicted(motion: CameraMotion) -> None:
+    assert not motion.is_measured and motion.pairs.shape == (0, 2) and motion.pairs.dtype == torch.int64
+    assert torch.equal(motion.T_cp, PREDICTED_T_CP) and torch.equal(motion.velocity, PREDICTED_VELOCITY)
+
+
+def test_inlier_mask_selects_the_matched_features_of_the_current_frame() -> None:
+    motion = CameraMotion(PREDICTED_T_CP, PREDICTED_VELOCITY, PAIRS, is_measured=True)
+    assert motion.inlier_mask(7).tolist() == [True, False, False, True, False, True, False]
+    assert not replace(motion, pairs=PAIRS[:0]).inlier_mask(7).any()
+
+
+def test_landmarks_are_propagated_by_the_inlier_matches(demo: RGBDSequence) -> None:
+    motion = CameraMotion(PREDICTED_T_CP, PREDICTED_VELOCITY, PAIRS, is_measured=True)
+    previous = replace(two_frames(demo, 0, 1).previous, landmark_ids=torch.tensor([10, 11, -1, 13, 14]))
+    assert motion.propagate_landmarks(previous, 7).tolist() == [14, -1, -1, -1, -1, 10, -1]
+    assert motion.propagate_landmarks(replace(previous, landmark_ids=None), 7).tolist() == 7 * [-1]
+    assert motion.propagate_landmarks(None, 7).tolist() == 7 * [-1]
 
 
 def test_slam_without_features_tracks_by_dense_odometry(demo: RGBDSequence) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -18,18 +17,19 @@ from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.readout_calibration import calibrate_readout
 from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, RollingShutterCompensation
-from v3d_torch.tracking.camera_tracker import CameraTracker
+from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.pose_history import PoseHistory
-from v3d_torch.types import FramePose, TrackingStatus
+from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
+from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
 
 CAMERA = PinholeCamera(525.0, 520.0, 320.0, 240.0)
 KINECT = Readout(0.026, 1e8)
 VELOCITY = torch.tensor([0.4, -0.3, 0.2, 0.9, -1.1, 1.3], dtype=torch.float64)  # m/s and rad/s
 AT_REST = torch.zeros(6, dtype=torch.float64)
 EYE = torch.eye(4, dtype=torch.float64)
-_NO_LOOP_CLOSER: Any = None  # not used for a frame that is tracked
 
 
 def points_in_view(count: int = 200) -> Tensor:
@@ -186,27 +186,36 @@ def test_pose_of_the_previous_frame_is_refined_with_a_better_velocity() -> None:
     """Bundle adjustment corrects keyframes; the poses between them are corrected here only."""
     config, T_cw = Config(), se3_exp(0.1 * VELOCITY)
     sparse_map = SparseMap(config.mapping, config.features, CAMERA)
+    sparse_map.readout = KINECT
     first = sparse_map.insert_keyframe(
         0, 0.0, EYE, features_of(CAMERA.project(points_in_view()), points_in_view()[:, 2]), torch.full((200,), -1)
     )
     observed = observe_rolling(points_in_view() @ T_cw[:3, :3].T + T_cw[:3, 3], VELOCITY, KINECT.seconds)
-    track_camera = CameraTracker(MapTracker(config.tracking, config.features, CAMERA), _NO_LOOP_CLOSER, sparse_map, 15)
+    image, depth = torch.zeros(3, 480, 640, dtype=torch.uint8), torch.zeros(1, 480, 640)
+    previous = TrackedFrame(RGBDFrame(1, 0.1, image, depth), depth, observed, landmark_ids=first.landmarks)
+    refine = PreviousFrameRefinement(
+        TimeCompensation(config, CAMERA),
+        MapTracker(config.tracking, config.features, CAMERA),
+        sparse_map,
+        refine_pose=True,
+    )
 
+    motion = CameraMotion(T_cw, VELOCITY, torch.zeros(0, 2, dtype=torch.int64), is_measured=True)
     poses = PoseHistory()
-    poses.record(0.0, FramePose(TrackingStatus.TRACKED, T_cw, first.landmarks), first)
-    poses.record(0.1, FramePose(TrackingStatus.TRACKED, se3_exp(0.2 * VELOCITY), first.landmarks), first)
-    errors, after = [], poses.T_cw
+    poses.append(0.0, FramePose(TrackingStatus.TRACKED, EYE, first.landmarks), motion, None, first)
+    poses.append(0.1, FramePose(TrackingStatus.TRACKED, T_cw, first.landmarks), motion, first, None)
+    errors = []
     for velocity in (AT_REST, VELOCITY / 2, VELOCITY):
-        found, points = sparse_map.landmark_positions(first.landmarks)
-        track_camera.again(RollingShutterCompensation(CAMERA)(observed[found], velocity, KINECT), points, poses)
-        errors.append(float(se3_log(poses.T_pw @ invert(T_cw)).norm()))
+        refine(previous, velocity, poses)
+        errors.append(float(se3_log(poses.T_cw @ invert(T_cw)).norm()))
     assert errors[0] > 1.5 * errors[1] > 15 * errors[2]
-    assert torch.equal(poses.T_cw, after)  # the pose of the current frame is unchanged
+    assert torch.equal(poses.trajectory().T_wc[0], EYE)  # the pose of the frame before is unchanged
 
-    few = slice(0, config.tracking.min_inliers - 1)
-    before = poses.T_pw
-    track_camera.again(observed[torch.arange(200)[few]], points[few], poses)
-    assert torch.equal(poses.T_pw, before)
+    few = torch.where(torch.arange(200) < config.tracking.min_inliers - 1, first.landmarks, -1)
+    before = poses.T_cw
+    refine(replace(previous, landmark_ids=few), AT_REST, poses)
+    refine(previous, None, poses)
+    assert torch.equal(poses.T_cw, before)
 
 
 def test_landmark_positions_are_those_of_active_landmarks() -> None:

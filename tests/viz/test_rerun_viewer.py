@@ -29,12 +29,13 @@ from v3d_torch.cli import run
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.errors import ConfigError, OutputError, ViewerError
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.objects.frame_objects import FrameObjects, MotionState
+from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runtime.viewer import NULL_VIEWER
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
+from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 from v3d_torch.viz.rerun.objects import CLASS_IDS
 from v3d_torch.viz.rerun.stream import open_stream
@@ -79,20 +80,20 @@ class RunLog:
 
     def __init__(self, slam: V3DSLAM) -> None:
         self._slam = slam
-        self.objects: list[FrameObjects] = []
+        self.results: list[FrameResult] = []
         self.frames: list[RGBDFrame] = []
         self.T_wc: list[NDArray[np.float64]] = []
         self.positions: list[NDArray[np.float64]] = []
         self.keyframes: list[list[int]] = []
         self.landmarks: list[int] = []
 
-    def __call__(self, frame: RGBDFrame, objects: FrameObjects, status: TrackingStatus) -> None:
+    def __call__(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.frames.append(frame)
-        self.objects.append(objects)
+        self.results.append(result)
         self.T_wc.append(invert(self._slam.poses.T_cw).numpy())
         self.positions.append(self._slam.poses.trajectory().T_wc[:, :3, 3].numpy())
-        self.keyframes.append([keyframe.frame for keyframe in self._slam.mapper.map.keyframes])
-        self.landmarks.append(int(self._slam.mapper.map.landmarks["active"].sum()))
+        self.keyframes.append([keyframe.frame for keyframe in self._slam.map.keyframes])
+        self.landmarks.append(int(self._slam.map.landmarks["active"].sum()))
 
 
 CONFIG = (
@@ -182,35 +183,35 @@ def test_motion_states_have_the_colours_of_the_figures(recorded: tuple[Recording
         assert classes[number]["color"] == red << 24 | green << 16 | blue << 8 | 255
     assert classes[0]["color"] & 255 == 0
     present = set()
-    for index, frame_objects in enumerate(log.objects):
+    for index, result in enumerate(log.results):
         buffer = np.array(recording.at("/world/camera/image/masks")[index]["buffer"][0], dtype=np.uint8)
         expected = np.zeros((240, 320), dtype=np.uint8)
-        for obj in frame_objects.objects:
+        for obj in result.objects:
             expected[obj.mask.numpy()] = CLASS_IDS[obj.motion_state]
         assert np.array_equal(buffer.reshape(240, 320), expected)
         boxes = recording.at("/world/camera/image/objects")[index]
         assert boxes["labels"] == ["person 1", "chair 2", "tv 3"]
-        assert boxes["class_ids"] == [CLASS_IDS[obj.motion_state] for obj in frame_objects.objects]
+        assert boxes["class_ids"] == [CLASS_IDS[obj.motion_state] for obj in result.objects]
         np.testing.assert_allclose(boxes["half_sizes"], 3 * [[30, 30]])
         np.testing.assert_allclose(boxes["centers"], [[50 + 4 * index, 120], [160, 120], [250, 120]])
         cloud = recording.at("/world/objects")[index]
-        points = torch.cat([obj.cloud for obj in frame_objects.objects])
+        points = torch.cat([obj.cloud for obj in result.objects])
         np.testing.assert_allclose(cloud["positions"], points, atol=1e-6)
         counts = {state: cloud["class_ids"].count(number) for state, number in CLASS_IDS.items()}
         for state in MotionState:
-            assert counts[state] == sum(len(obj.cloud) for obj in frame_objects.objects if obj.motion_state is state)
-        present |= {obj.motion_state for obj in frame_objects.objects}
+            assert counts[state] == sum(len(obj.cloud) for obj in result.objects if obj.motion_state is state)
+        present |= {obj.motion_state for obj in result.objects}
     assert MotionState.DYNAMIC in present and MotionState.STATIC in present
 
 
 def test_votes_are_red_lines_between_centroids(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
     recording, log, _ = recorded
     drawn = 0
-    for index, frame_objects in enumerate(log.objects):
-        centroid = {obj.id: obj.centroid.numpy() for obj in frame_objects.objects}
+    for index, result in enumerate(log.results):
+        centroid = {obj.id: obj.centroid.numpy() for obj in result.objects}
         np.testing.assert_allclose(recording.at("/world/centroids")[index]["positions"], list(centroid.values()))
-        dynamic = [obj.id for obj in frame_objects.objects if obj.motion_state is MotionState.DYNAMIC]
-        for entity, pairs in zip(("", "/without_effect"), split_votes(frame_objects.vote_pairs, dynamic), strict=True):
+        dynamic = [obj.id for obj in result.objects if obj.motion_state is MotionState.DYNAMIC]
+        for entity, pairs in zip(("", "/without_effect"), split_votes(result.vote_pairs, dynamic), strict=True):
             row = recording.at(f"/world/votes{entity}")[index]
             assert len(row["strips"]) == len(pairs)
             for strip, (first, second) in zip(row["strips"], pairs, strict=True):
@@ -218,8 +219,8 @@ def test_votes_are_red_lines_between_centroids(recorded: tuple[Recording, RunLog
             drawn += len(pairs) if not entity else 0
             red, green, blue = (row["colors"][0] >> shift & 255 for shift in (24, 16, 8))
             assert red > 200 and green == blue < 140
-        votes = [recording.at(f"/votes/{obj.id}")[index]["scalars"][0] for obj in frame_objects.objects]
-        assert votes == [obj.votes for obj in frame_objects.objects]
+        votes = [recording.at(f"/votes/{obj.id}")[index]["scalars"][0] for obj in result.objects]
+        assert votes == [obj.votes for obj in result.objects]
     assert drawn > 0
 
 
@@ -260,11 +261,11 @@ def test_curves_summaries_and_events(recorded: tuple[Recording, RunLog, Pipeline
         for stage, seconds in row.items():
             if stage not in ("frame", "stamp"):
                 assert recording.at(f"/seconds/{stage}")[index]["scalars"][0] == pytest.approx(seconds)
-    for index, frame_objects in enumerate(log.objects):
+    for index, result in enumerate(log.results):
         text = recording.at("/frame_summary")[index]["text"][0]
         assert f"**frame {index}** at {index / 10:.3f} s: tracked" in text
-        assert all(f"| {obj.motion_state.value} | {obj.votes} |" in text for obj in frame_objects.objects)
-        chamfer = [obj.chamfer for obj in frame_objects.objects if obj.id == 1]
+        assert all(f"| {obj.motion_state.value} | {obj.votes} |" in text for obj in result.objects)
+        chamfer = [obj.chamfer for obj in result.objects if obj.id == 1]
         if np.isfinite(chamfer[0]):
             assert recording.at("/chamfer/1")[index]["scalars"] == chamfer
     events = {frame: row["text"][0] for frame, row in recording.at("/log").items()}
@@ -279,14 +280,14 @@ def test_map_and_poses_are_logged_again_after_loop_correction(tmp_path: Path) ->
     viewer = make_viewer(None, tmp_path / "run.rrd", sequence)
     log = RunLog(slam)
 
-    def on_frame(frame: RGBDFrame, objects: FrameObjects, status: TrackingStatus) -> None:
+    def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
         if frame.index == FRAMES - 1:
             T_new_old = se3_exp(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.3, 0.0], dtype=torch.float64))
-            slam.mapper.map.move_keyframes(slam.mapper.map.T_cw @ invert(T_new_old))
+            slam.map.move_keyframes(slam.map.T_cw @ invert(T_new_old))
             slam.loop_closer.loop_count += 1
-            slam.mapper.map.keyframes[-1].frame = frame.index
-            viewer.show(frame, objects, slam, {})
-        log(frame, objects, status)
+            slam.map.keyframes[-1].frame = frame.index
+            viewer.show(frame, result, slam, {})
+        log(frame, result)
 
     pipeline = Pipeline(sequence, slam, viewer=viewer)
     pipeline(on_frame)
@@ -296,7 +297,7 @@ def test_map_and_poses_are_logged_again_after_loop_correction(tmp_path: Path) ->
     np.testing.assert_allclose(moved, slam.poses.trajectory().T_wc[:, :3, 3], atol=1e-6)
     assert np.linalg.norm(np.array(moved[0])) > 0.4  # the first pose is moved as well
     centres = np.array(recording.at("/world/map/keyframes")[FRAMES - 1]["strips"])[:, 5]
-    np.testing.assert_allclose(centres, invert(slam.mapper.map.T_cw)[:, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(centres, invert(slam.map.T_cw)[:, :3, 3], atol=1e-6)
     assert "loop closed" in recording.at("/log")[FRAMES - 1]["text"][0]
     np.testing.assert_allclose(
         recording.at("/world/camera")[FRAMES - 1]["translation"][0], invert(slam.poses.T_cw)[:3, 3], atol=1e-6

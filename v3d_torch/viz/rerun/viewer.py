@@ -87,7 +87,7 @@ class RerunViewer:
         with slam.timer("viewer"):
             self._stream.set_time("frame", sequence=frame.index)
             self._stream.set_time("stamp", timestamp=frame.stamp)
-            keyframes = slam.mapper.map.keyframes
+            keyframes = slam.map.keyframes
             is_keyframe = bool(keyframes) and keyframes[-1].frame == frame.index
             T_wc = invert(slam.poses.T_cw)
             self._log_camera(frame, T_wc)
@@ -134,11 +134,11 @@ class RerunViewer:
 
     def _log_map(self, slam: V3DSLAM) -> None:
         """Log the whole map and all poses after the latest correction."""
-        landmarks = slam.mapper.map.landmarks
+        landmarks = slam.map.landmarks
         points = landmarks["point"][landmarks["active"]].numpy()
         grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/landmarks", grey)
-        frustums = _frustums(self._camera, invert(stack_poses(slam.mapper.map.active_keyframes)))
+        frustums = _frustums(self._camera, invert(stack_poses(slam.map.active_keyframes)))
         self._stream.log("world/map/keyframes", _lines(frustums, "tab:cyan", width=0.7))
         positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
         self._stream.log("world/trajectory", _lines([positions], "tab:blue"))
@@ -163,7 +163,7 @@ class RerunViewer:
         summary = rr.TextDocument(f"{heading}\n\n{format_objects(objects)}", media_type="text/markdown")
         self._stream.log("frame_summary", summary)
         events = [status.value] if status is not TrackingStatus.TRACKED else []
-        events += [f"keyframe {len(slam.mapper.map.keyframes) - 1}"] if is_keyframe else []
+        events += [f"keyframe {len(slam.map.keyframes) - 1}"] if is_keyframe else []
         if slam.loop_closer.loop_count > self._loops:
             self._loops = slam.loop_closer.loop_count
             events.append("loop closed, map corrected")
