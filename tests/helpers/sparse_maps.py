@@ -1,4 +1,4 @@
-"""Sparse maps and features made by hand."""
+"""Synthetic features and empty sparse maps."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from v3d_torch.mapping.sparse_map import SparseMap
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 
-
 EYE = torch.eye(4, dtype=torch.float64)
 
 
-def numbers(*shape: int, seed: int) -> Tensor:
+def uniform(*shape: int, seed: int) -> Tensor:
+    """Random numbers in [0, 1), float64."""
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def features(count: int, seed: int = 0, depth: float | None = None) -> Features:
-    """Features all over the image, 1 to 3 m away or at the given depth."""
-    uv = numbers(count, 2, seed=seed) * torch.tensor([639.0, 479.0], dtype=torch.float64)
+    """Features spread over the image, at 1 to 3 m or at the given depth, metres."""
+    uv = uniform(count, 2, seed=seed) * torch.tensor([639.0, 479.0], dtype=torch.float64)
     bits = torch.randint(0, 256, (count, 32), generator=torch.Generator().manual_seed(seed), dtype=torch.uint8)
-    z = 1 + 2 * numbers(count, seed=seed + 1) if depth is None else torch.full((count,), depth, dtype=torch.float64)
-    return Features(uv, uv.round().long(), z, (4 * numbers(count, seed=seed + 2)).long(), bits)
+    z = 1 + 2 * uniform(count, seed=seed + 1) if depth is None else torch.full((count,), depth, dtype=torch.float64)
+    return Features(uv, uv.round().long(), z, (4 * uniform(count, seed=seed + 2)).long(), bits)
 
 
-def sparse_map(**settings_: int) -> SparseMap:
+def make_map(**settings: int) -> SparseMap:
+    """An empty map with the given mapping configuration."""
     config = Config()
-    return SparseMap(MappingConfig(**settings_), config.features, CAMERA)
+    return SparseMap(MappingConfig(**settings), config.features, CAMERA)

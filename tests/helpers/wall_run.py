@@ -1,4 +1,4 @@
-"""A short run before a wall, and its frames."""
+"""Short sequence of a camera in front of a wall, and instances for its frames."""
 
 from __future__ import annotations
 
@@ -13,20 +13,23 @@ from v3d_torch.types import Instances, RGBDFrame, Trajectory
 
 CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 
-
 WALL = 2.0
-"""Distance of the wall, metres."""
-
+"""Distance from the camera to the wall, metres."""
 
 STEP = 4
-"""Pixels by which the image moves from frame to frame: the camera goes 4 * 2 / 260 m."""
-
+"""Motion of the image from frame to frame, pixels: the camera moves by 4 * 2 / 260 m."""
 
 FRAMES = 14
+"""Number of frames."""
 
 
 class Wall:
-    """A camera that slides along a wall covered with noise; a square in the image's middle is called a person."""
+    """Sequence of a camera that moves along a wall with a random texture; `square` gives its only instance.
+
+    Args:
+        broken: Index of a frame that cannot be read.
+        interrupted: Index of a frame at which the run is interrupted.
+    """
 
     name = "wall"
     camera = CAMERA
@@ -36,7 +39,7 @@ class Wall:
         self._wall = cv2.resize(noise, (480, 240), interpolation=cv2.INTER_CUBIC)
         self._broken, self._interrupted = broken, interrupted
         self.stamps = torch.arange(FRAMES, dtype=torch.float64) / 10
-        # Turned by next to nothing: orientations that never change are taken for placeholders.
+        # Rotated by 1e-6 rad, because constant orientations count as placeholders.
         T_wc = se3_exp(torch.zeros(FRAMES, 6, dtype=torch.float64).index_fill_(1, torch.tensor(3), 1e-6))
         T_wc[0] = torch.eye(4)
         T_wc[:, 0, 3] = torch.arange(FRAMES) * STEP * WALL / CAMERA.fx

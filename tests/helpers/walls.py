@@ -1,4 +1,4 @@
-"""A camera that slides along a long wall covered with noise: every place of it looks different."""
+"""Sequence of a camera that moves along a long wall with a random texture: every place of the wall is unique."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
 DISTANCE = 2.0
-"""From the camera to the wall, metres."""
+"""Distance from the camera to the wall, metres."""
 LENGTH = 1600
-"""Of the wall, pixels of an image."""
+"""Length of the wall, pixels of an image."""
 
 
 class Slide:
-    """Frames from one place on the wall to another, 10 a second.
+    """Frames from one place on the wall to another, at 10 Hz.
 
     Args:
-        first: column of the wall at the first image's left border.
-        last: at the last image's.
-        step: columns from frame to frame.
-        dark: frames that show nothing, with depth.
-        seed: of the wall.
+        first: Column of the wall at the left border of the first image.
+        last: Column of the wall at the left border of the last image.
+        step: Columns from frame to frame.
+        dark: Indices of frames with a black image; their depth is valid.
+        seed: Seed of the wall's texture.
     """
 
     name = "slide"
@@ -42,7 +42,10 @@ class Slide:
 
     @property
     def T_wc(self) -> Tensor:
-        """In the world of the camera at the wall's beginning; turned by next to nothing, as placeholders are not."""
+        """Poses in the world frame of a camera at the start of the wall.
+
+        All are rotated by 1e-6 rad, because constant identity orientations count as placeholders.
+        """
         T_wc = se3_exp(torch.zeros(len(self), 6, dtype=torch.float64).index_fill_(1, torch.tensor(3), 1e-6))
         T_wc[:, 0, 3] = torch.tensor([column * DISTANCE / CAMERA.fx for column in self._columns])
         return T_wc

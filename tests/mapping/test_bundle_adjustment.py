@@ -1,4 +1,4 @@
-"""Bundle adjustment against dense algebra, SciPy and gtsam; gauge, outliers, degenerate landmarks."""
+"""Bundle adjustment against dense algebra, SciPy and GTSAM; gauge, outliers, degenerate landmarks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,9 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
-from v3d_torch.mapping.bundle_adjustment import (
-    Bundle,
-    Observations,
-    bundle_adjust,
-)
+from v3d_torch.mapping.bundle_adjustment import BundleProblem, Observations, bundle_adjust
 from v3d_torch.optim.levenberg_marquardt import huber
-from v3d_torch.optim.reprojection import reprojection_residuals
+from v3d_torch.optim.reprojection import reprojection
 from v3d_torch.optim.schur import solve_normal_equations
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
@@ -27,9 +23,17 @@ DEPTH_SIGMA = 0.0025
 
 
 class Scene:
-    """True poses and points, their noisy observations, and a wrong start."""
+    """True poses and points, their noisy observations, and an inaccurate initial estimate.
 
-    def __init__(self, poses: int, points: int, seen_by: int, noise: float = 1.0, seed: int = 0) -> None:
+    Args:
+        poses: Number of poses.
+        points: Number of points.
+        observers: Number of poses that observe each point.
+        noise: Factor of the measurement noise.
+        seed: Seed of all random numbers.
+    """
+
+    def __init__(self, poses: int, points: int, observers: int, noise: float = 1.0, seed: int = 0) -> None:
         generator = torch.Generator().manual_seed(seed)
 
         def normal(*shape: int) -> Tensor:
@@ -42,8 +46,8 @@ class Scene:
         self.T_cw = se3_exp(normal(poses, 6) * spread)
         uv = uniform(points, 2) * torch.tensor([640.0, 480.0], dtype=torch.float64)
         self.points = CAMERA.back_project(uv, 1 + 3 * uniform(points))
-        pose = torch.stack([torch.randperm(poses, generator=generator)[:seen_by] for _ in range(points)]).flatten()
-        point = torch.arange(points).repeat_interleave(seen_by)
+        pose = torch.stack([torch.randperm(poses, generator=generator)[:observers] for _ in range(points)]).flatten()
+        point = torch.arange(points).repeat_interleave(observers)
         count = pose.shape[0]
         T = self.T_cw[pose]
         in_camera = (T[:, :3, :3] @ self.points[point, :, None])[..., 0] + T[:, :3, 3]
@@ -59,19 +63,19 @@ class Scene:
             inverse_depth_sigma=DEPTH_SIGMA,
         )
         self.fixed = torch.arange(poses) == 0
-        wrong = 0.02 * normal(poses, 6)
-        self.start = torch.where(self.fixed[:, None, None], self.T_cw, se3_exp(wrong) @ self.T_cw)
+        error = 0.02 * normal(poses, 6)
+        self.start = torch.where(self.fixed[:, None, None], self.T_cw, se3_exp(error) @ self.T_cw)
         self.start_points = self.points + 0.02 * normal(points, 3)
 
 
 def residuals(T_cw: Tensor, points: Tensor, observations: Observations) -> Tensor:
     T = T_cw[observations.pose]
     in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
-    return reprojection_residuals(in_camera, observations, CAMERA)
+    return reprojection(in_camera, observations, CAMERA)
 
 
-def test_step_equals_dense_solution() -> None:
-    scene = Scene(poses=4, points=12, seen_by=3)
+def test_damped_step_equals_the_dense_solution() -> None:
+    scene = Scene(poses=4, points=12, observers=3)
     free = torch.tensor([1, 3])
     damping = 1e-3
 
@@ -83,42 +87,42 @@ def test_step_equals_dense_solution() -> None:
     by_pose, by_point = torch.autograd.functional.jacobian(moved, zeros)
     r = moved(*zeros)
     J = torch.cat([by_pose.reshape(-1, 12), by_point.reshape(-1, 36)], dim=1)
-    _, weights = huber((r * r).sum(dim=-1), scene.observations.chi2_threshold)
+    _, weights = huber((r * r).sum(dim=-1), scene.observations.limit)
     weighted = (J * weights.repeat_interleave(3)[:, None]).T
     H = weighted @ J
     expected = torch.linalg.solve(H + damping * H.diagonal().diag(), -weighted @ r.flatten())
 
     state = scene.start, scene.start_points
-    bundle = Bundle(scene.observations, CAMERA, ~torch.isin(torch.arange(4), free), points=12)
-    _, errors = bundle.errors_at(state)
-    xi, shift = solve_normal_equations(errors.normal_equations, damping)
+    problem = BundleProblem(scene.observations, CAMERA, ~torch.isin(torch.arange(4), free), point_count=12)
+    _, at_start = problem.residuals_at(state)
+    xi, shift = solve_normal_equations(at_start.normal_equations, damping)
     torch.testing.assert_close(torch.cat([xi.flatten(), shift.flatten()]), expected, rtol=1e-7, atol=1e-9)
 
 
-def test_profile_is_that_of_the_cost_adjusted_anew() -> None:
-    """Its derivatives are those of the least costs when all is seen a little to one side and to the other."""
-    scene = Scene(poses=4, points=40, seen_by=3)
-    drift = 5.0 * torch.randn(len(scene.observations.uv), 2, generator=torch.Generator().manual_seed(5)).double()
-    here = bundle_adjust(
+def test_reduced_cost_derivatives_equal_finite_differences_of_the_minimum_cost() -> None:
+    """Finite differences of the minimum cost for measurements that are shifted in both directions."""
+    scene = Scene(poses=4, points=40, observers=3)
+    uv_jacobian = 5.0 * torch.randn(len(scene.observations.uv), 2, generator=torch.Generator().manual_seed(5)).double()
+    optimum = bundle_adjust(
         scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
     )
 
     def cost(step: float) -> float:
-        seen = replace(scene.observations, uv=scene.observations.uv + step * drift)
+        shifted = replace(scene.observations, uv=scene.observations.uv + step * uv_jacobian)
         return bundle_adjust(
-            here.T_cw, here.points, seen, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
+            optimum.T_cw, optimum.points, shifted, CAMERA, scene.fixed, iterations=50, tolerance=1e-13
         ).cost_after
 
     step = 1e-3
     less, same, more = cost(-step), cost(0.0), cost(step)
-    first, second = here.errors.profile(drift)
+    first, second = optimum.residuals.reduced_cost_derivatives(uv_jacobian)
     assert first == pytest.approx((more - less) / (2 * step), rel=1e-3)
     assert second == pytest.approx((more - 2 * same + less) / step**2, rel=0.05)
 
 
-def test_same_optimum_as_scipy() -> None:
-    scene = Scene(poses=3, points=12, seen_by=3)
-    limit = scene.observations.chi2_threshold
+def test_optimum_equals_scipy() -> None:
+    scene = Scene(poses=3, points=12, observers=3)
+    limit = scene.observations.limit
 
     def unpack(x: np.ndarray) -> tuple[Tensor, Tensor]:
         numbers = torch.from_numpy(x)
@@ -139,8 +143,8 @@ def test_same_optimum_as_scipy() -> None:
     assert (result.points - points).norm(dim=1).max() < 1e-3
 
 
-def test_same_optimum_as_gtsam() -> None:
-    scene = Scene(poses=5, points=60, seen_by=4)
+def test_optimum_equals_gtsam() -> None:
+    scene = Scene(poses=5, points=60, observers=4)
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, T_wc in enumerate(invert(scene.start)):
         start.insert(k, gtsam.Pose3(T_wc.numpy()))
@@ -151,11 +155,15 @@ def test_same_optimum_as_gtsam() -> None:
     stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, 1 / CAMERA.fx)
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
     A = np.array([[1.0, 0, 0], [1, 0, -1], [0, 1, 0]])
-    seen = scene.observations
-    for m in range(seen.pose.shape[0]):
-        (u, v), w, sigma = seen.uv[m].tolist(), float(seen.inverse_depth[m]), float(seen.pixel_sigma[m])
-        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(seen.chi2_threshold[m].sqrt()))
-        keys = int(seen.pose[m]), 1000 + int(seen.point[m])
+    observations = scene.observations
+    for m in range(observations.pose.shape[0]):
+        (u, v), w, sigma = (
+            observations.uv[m].tolist(),
+            float(observations.inverse_depth[m]),
+            float(observations.pixel_sigma[m]),
+        )
+        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(observations.limit[m].sqrt()))
+        keys = int(observations.pose[m]), 1000 + int(observations.point[m])
         if w > 0:
             noise = gtsam.noiseModel.Gaussian.Covariance(A @ np.diag([sigma**2, sigma**2, DEPTH_SIGMA**2]) @ A.T)
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)
@@ -164,7 +172,7 @@ def test_same_optimum_as_gtsam() -> None:
             noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
             graph.add(gtsam.GenericProjectionFactorCal3_S2(gtsam.Point2(u, v), noise, *keys, mono))
     best = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    result = bundle_adjust(scene.start, scene.start_points, seen, CAMERA, scene.fixed, iterations=30)
+    result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed, iterations=30)
     assert result.cost_before == pytest.approx(2 * graph.error(start), rel=1e-6)
     assert result.cost_after == pytest.approx(2 * graph.error(best), rel=1e-5)
     expected = torch.stack([torch.from_numpy(best.atPose3(k).matrix()) for k in range(5)])
@@ -173,36 +181,36 @@ def test_same_optimum_as_gtsam() -> None:
     assert (result.points - points).norm(dim=1).max() < 1e-3
 
 
-def test_recovers_an_exact_scene() -> None:
-    scene = Scene(poses=6, points=100, seen_by=4, noise=0.0)
+def test_noise_free_scene_is_recovered() -> None:
+    scene = Scene(poses=6, points=100, observers=4, noise=0.0)
     result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=20)
     torch.testing.assert_close(result.T_cw, scene.T_cw, rtol=0, atol=1e-7)
     torch.testing.assert_close(result.points, scene.points, rtol=0, atol=1e-6)
     assert result.cost_after < 1e-6 < result.cost_before
 
 
-def test_chi2_follows_its_distribution() -> None:
-    scene = Scene(poses=6, points=400, seen_by=5)
+def test_mean_chi2_equals_the_degrees_of_freedom() -> None:
+    scene = Scene(poses=6, points=400, observers=5)
     result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
     degrees = (2 + (scene.observations.inverse_depth > 0)).sum() - 5 * 6 - 400 * 3
     assert float(result.chi2.sum() / degrees) == pytest.approx(1.0, abs=0.05)
 
 
-def test_outliers_do_not_matter_and_are_found() -> None:
-    scene = Scene(poses=6, points=300, seen_by=5)
-    wrong = torch.arange(scene.observations.pose.shape[0]) % 10 == 0
-    uv = torch.where(wrong[:, None], scene.observations.uv + 40.0, scene.observations.uv)
+def test_outliers_are_detected_and_do_not_change_the_poses() -> None:
+    scene = Scene(poses=6, points=300, observers=5)
+    shifted = torch.arange(scene.observations.pose.shape[0]) % 10 == 0
+    uv = torch.where(shifted[:, None], scene.observations.uv + 40.0, scene.observations.uv)
     observations = replace(scene.observations, uv=uv)
     result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed)
     clean = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
     assert se3_log(result.T_cw @ invert(clean.T_cw)).abs().max() < 0.005
-    outlier = result.chi2 > observations.chi2_threshold
-    assert outlier[wrong].double().mean() > 0.99
-    assert outlier[~wrong].double().mean() < 0.15
+    outlier = result.chi2 > observations.limit
+    assert outlier[shifted].double().mean() > 0.99
+    assert outlier[~shifted].double().mean() < 0.15
 
 
-def test_fixed_poses_stay_to_the_bit() -> None:
-    scene = Scene(poses=5, points=50, seen_by=4)
+def test_fixed_poses_are_bit_identical() -> None:
+    scene = Scene(poses=5, points=50, observers=4)
     fixed = torch.tensor([True, False, True, False, True])
     result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, fixed)
     assert torch.equal(result.T_cw[fixed], scene.start[fixed])
@@ -213,27 +221,27 @@ def test_fixed_poses_stay_to_the_bit() -> None:
     assert only_points.cost_after < only_points.cost_before
 
 
-def test_inputs_are_not_changed() -> None:
-    scene = Scene(poses=3, points=20, seen_by=3)
+def test_inputs_are_not_modified() -> None:
+    scene = Scene(poses=3, points=20, observers=3)
     before = scene.start.clone(), scene.start_points.clone()
     bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
     assert torch.equal(scene.start, before[0])
     assert torch.equal(scene.start_points, before[1])
 
 
-def test_weak_points_do_not_blow_up() -> None:
-    scene = Scene(poses=5, points=40, seen_by=4)
-    seen = scene.observations
-    # Point 0 is seen once without depth, 1 once with depth, 2 never, 3 is behind its cameras.
-    rank = torch.arange(seen.pose.shape[0]) % 4
-    keep = ~((seen.point <= 1) & (rank > 0)) & (seen.point != 2)
-    inverse_depth = torch.where(seen.point == 0, 0.0, torch.where(seen.point == 1, 0.4, seen.inverse_depth))
+def test_degenerate_points_stay_finite() -> None:
+    scene = Scene(poses=5, points=40, observers=4)
+    given = scene.observations
+    # Point 0 is observed once without depth, 1 once with depth, 2 never; 3 is behind its cameras.
+    rank = torch.arange(given.pose.shape[0]) % 4
+    keep = ~((given.point <= 1) & (rank > 0)) & (given.point != 2)
+    inverse_depth = torch.where(given.point == 0, 0.0, torch.where(given.point == 1, 0.4, given.inverse_depth))
     observations = Observations(
-        pose=seen.pose[keep],
-        point=seen.point[keep],
-        uv=seen.uv[keep],
+        pose=given.pose[keep],
+        point=given.point[keep],
+        uv=given.uv[keep],
         inverse_depth=inverse_depth[keep],
-        pixel_sigma=seen.pixel_sigma[keep],
+        pixel_sigma=given.pixel_sigma[keep],
         inverse_depth_sigma=DEPTH_SIGMA,
     )
     points = scene.start_points.clone()
@@ -250,8 +258,8 @@ def test_weak_points_do_not_blow_up() -> None:
     assert (result.points - scene.points)[good].norm(dim=1).median() < 0.02
 
 
-def test_without_a_fixed_pose_the_cost_still_falls() -> None:
-    scene = Scene(poses=4, points=50, seen_by=4)
+def test_cost_without_a_fixed_pose_reaches_the_same_minimum() -> None:
+    scene = Scene(poses=4, points=50, observers=4)
     free = torch.zeros(4, dtype=torch.bool)
     result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, free, iterations=20)
     tied = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=20)
@@ -259,8 +267,8 @@ def test_without_a_fixed_pose_the_cost_still_falls() -> None:
     assert (result.T_cw - scene.start).abs().max() < 0.3
 
 
-def test_deterministic() -> None:
-    scene = Scene(poses=6, points=200, seen_by=4)
+def test_result_is_deterministic() -> None:
+    scene = Scene(poses=6, points=200, observers=4)
     first, second = (
         bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed) for _ in range(2)
     )

@@ -1,4 +1,4 @@
-"""Keyframes that the map does without: which, against plain counting; and that all that hangs on them follows."""
+"""Culling of landmarks and keyframes against plain counting; poses of culled keyframes; keyframe database."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from itertools import pairwise
 
 import pytest
 import torch
+from helpers.sparse_maps import CAMERA, EYE
+from helpers.sparse_maps import features as random_features
+from helpers.sparse_maps import make_map as make_empty_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -14,140 +17,171 @@ from torch import Tensor
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
 from v3d_torch.config import Config, MappingConfig
 from v3d_torch.features.features import Features
-from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.culling import cull_redundant_keyframes
 from v3d_torch.mapping.sparse_map import SparseMap
 
-CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
-EYE = torch.eye(4, dtype=torch.float64)
 LANDMARKS = 20
 LEVELS = Config().features.levels
 
-Sight = dict[int, int]  # landmarks that a keyframe sees, and on which level of scale each
+Observed = dict[int, int]
+"""Landmarks that a keyframe observes, with the octave of each."""
 
 
 def pose(seed: int) -> Tensor:
     return se3_exp(torch.randn(6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
 
 
-def insert(target: SparseMap, sight: Sight, T_cw: Tensor = EYE, fresh: int = 0) -> None:
-    """A keyframe that sees known landmarks, whose features have no depth, and some new ones."""
-    count, index = len(sight) + fresh, len(target.keyframes)
+def insert(sparse_map: SparseMap, observed: Observed, T_cw: Tensor = EYE, new: int = 0) -> None:
+    """Insert a keyframe that observes known landmarks, by features without depth, and creates some new ones."""
+    count, index = len(observed) + new, len(sparse_map.keyframes)
     generator = torch.Generator().manual_seed(index)
     uv = torch.rand(count, 2, generator=generator, dtype=torch.float64) * torch.tensor([639, 479])
     features = Features(
         uv=uv,
         pixel=uv.round().long(),
-        depth=torch.cat([torch.zeros(len(sight)), torch.full((fresh,), 2.0)]).double(),
-        octave=torch.tensor([*sight.values(), *[0] * fresh], dtype=torch.int64),
+        depth=torch.cat([torch.zeros(len(observed)), torch.full((new,), 2.0)]).double(),
+        octave=torch.tensor([*observed.values(), *[0] * new], dtype=torch.int64),
         descriptors=torch.randint(0, 256, (count, 32), generator=generator, dtype=torch.uint8),
     )
-    target.insert_keyframe(index, index / 30, T_cw, features, torch.tensor([*sight, *[-1] * fresh], dtype=torch.int64))
+    landmarks = torch.tensor([*observed, *[-1] * new], dtype=torch.int64)
+    sparse_map.insert_keyframe(index, index / 30, T_cw, features, landmarks)
 
 
-def map_of(sights: list[Sight], *, moving: bool = False) -> SparseMap:
-    """A map whose first keyframe makes all landmarks, and others that see some of them."""
+def make_map(observed: list[Observed], *, moving: bool = False) -> SparseMap:
+    """A map whose first keyframe creates all landmarks, and whose other keyframes observe some of them."""
     config = Config()
-    target = SparseMap(config.mapping, config.features, CAMERA)
-    insert(target, {}, fresh=LANDMARKS)
-    for index, sight in enumerate(sights, start=1):
-        insert(target, sight, pose(index) if moving else EYE)
-    return target
+    sparse_map = SparseMap(config.mapping, config.features, CAMERA)
+    insert(sparse_map, {}, new=LANDMARKS)
+    for index, by_keyframe in enumerate(observed, start=1):
+        insert(sparse_map, by_keyframe, pose(index) if moving else EYE)
+    return sparse_map
 
 
-def cull(target: SparseMap, **config: float) -> set[int]:
-    """Indices of those retired by then."""
-    cull_redundant_keyframes(target, target.keyframes[-1], MappingConfig(**config))
-    return {keyframe.index for keyframe in target.keyframes if keyframe.is_culled}
+def cull(sparse_map: SparseMap, **config: float) -> set[int]:
+    """Cull redundant keyframes; returns the indices of all culled keyframes."""
+    cull_redundant_keyframes(sparse_map, sparse_map.keyframes[-1], MappingConfig(**config))
+    return {keyframe.index for keyframe in sparse_map.keyframes if keyframe.is_culled}
 
 
-def counted(sights: list[Sight], share: float, views: int) -> set[int]:
-    """ORB-SLAM2's rule, pair by pair: those that share most with the newest first, of these the newest."""
-    seen: dict[int, Sight] = dict(enumerate([dict.fromkeys(range(LANDMARKS), 0), *sights]))
-    newest, gone = len(sights), set()
-    shared = {index: len(sight.keys() & seen[newest].keys()) for index, sight in seen.items()}
-    for index in sorted(seen, key=lambda index: (-shared[index], -index)):
+def count_redundant(observed: list[Observed], ratio: float, views: int) -> set[int]:
+    """ORB-SLAM2's criterion, pair by pair, in the order of shared landmarks with the newest keyframe, newest first."""
+    all_observed: dict[int, Observed] = dict(enumerate([dict.fromkeys(range(LANDMARKS), 0), *observed]))
+    newest, culled = len(observed), set()
+    shared = {index: len(own.keys() & all_observed[newest].keys()) for index, own in all_observed.items()}
+    for index in sorted(all_observed, key=lambda index: (-shared[index], -index)):
         if index in (0, newest) or not shared[index]:
             continue
-        others = [sight for other, sight in seen.items() if other != index and other not in gone]
+        others = [own for other, own in all_observed.items() if other != index and other not in culled]
         redundant = [
-            sum(level >= other[landmark] - 1 for other in others if landmark in other) >= views
-            for landmark, level in seen[index].items()
+            sum(octave >= other[landmark] - 1 for other in others if landmark in other) >= views
+            for landmark, octave in all_observed[index].items()
         ]
-        if sum(redundant) > share * len(redundant):
-            gone.add(index)
-    return gone
+        if sum(redundant) > ratio * len(redundant):
+            culled.add(index)
+    return culled
 
 
-SIGHTS = st.lists(
+OBSERVED = st.lists(
     st.dictionaries(st.integers(0, LANDMARKS - 1), st.integers(0, LEVELS - 1), min_size=1), min_size=1, max_size=9
 )
 
 
 @settings(deadline=None, max_examples=200)
-@given(SIGHTS, st.sampled_from([0.3, 0.5, 0.9]), st.integers(1, 4))
-def test_those_retired_are_those_of_a_plain_count(sights: list[Sight], share: float, views: int) -> None:
-    assert cull(map_of(sights), redundant_share=share, redundant_views=views) == counted(sights, share, views)
+@given(OBSERVED, st.sampled_from([0.3, 0.5, 0.9]), st.integers(1, 4))
+def test_culled_keyframes_equal_a_plain_count(observed: list[Observed], ratio: float, views: int) -> None:
+    culled = cull(make_map(observed), redundant_ratio=ratio, redundant_views=views)
+    assert culled == count_redundant(observed, ratio, views)
 
 
-def test_neither_the_first_nor_the_newest_goes_and_with_a_share_of_1_nobody() -> None:
-    all_alike = [dict.fromkeys(range(LANDMARKS), 0) for _ in range(8)]
-    assert cull(map_of(all_alike), redundant_share=1.0) == set()
-    kept = set(range(9)) - cull(map_of(all_alike))
-    assert {0, 8} < kept and len(kept) == 3  # each is seen by 2 others only
+def test_first_and_newest_keyframe_are_kept_and_a_ratio_of_1_keeps_all() -> None:
+    identical = [dict.fromkeys(range(LANDMARKS), 0) for _ in range(8)]
+    assert cull(make_map(identical), redundant_ratio=1.0) == set()
+    kept = set(range(9)) - cull(make_map(identical))
+    assert {0, 8} < kept and len(kept) == 3  # each landmark is observed by only 2 others
 
 
-def test_what_a_retired_keyframe_saw_is_forgotten_and_nothing_else() -> None:
-    """Landmark 0 is seen by nobody else: it goes; the others stay, and who sees them."""
-    target = map_of([])
-    insert(target, dict.fromkeys(range(1, LANDMARKS), 0), fresh=1)
+def test_culling_a_keyframe_removes_its_observations_and_its_own_landmarks_only() -> None:
+    """The landmark that no other keyframe observes becomes inactive; other observations stay."""
+    sparse_map = make_map([])
+    insert(sparse_map, dict.fromkeys(range(1, LANDMARKS), 0), new=1)
     for _ in range(3):
-        insert(target, dict.fromkeys(range(LANDMARKS), 0))
-    before = target.count_shared(torch.arange(LANDMARKS + 1))
-    target.cull_keyframes({1: 2})
-    retired, after = target.keyframes[1], target.count_shared(torch.arange(LANDMARKS + 1))
-    assert len(retired.features) == len(retired.landmarks) == after[1] == 0
+        insert(sparse_map, dict.fromkeys(range(LANDMARKS), 0))
+    before = sparse_map.count_shared(torch.arange(LANDMARKS + 1))
+    sparse_map.cull_keyframes({1: 2})
+    culled, after = sparse_map.keyframes[1], sparse_map.count_shared(torch.arange(LANDMARKS + 1))
+    assert len(culled.features) == len(culled.landmarks) == after[1] == 0
     assert torch.equal(after[[0, 2, 3, 4]], before[[0, 2, 3, 4]])
-    assert torch.nonzero(~target.landmarks["alive"]).tolist() == [[LANDMARKS]]
-    assert [keyframe.index for keyframe in target.active_keyframes] == [0, 2, 3, 4]
-    for keyframe in target.active_keyframes:  # the tables agree with the keyframes
-        rows = target.observations["keyframe"] == keyframe.index
-        seen = torch.full_like(keyframe.landmarks, -1)
-        seen[target.observations["feature"][rows]] = target.observations["landmark"][rows]
-        assert torch.equal(seen, keyframe.landmarks)
+    assert torch.nonzero(~sparse_map.landmarks["active"]).tolist() == [[LANDMARKS]]
+    assert [keyframe.index for keyframe in sparse_map.active_keyframes] == [0, 2, 3, 4]
+    for keyframe in sparse_map.active_keyframes:  # the table agrees with the keyframes
+        rows = sparse_map.observations["keyframe"] == keyframe.index
+        landmarks = torch.full_like(keyframe.landmarks, -1)
+        landmarks[sparse_map.observations["feature"][rows]] = sparse_map.observations["landmark"][rows]
+        assert torch.equal(landmarks, keyframe.landmarks)
 
 
-def test_poses_and_landmarks_of_the_retired_go_along_with_those_kept() -> None:
-    """Also where the one that they went along with goes itself: 1 with 2, then 2 with 4."""
-    target = map_of([dict.fromkeys(range(LANDMARKS), 0) for _ in range(4)], moving=True)
-    target.landmarks["keyframe"][:5] = 1
+def test_culled_keyframes_and_their_landmarks_move_with_the_reference_keyframe() -> None:
+    """Also if the reference keyframe is culled later: 1 moves with 2, then 2 with 4."""
+    sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(4)], moving=True)
+    sparse_map.landmarks["keyframe"][:5] = 1
     for references in ({1: 2}, {2: 4}):
-        target.cull_keyframes(references)
-        before, points = target.T_cw, target.landmarks["point"].clone()
+        sparse_map.cull_keyframes(references)
+        before, points = sparse_map.T_cw, sparse_map.landmarks["point"].clone()
         moved = torch.stack([pose(100 + index) for index in range(5)])
-        target.move_keyframes(moved)
-        after = target.T_cw
+        sparse_map.move_keyframes(moved)
+        after = sparse_map.T_cw
         assert torch.equal(after[[3, 4]], moved[[3, 4]])
         for index in range(5):
-            reference = target.keyframes[index].reference
-            kept = before[index] @ invert(before[reference])
-            torch.testing.assert_close(after[index] @ invert(after[reference]), kept, rtol=0, atol=1e-12)
+            reference = sparse_map.keyframes[index].reference
+            relative = before[index] @ invert(before[reference])
+            torch.testing.assert_close(after[index] @ invert(after[reference]), relative, rtol=0, atol=1e-12)
         T_new_old = invert(after[1]) @ before[1]
         expected = points[:5] @ T_new_old[:3, :3].T + T_new_old[:3, 3]
-        torch.testing.assert_close(target.landmarks["point"][:5], expected, rtol=0, atol=1e-9)
-    assert [keyframe.reference for keyframe in target.keyframes] == [0, 4, 4, 3, 4]
+        torch.testing.assert_close(sparse_map.landmarks["point"][:5], expected, rtol=0, atol=1e-9)
+    assert [keyframe.reference for keyframe in sparse_map.keyframes] == [0, 4, 4, 3, 4]
 
 
-def test_neighbours_in_time_are_joined_over_the_retired() -> None:
-    target = map_of([dict.fromkeys(range(LANDMARKS), 0) for _ in range(5)])
-    target.cull_keyframes({1: 0, 2: 0, 4: 5})
-    assert target.covisibility_edges(LANDMARKS + 1).tolist() == [list(pair) for pair in pairwise([0, 3, 5])]
+def test_consecutive_active_keyframes_are_connected_across_culled_ones() -> None:
+    sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(5)])
+    sparse_map.cull_keyframes({1: 0, 2: 0, 4: 5})
+    assert sparse_map.covisibility_edges(LANDMARKS + 1).tolist() == [list(pair) for pair in pairwise([0, 3, 5])]
 
 
-@pytest.mark.parametrize("gone", [[3], [0, 1], [4, 0, 2], [0, 1, 2, 3, 4]])
-def test_a_forgotten_place_was_never_there(gone: list[int]) -> None:
-    """Scores weigh by how many keyframes there are and show a thing: those forgotten must not count, at once."""
+# --- landmarks
+
+
+def test_landmarks_with_a_low_found_ratio_are_culled_after_the_next_keyframe() -> None:
+    sparse_map = make_empty_map()
+    sparse_map.insert_keyframe(0, 0.0, EYE, random_features(4), torch.full((4,), -1))
+    for turn in range(8):  # landmark 0 is found in every frame, 1 in every second frame, 2 once, 3 never
+        found = torch.tensor([0, 1 if turn % 2 else -1, 2 if turn == 0 else -1, -1])
+        sparse_map.count_matches(found[found >= 0], torch.arange(4))
+    sparse_map.cull_landmarks()
+    assert sparse_map.landmarks["active"].all()
+    insert(sparse_map, dict.fromkeys(range(4), 0))
+    sparse_map.cull_landmarks()
+    assert sparse_map.landmarks["active"].tolist() == [True, True, False, False]
+
+
+def test_landmarks_without_a_second_observation_are_culled_after_three_keyframes() -> None:
+    sparse_map = make_empty_map()
+    sparse_map.insert_keyframe(0, 0.0, EYE, random_features(3), torch.full((3,), -1))
+    for _ in range(2):
+        insert(sparse_map, {1: 0})
+        sparse_map.cull_landmarks()
+    assert sparse_map.landmarks["active"].all()
+    insert(sparse_map, {})
+    sparse_map.cull_landmarks()
+    assert sparse_map.landmarks["active"].tolist() == [False, True, False]
+
+
+# --- keyframe database
+
+
+@pytest.mark.parametrize("removed", [[3], [0, 1], [4, 0, 2], [0, 1, 2, 3, 4]])
+def test_removed_keyframes_do_not_influence_the_scores(removed: list[int]) -> None:
+    """Scores depend on the number of keyframes and on how many contain a descriptor: removed ones must not count."""
     dice = random.Random(1)  # noqa: S311
     common = torch.randint(0, 256, (40, 32), generator=torch.Generator().manual_seed(9), dtype=torch.uint8)
     places = {
@@ -157,11 +191,11 @@ def test_a_forgotten_place_was_never_there(gone: list[int]) -> None:
     index, expected = KeyframeDatabase(), KeyframeDatabase()
     for place, descriptors in places.items():
         index.add(place, descriptors)
-        if place not in gone:
+        if place not in removed:
             expected.add(place, descriptors)
-    index.remove([*gone[:1], 99])
-    index.remove(gone)
-    assert len(index) == len(expected) == 5 - len(gone)
+    index.remove([*removed[:1], 99])
+    index.remove(removed)
+    assert len(index) == len(expected) == 5 - len(removed)
     assert index.query(common, k=5) == expected.query(common, k=5)
     index.add(7, common)
     expected.add(7, common)

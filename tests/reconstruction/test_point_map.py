@@ -1,4 +1,4 @@
-"""The coloured map against plain voxel means, normals against known surfaces, free space against ghosts."""
+"""Point map against plain voxel means, normals against known surfaces, and removal of points in free space."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
-from v3d_torch.geometry.camera import PinholeCamera, back_project
+from v3d_torch.geometry.camera import back_project
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.static_views import StaticViews
-from v3d_torch.reconstruction import point_map as dense
+from v3d_torch.reconstruction import point_map as point_map_module
 from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 
 ALL = torch.ones(240, 320, dtype=torch.bool)
@@ -27,10 +27,10 @@ def config(**settings: float) -> Config:
     return load_config(overrides=[f"dense_map.{name}={value}" for name, value in settings.items()])
 
 
-def views_of(*seen: tuple[Tensor, Tensor], stride: int = 1) -> StaticViews:
-    """Views of depth images, all of it static, from poses T_cw."""
+def views_of(*images: tuple[Tensor, Tensor], stride: int = 1) -> StaticViews:
+    """Views from pairs of a pose T_cw and a depth image, in which all pixels are static."""
     views = StaticViews(CAMERA, stride)
-    for T_cw, depth in seen:
+    for T_cw, depth in images:
         views.add(keyframe(T_cw), GREY, depth, ALL)
     return views
 
@@ -42,7 +42,7 @@ def wall(z: float) -> Tensor:
 # --- fusion
 
 
-def test_the_map_equals_plain_voxel_means() -> None:
+def test_points_equal_plain_voxel_means() -> None:
     generator = torch.Generator().manual_seed(3)
     views = StaticViews(CAMERA, 4)
     voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
@@ -54,16 +54,16 @@ def test_the_map_equals_plain_voxel_means() -> None:
         views.add(keyframe(invert(T_wc)), image, depth, static)
         v, u = np.mgrid[0:240:4, 0:320:4]
         z = depth[0].numpy()[v, u].astype(np.float64)
-        # On a smooth surface a pixel has a normal where its four neighbours are there.
-        there = static.numpy()[v, u] & (z > 0)
-        keep = binary_erosion(there, generate_binary_structure(2, 1)) & (z <= 1.7)
+        # On a smooth surface a pixel has a normal if its four neighbours are valid.
+        valid = static.numpy()[v, u] & (z > 0)
+        keep = binary_erosion(valid, generate_binary_structure(2, 1)) & (z <= 1.7)
         u, v, z = u[keep], v[keep], z[keep]
         rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(z)], axis=1)
         points = rays * z[:, None] @ T_wc[:3, :3].numpy().T + T_wc[:3, 3].numpy()
         for point, colour in zip(points, image.numpy()[:, v, u].T, strict=True):
             voxels.setdefault(tuple(np.floor(point / 0.05).astype(int)), []).append(np.r_[point, colour])
     fused = fuse_points(views, config(voxel_size=0.05, max_depth=1.7))
-    # Rounding puts a few points on the other side of a voxel's face.
+    # Rounding moves a few points to the next voxel.
     assert len(voxels) > 500 and abs(len(fused) - len(voxels)) <= 3
     expected = np.array([np.mean(rows, axis=0) for rows in voxels.values()])
     distance = torch.cdist(fused.points.double(), torch.from_numpy(expected[:, :3]))
@@ -74,26 +74,27 @@ def test_the_map_equals_plain_voxel_means() -> None:
 
 
 def around(count: int) -> StaticViews:
+    """Views of the room and the crate in all directions."""
     return views_of(*((invert(T_wc), render(T_wc, CRATE)) for T_wc in looking_around(count)), stride=2)
 
 
-def test_points_lie_on_the_surfaces_that_were_seen() -> None:
+def test_points_lie_on_the_observed_surfaces() -> None:
     fused = fuse_points(around(8), config())
     assert len(fused) > 50_000
     error = distance_to(fused.points.double(), CRATE)
-    # The mean over a voxel that holds a corner lies inside of it.
+    # In a voxel with an edge of the room the mean is off the surface.
     assert error.median() < 1e-4 and (error < 1e-3).double().mean() > 0.98 and error.max() < 0.01
 
 
-def test_taken_in_by_parts_the_map_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_are_equal_for_any_batch_size(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = fuse_points(around(6), config())
-    monkeypatch.setattr(dense, "_BATCH", 1)
+    monkeypatch.setattr(point_map_module, "_BATCH", 1)
     parts = fuse_points(around(6), config())
-    assert abs(len(parts) - len(whole)) < 0.001 * len(whole)  # means that lie on the faces of voxels
+    assert abs(len(parts) - len(whole)) < 0.001 * len(whole)  # except for means on voxel boundaries
     assert torch.cdist(parts.points[:2000].double(), whole.points.double()).amin(dim=1).quantile(0.99) < 1e-5
 
 
-def test_the_map_follows_its_keyframes() -> None:
+def test_points_move_with_the_poses_of_their_keyframes() -> None:
     own = keyframe()
     views = StaticViews(CAMERA, 4)
     views.add(own, GREY, wall(2.0), ALL)
@@ -104,39 +105,12 @@ def test_the_map_follows_its_keyframes() -> None:
     torch.testing.assert_close(after.points[:, 2], torch.full((58 * 78,), 2.5))
 
 
-def test_without_views_or_static_pixels_the_map_is_empty() -> None:
+def test_map_without_views_or_static_pixels_is_empty() -> None:
     views = StaticViews(CAMERA, 2)
     for _ in range(2):
         fused = fuse_points(views, config())
         assert fused.points.shape == fused.colours.shape == fused.normals.shape == (0, 3)
         views.add(keyframe(), GREY, wall(1.0), ~ALL)
-
-
-def test_the_lens_is_taken_out() -> None:
-    """Points of a bent image are those of `PinholeCamera.rays`, and are found at their pixel by the pinhole alone."""
-    camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
-    views = StaticViews(camera, 2)
-    v, u = torch.meshgrid(torch.arange(480), torch.arange(640), indexing="ij")
-    depth = 1 + 0.001 * (u + v)[None].float()
-    views.add(keyframe(), torch.zeros(3, 480, 640, dtype=torch.uint8), depth, torch.ones(480, 640, dtype=torch.bool))
-    (view,) = views
-    seen = view.depth > 0
-    points = back_project(view.depth[None, None], views.rays)[0]
-    pixels = views.camera.project(points[seen].double())
-    row, column = torch.nonzero(seen).double().unbind(dim=1)
-    assert (pixels - torch.stack([column, row], dim=1)).abs().max() < 0.26  # half a pixel of the image
-    true = back_project(depth[None], camera.rays)[0].reshape(-1, 3)
-    row = torch.randint(0, int(seen.sum()), (300,), generator=torch.Generator().manual_seed(0))
-    assert torch.cdist(points[seen][row].double(), true.double()).amin(dim=1).max() < 2e-4
-    assert seen.double().mean() > 0.94  # the image is smaller than the pinhole's: this lens shows less in the corners
-
-
-def test_depth_is_kept_to_a_tenth_of_a_millimetre() -> None:
-    depth = 0.5 + 15 * torch.rand(1, 240, 320, generator=torch.Generator().manual_seed(0))
-    (view,) = views_of((EYE, depth))
-    near = depth[0] < 13
-    assert (view.depth - depth[0])[near].abs().max() < 1.1e-4
-    assert (view.depth[depth[0] > 13.2] == 0).all()
 
 
 # --- normals
@@ -154,7 +128,7 @@ def slanted(normal: list[float], distance: float) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("normal", [[0, 0, -1], [0.6, 0, -1], [-0.5, 0.4, -1], [0.1, -0.9, -1]])
 @pytest.mark.parametrize("radius", [0, 1, 4])
 def test_convention_normals_of_a_plane_point_to_the_camera(normal: list[float], radius: int) -> None:
-    """Up to the border, and beside what is not measured."""
+    """Also next to the image border and next to pixels without depth."""
     points, n = slanted(normal, 2.0)
     points[:, 100:110, 60:] = 0
     normals = surface_normals(points, radius)[0]
@@ -165,7 +139,7 @@ def test_convention_normals_of_a_plane_point_to_the_camera(normal: list[float], 
     torch.testing.assert_close(normals, torch.where(known[..., None], n, 0.0), rtol=0, atol=1e-9)
 
 
-def test_normals_are_the_same_alone_and_in_a_batch() -> None:
+def test_normals_of_a_batch_equal_normals_of_each_image() -> None:
     batch = torch.cat([slanted([0, 0, -1], 1.0)[0], slanted([0.5, 0.1, -1], 2.0)[0]])
     normals = surface_normals(batch)
     for points, expected in zip(batch, normals, strict=True):
@@ -184,8 +158,8 @@ def test_edges_and_holes_have_no_normals() -> None:
 
 
 @pytest.mark.parametrize(("distance", "degrees"), [(1.0, 1.5), (2.0, 3.0), (4.0, 6.0)])
-def test_normals_of_a_wall_seen_by_a_kinect(distance: float, degrees: float) -> None:
-    """Error and steps of disparity as Khoshelham and Elberink measured them (Sensors 2012)."""
+def test_normals_of_a_wall_with_kinect_noise_are_accurate(distance: float, degrees: float) -> None:
+    """Noise and quantisation of disparity after Khoshelham and Elberink (Sensors 2012)."""
     generator = torch.Generator().manual_seed(0)
     points, n = slanted([0.5, 0.2, -1], distance)
     z = points[..., 2]
@@ -193,17 +167,17 @@ def test_normals_of_a_wall_seen_by_a_kinect(distance: float, degrees: float) -> 
     z = 1 / (0.00285 * (1 / (0.00285 * z)).round())
     smooth = smooth_depth(z[:, None].float())
     normals = surface_normals(back_project(smooth, CAMERA.rays))[0].double()
-    known = (normals != 0).any(dim=-1)
-    angle = torch.rad2deg(torch.arccos((normals[known] @ n).clamp(max=1)))
+    valid = (normals != 0).any(dim=-1)
+    angle = torch.rad2deg(torch.arccos((normals[valid] @ n).clamp(max=1)))
     assert angle.quantile(0.9) < degrees
-    assert known.double().mean() > 0.95
+    assert valid.double().mean() > 0.95
 
 
-def test_the_maps_normals_are_those_of_the_room() -> None:
+def test_normals_of_the_map_equal_the_normals_of_the_room() -> None:
     fused = fuse_points(around(8), config())
     lengths = fused.normals.norm(dim=1)
     torch.testing.assert_close(lengths, torch.ones_like(lengths))
-    # Seen from inside, the wall to the right is met by its normal from the left, and so on; y is down.
+    # Normals point into the room: to the left at the right wall, and so on; y points down.
     for axis, place, sign in ((0, 1.49, -1), (0, -1.53, 1), (2, 1.83, -1), (2, -1.47, 1), (1, 0.41, -1)):
         on = (fused.points[:, axis] - place).abs() < 1e-3
         corners = torch.cat([ROOM, CRATE])
@@ -218,7 +192,7 @@ def test_the_maps_normals_are_those_of_the_room() -> None:
 
 
 def square_at(z: float, behind: float = 2.5) -> Tensor:
-    """A wall with something of 0.4 m before it."""
+    """Depth image of a wall and of a square of 0.4 m in front of it."""
     depth = wall(behind)
     half = round(0.2 / z * CAMERA.fx)
     depth[0, 120 - half : 120 + half, 160 - half : 160 + half] = z
@@ -226,36 +200,36 @@ def square_at(z: float, behind: float = 2.5) -> Tensor:
 
 
 def aside(x: float) -> Tensor:
-    """``T_cw`` of a camera x metres to the right that looks ahead."""
+    """``T_cw`` of a camera x metres to the right, without rotation."""
     return se3_exp(torch.tensor([-x, 0, 0, 0, 0, 0], dtype=torch.float64))
 
 
-def before_the_wall(fused: PointMap) -> int:
+def count_in_front_of_the_wall(fused: PointMap) -> int:
     return int((fused.points[:, 2] < 2.3).sum())
 
 
-def test_a_ghost_in_one_view_is_looked_through_by_another() -> None:
-    ghost = (EYE, square_at(1.5))
-    assert before_the_wall(fuse_points(views_of(ghost), config())) > 1000
-    assert before_the_wall(fuse_points(views_of(ghost, (aside(0.1), wall(2.5))), config())) == 0
-    assert before_the_wall(fuse_points(views_of((aside(0.1), wall(2.5)), ghost), config())) == 0
+def test_object_in_one_view_is_removed_if_another_view_observes_free_space() -> None:
+    transient = (EYE, square_at(1.5))
+    assert count_in_front_of_the_wall(fuse_points(views_of(transient), config())) > 1000
+    assert count_in_front_of_the_wall(fuse_points(views_of(transient, (aside(0.1), wall(2.5))), config())) == 0
+    assert count_in_front_of_the_wall(fuse_points(views_of((aside(0.1), wall(2.5)), transient), config())) == 0
 
 
-def test_what_is_seen_more_often_than_looked_through_stays() -> None:
-    """A chair that somebody takes away in the end, or one of many depth images that is wrong."""
-    there, gone = (EYE, square_at(1.5)), (EYE, wall(2.5))
-    assert before_the_wall(fuse_points(views_of(there, there, gone), config())) > 1000
-    assert before_the_wall(fuse_points(views_of(there, gone, gone), config())) == 0
+def test_object_in_most_views_is_kept() -> None:
+    """For example a chair that is removed at the end, or a single wrong depth image."""
+    present, absent = (EYE, square_at(1.5)), (EYE, wall(2.5))
+    assert count_in_front_of_the_wall(fuse_points(views_of(present, present, absent), config())) > 1000
+    assert count_in_front_of_the_wall(fuse_points(views_of(present, absent, absent), config())) == 0
 
 
-def test_what_is_hidden_or_not_measured_is_not_gone() -> None:
-    there = (EYE, square_at(1.5))
+def test_occluded_or_unmeasured_object_is_kept() -> None:
+    present = (EYE, square_at(1.5))
     for depth in (wall(0.8), wall(0.0)):
-        assert before_the_wall(fuse_points(views_of(there, *3 * [(EYE, depth)]), config())) > 1000
+        assert count_in_front_of_the_wall(fuse_points(views_of(present, *3 * [(EYE, depth)]), config())) > 1000
 
 
-def test_nothing_of_a_still_room_is_looked_through() -> None:
-    """Grazing views, corners and all."""
+def test_static_room_loses_no_points() -> None:
+    """Including surfaces at grazing angles and corners."""
     views = around(12)
     kept = fuse_points(views, config())
     every = fuse_points(views, load_config(overrides=["objects.free_space.min_tolerance=100"]))

@@ -1,4 +1,4 @@
-"""Signed distances of known surfaces, and the mesh of a known room, beside Open3D's where it can be had."""
+"""TSDF of known surfaces, and the mesh of a known room, also compared with Open3D if it is installed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VOXEL, TRUNCATION = CONFIG.mesh.voxel_size, CONFIG.mesh.truncation
 
 
 def views_of(poses: Tensor, *boxes: Tensor, stride: int = 2) -> StaticViews:
-    """The room from poses T_wc, in colours that tell the place: its corners are black and white."""
+    """Views of the room from poses T_wc; colours are linear in the position, from black to white corner."""
     views = StaticViews(CAMERA, stride)
     for T_wc in poses:
         depth = render(T_wc, *boxes)
@@ -35,7 +35,7 @@ def views_of(poses: Tensor, *boxes: Tensor, stride: int = 2) -> StaticViews:
 
 
 def flat(z: float, *more: tuple[Tensor, float]) -> StaticViews:
-    """Walls at a distance, seen from the origin or from poses T_cw."""
+    """Views of flat walls: one at depth z from the origin, and others from poses T_cw at given depths."""
     views = StaticViews(CAMERA, 1)
     for T_cw, distance in ((EYE, z), *more):
         grey = torch.full((3, 240, 320), 128, dtype=torch.uint8)
@@ -45,14 +45,14 @@ def flat(z: float, *more: tuple[Tensor, float]) -> StaticViews:
 
 @pytest.fixture(scope="module")
 def room() -> Mesh:
-    """The room with a crate in it from twelve poses."""
+    """Mesh of the room with a crate in it from twelve poses."""
     return fuse_mesh(views_of(looking_around(12), CRATE), CONFIG)
 
 
 # --- distances
 
 
-def test_blocks_lie_around_the_surface_and_only_there() -> None:
+def test_blocks_cover_the_surface_and_its_truncation_band_only() -> None:
     views = flat(2.0)
     blocks = surface_blocks(views, CONFIG)
     assert torch.equal(blocks, blocks.unique(dim=0))
@@ -60,14 +60,14 @@ def test_blocks_lie_around_the_surface_and_only_there() -> None:
     depths = (blocks[:, 2] * side).unique()
     assert torch.equal(depths, depths[(depths <= 2.0 + TRUNCATION) & (depths + side >= 2.0 - TRUNCATION)])
     edge = torch.tensor([[0.0, 0], [319, 239]]).sub(torch.tensor([CAMERA.cx, CAMERA.cy])) / CAMERA.fx * 2.0
-    seen = (edge / side).floor()
-    assert torch.equal(blocks[blocks[:, 2] == 12][:, :2].amin(dim=0), seen[0].long())
-    assert torch.equal(blocks[blocks[:, 2] == 12][:, :2].amax(dim=0), seen[1].long())
+    expected = (edge / side).floor()
+    assert torch.equal(blocks[blocks[:, 2] == 12][:, :2].amin(dim=0), expected[0].long())
+    assert torch.equal(blocks[blocks[:, 2] == 12][:, :2].amax(dim=0), expected[1].long())
     far = surface_blocks(flat(4.5), CONFIG)
     assert len(far) == 0  # beyond max_depth
 
 
-def test_convention_distances_are_along_the_axis_and_positive_before_the_surface() -> None:
+def test_convention_distances_are_along_the_optical_axis_and_positive_in_front_of_the_surface() -> None:
     blocks = torch.tensor([[0, 0, 12], [0, 0, 5], [0, 0, 14], [0, 0, -12]])
     distances, weights = integrate(blocks, flat(2.0), CONFIG)
     z = (blocks[:, 2:] * BLOCK + torch.arange(BLOCK)) * VOXEL  # (4, 8)
@@ -79,7 +79,7 @@ def test_convention_distances_are_along_the_axis_and_positive_before_the_surface
     torch.testing.assert_close(weights[0, 0, 0, :3], 1 / z[0, :3].square().float(), rtol=1e-4, atol=0)
 
 
-def test_outside_of_the_image_nothing_is_known() -> None:
+def test_voxels_outside_of_the_image_have_no_weight() -> None:
     blocks = torch.cartesian_prod(torch.arange(-20, 20), torch.arange(-20, 20), torch.tensor([11]))
     _, weights = integrate(blocks, flat(2.0), CONFIG)
     voxels = (blocks[:, None] * BLOCK + torch.cartesian_prod(*3 * [torch.arange(BLOCK)])) * VOXEL
@@ -90,8 +90,8 @@ def test_outside_of_the_image_nothing_is_known() -> None:
     assert inside.any() and outside.any()
 
 
-def test_distances_are_means_by_inverse_square_depth() -> None:
-    """Two walls 4 cm apart, the second from half a metre farther back."""
+def test_distances_are_means_weighted_by_inverse_squared_depth() -> None:
+    """Two walls 4 cm apart, the second one viewed from half a metre farther away."""
     back = torch.eye(4, dtype=torch.float64)
     back[2, 3] = 0.5
     distances, weights = integrate(torch.tensor([[0, 0, 12]]), flat(2.0, (back, 2.54)), CONFIG)
@@ -102,29 +102,29 @@ def test_distances_are_means_by_inverse_square_depth() -> None:
     torch.testing.assert_close(distances[0, 0, 0], (a * first + b * second) / (a + b), rtol=0, atol=1e-3)
 
 
-def test_who_is_looked_through_leaves_no_surface() -> None:
-    ghost = StaticViews(CAMERA, 1)
-    somebody = torch.full((1, 240, 320), 2.5)
-    somebody[0, 100:140, 140:180] = 1.5
+def test_object_in_observed_free_space_leaves_no_surface() -> None:
+    views = StaticViews(CAMERA, 1)
+    person = torch.full((1, 240, 320), 2.5)
+    person[0, 100:140, 140:180] = 1.5
     grey = torch.full((3, 240, 320), 128, dtype=torch.uint8)
-    for depth in (somebody, *3 * [torch.full((1, 240, 320), 2.5)]):
-        ghost.add(keyframe(EYE), grey, depth, ALL)
-    mesh = fuse_mesh(ghost, CONFIG)
+    for depth in (person, *3 * [torch.full((1, 240, 320), 2.5)]):
+        views.add(keyframe(EYE), grey, depth, ALL)
+    mesh = fuse_mesh(views, CONFIG)
     assert len(mesh.vertices) > 1000 and mesh.vertices[:, 2].min() > 2.4
 
 
 # --- the mesh
 
 
-def test_vertices_lie_on_the_rooms_surfaces(room: Mesh) -> None:
+def test_vertices_lie_on_the_surfaces_of_the_room(room: Mesh) -> None:
     assert len(room.vertices) > 20_000
     error = distance_to(room.vertices.double(), CRATE)
     assert error.median() < 0.05 * VOXEL
-    # Corners are rounded, and beside the crate's edges nobody saw how far it reaches back.
+    # Corners are rounded, and behind the edges of the crate its depth was not observed.
     assert error.quantile(0.95) < 0.5 * VOXEL and error.quantile(0.99) < TRUNCATION
 
 
-def test_every_surface_in_sight_is_covered(room: Mesh) -> None:
+def test_mesh_covers_all_visible_surfaces(room: Mesh) -> None:
     for T_wc in looking_around(12)[::3]:
         points = (CAMERA.rays * render(T_wc, CRATE)[0, ..., None])[::16, ::16].reshape(-1, 3).double()
         points = points @ T_wc[:3, :3].T + T_wc[:3, 3]
@@ -132,8 +132,8 @@ def test_every_surface_in_sight_is_covered(room: Mesh) -> None:
         assert covered.double().mean() > 0.97
 
 
-def test_convention_the_front_of_the_triangles_is_seen(room: Mesh) -> None:
-    """From inside the room, where everything was seen from, corners run counterclockwise; normals agree."""
+def test_convention_triangles_are_counterclockwise_from_free_space(room: Mesh) -> None:
+    """Viewed from inside the room; vertex normals agree."""
     a, b, c = room.vertices[room.faces].double().unbind(dim=1)
     normal = torch.linalg.cross(b - a, c - a)
     on_walls = (distance_to((a + b + c) / 3) < 0.01) & (normal.norm(dim=1) > 1e-6)
@@ -144,26 +144,26 @@ def test_convention_the_front_of_the_triangles_is_seen(room: Mesh) -> None:
     torch.testing.assert_close(lengths, torch.ones_like(lengths))
 
 
-def test_colours_are_those_of_the_places(room: Mesh) -> None:
+def test_vertex_colours_equal_the_colours_of_the_views(room: Mesh) -> None:
     near = distance_to(room.vertices.double(), CRATE) < 0.2 * VOXEL
     expected = 255 * ((room.vertices - ROOM[0]) / (ROOM[1] - ROOM[0])).clamp(0, 1)
     difference = (room.colours.double() - expected).abs().amax(dim=1)[near]
     assert difference.quantile(0.95) < 4  # of 255: a pixel is 1 cm wide
 
 
-def test_a_mesh_is_closed_but_for_its_rim() -> None:
-    """Inside of what was seen each edge has a triangle to either side, also where tiles meet."""
+def test_mesh_is_closed_except_at_its_boundary() -> None:
+    """Each inner edge has a triangle on both sides, also between tiles."""
     mesh = fuse_mesh(views_of(looking_around(12)), CONFIG)
     edges = torch.cat([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     _, times = edges.sort(dim=1).values.unique(dim=0, return_counts=True)
     assert times.max() == 2
-    rim = edges.sort(dim=1).values.unique(dim=0)[times == 1]
-    # The camera never sees floor and ceiling but in the corners: the walls' strip ends above and below.
-    assert (mesh.vertices[rim][..., 1].abs() > 0.5).all()
+    boundary = edges.sort(dim=1).values.unique(dim=0)[times == 1]
+    # Floor and ceiling are observed in the corners only: the boundary is above and below.
+    assert (mesh.vertices[boundary][..., 1].abs() > 0.5).all()
     assert len(mesh.faces.unique()) == len(mesh.vertices)
 
 
-def test_tiles_of_any_size_make_the_same_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_is_equal_for_any_tile_size(monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(looking_around(3), CRATE)
     whole = fuse_mesh(views, CONFIG)
     monkeypatch.setattr(mesh_module, "_TILE", 3)
@@ -174,7 +174,7 @@ def test_tiles_of_any_size_make_the_same_mesh(monkeypatch: pytest.MonkeyPatch) -
     assert (tiled.colours.int() - whole.colours[same].int()).abs().max() <= 1
 
 
-def test_finer_voxels_make_a_finer_mesh() -> None:
+def test_smaller_voxels_give_a_finer_mesh() -> None:
     views = views_of(looking_around(6), stride=1)
     fine = fuse_mesh(views, DenseMapConfig(stride=1, mesh=MeshConfig(voxel_size=0.01, truncation=0.04)))
     coarse = fuse_mesh(views, DenseMapConfig(stride=1, mesh=MeshConfig(voxel_size=0.04, truncation=0.16)))
@@ -182,7 +182,7 @@ def test_finer_voxels_make_a_finer_mesh() -> None:
     assert distance_to(fine.vertices.double()).quantile(0.95) < 0.002
 
 
-def test_nothing_seen_makes_an_empty_mesh() -> None:
+def test_mesh_without_views_or_static_pixels_is_empty() -> None:
     views = StaticViews(CAMERA, 2)
     for _ in range(2):
         mesh = fuse_mesh(views, CONFIG)
@@ -190,24 +190,24 @@ def test_nothing_seen_makes_an_empty_mesh() -> None:
         views.add(keyframe(), torch.zeros(3, 240, 320, dtype=torch.uint8), torch.ones(1, 240, 320), ~ALL)
 
 
-def test_the_same_mesh_again_to_the_bit(room: Mesh) -> None:
+def test_mesh_is_deterministic(room: Mesh) -> None:
     again = fuse_mesh(views_of(looking_around(12), CRATE), CONFIG)
     for name in ("vertices", "faces", "normals", "colours"):
         assert torch.equal(getattr(again, name), getattr(room, name))
 
 
-# --- beside Open3D
+# --- Open3D
 
 
 def open3d() -> ModuleType:
     try:
         return importlib.import_module("open3d")
-    except ImportError as error:  # it is not there, or lacks a library of the system such as libusb-1.0
+    except ImportError as error:  # not installed, or without a system library such as libusb-1.0
         pytest.skip(f"Open3D cannot be imported: {error}")
 
 
-def test_surfaces_are_those_of_open3d() -> None:
-    """Its dense volume with the same voxels (the scalable one of 0.20 stays empty): both meshes lie on each other."""
+def test_mesh_equals_the_mesh_of_open3d() -> None:
+    """Open3D's dense volume with the same voxels; its scalable volume of version 0.20 stays empty."""
     o3d = open3d()
     poses = looking_around(12)
     kind = o3d.pipelines.integration.TSDFVolumeColorType.NoColor
@@ -228,7 +228,7 @@ def test_surfaces_are_those_of_open3d() -> None:
     ours = fuse_mesh(views_of(poses, CRATE, stride=1), CONFIG).vertices.double()
     assert 0.98 < len(ours) / len(theirs) < 1.02
     for a, b in ((ours, theirs), (theirs, ours)):
-        nearest = torch.cdist(a[::9], b).amin(dim=1)  # of vertices: the two grids are shifted against each other
+        nearest = torch.cdist(a[::9], b).amin(dim=1)  # of vertices: the two grids have different origins
         assert nearest.quantile(0.98) < 0.75 * VOXEL
     errors = [distance_to(mesh, CRATE).quantile(0.99) for mesh in (ours, theirs)]
     assert errors[0] < 1.1 * errors[1], errors

@@ -1,4 +1,4 @@
-"""Maps of earlier runs, and where the next one is to be saved."""
+"""Cases with map files: intact, damaged and incompatible maps, and paths to which a map cannot be saved."""
 
 from __future__ import annotations
 
@@ -28,34 +28,34 @@ from helpers.corpus.case import (
 )
 from v3d_torch.cli import run
 
-NO_MAP = "{seq}/room.map: is no map, or a damaged one (...); give a file that --save-map wrote"
+NOT_A_MAP = "{seq}/room.map: is not a map file or is damaged (...); give a file written by --save-map"
 
 
 @cache
-def whole() -> bytes:
-    """A map of the sequence."""
+def map_bytes() -> bytes:
+    """Content of the map file that a run over the sequence saves."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         write_base(folder / "seq")
         paths = {"--seq": folder / "seq", "--out": folder / "out", "--save-map": folder / "room.map"}
-        given = [word for option, path in paths.items() for word in (option, str(path))]
-        done = CliRunner().invoke(run.app, [*given, "--segmenter", "none"])
-        assert done.exit_code == 0, done.stderr
+        arguments = [word for option, path in paths.items() for word in (option, str(path))]
+        result = CliRunner().invoke(run.app, [*arguments, "--segmenter", "none"])
+        assert result.exit_code == 0, result.stderr
         return (folder / "room.map").read_bytes()
 
 
-def given(change: Callable[[bytes], bytes] = lambda content: content) -> Damage:
-    """The map, changed."""
+def load_map(change: Callable[[bytes], bytes] = lambda content: content) -> Damage:
+    """Load a map file with changed content."""
 
     def make(place: Workspace) -> None:
-        write("room.map", change(whole()))(place)
+        write("room.map", change(map_bytes()))(place)
         add_options("--load-map", "{seq}/room.map")(place)
 
     return make
 
 
 def with_array(name: str, array: np.ndarray, claim: int | None = None) -> Callable[[bytes], bytes]:
-    """Another array in place of one of the map, which may claim to be larger than it is."""
+    """Replace an array of the file; ``claim`` is a false unpacked size for its zip entry, bytes."""
 
     def change(content: bytes) -> bytes:
         changed, file = io.BytesIO(), io.BytesIO()
@@ -70,88 +70,91 @@ def with_array(name: str, array: np.ndarray, claim: int | None = None) -> Callab
     return change
 
 
-def of_another_room(place: Workspace) -> None:
-    """Other images, in which nothing is of the map."""
+def show_another_room(place: Workspace) -> None:
+    """Replace the images by images without any feature of the map."""
     for i, stamp in enumerate(STAMPS):
         noise = np.random.default_rng(50).integers(0, 256, (60, 120, 3), dtype=np.uint8)
         (place.folder / "rgb" / f"{stamp}.png").write_bytes(png(noise[:, 2 * i : 2 * i + 80]))
 
 
-def saved(to: str) -> Damage:
-    return add_options("--save-map", to)
+def save_map(path: str) -> Damage:
+    """Save the map of the run at a path."""
+    return add_options("--save-map", path)
 
 
 CASES = [
-    Case("a map", given(), Succeeds()),
-    Case("a map to find the camera in", all_of(given(), add_options("--localise")), Succeeds()),
+    Case("an intact map", load_map(), Succeeds()),
+    Case("localisation in an intact map", all_of(load_map(), add_options("--localise")), Succeeds()),
     Case(
         "--localise without a map",
         add_options("--localise"),
         Fails("mapping.enabled=false: there is no map to find the camera in; give one with --load-map"),
     ),
     Case(
-        "not there",
+        "a missing file",
         add_options("--load-map", "{seq}/room.map"),
-        Fails("{seq}/room.map: cannot be read (No such file or directory); give a file that --save-map wrote"),
+        Fails("{seq}/room.map: cannot be read (No such file or directory); give a file written by --save-map"),
     ),
     Case(
-        "a folder",
+        "a folder instead of a file",
         add_options("--load-map", "{seq}"),
-        Fails("{seq}: cannot be read (Is a directory); give a file that --save-map wrote"),
+        Fails("{seq}: cannot be read (Is a directory); give a file written by --save-map"),
     ),
-    Case("empty", given(lambda content: b""), Fails(NO_MAP)),
-    Case("noise", given(lambda content: NOISE), Fails(NO_MAP)),
-    Case("an image", given(lambda content: png(np.zeros((3, 3), np.uint8))), Fails(NO_MAP)),
-    Case("breaks off", given(first_half), Fails(NO_MAP)),
-    Case("a wrong byte", given(lambda content: content[:20_000] + b"\0\0" + content[20_002:]), Fails(NO_MAP)),
-    Case("a zip of something else", given(with_array("about", np.zeros(3, np.uint8))), Fails(NO_MAP)),
-    Case("objects in place of numbers", given(with_array("keyframe/stamp", np.array([{}, {}]))), Fails(NO_MAP)),
+    Case("an empty file", load_map(lambda content: b""), Fails(NOT_A_MAP)),
+    Case("random bytes", load_map(lambda content: NOISE), Fails(NOT_A_MAP)),
+    Case("an image", load_map(lambda content: png(np.zeros((3, 3), np.uint8))), Fails(NOT_A_MAP)),
+    Case("a truncated file", load_map(first_half), Fails(NOT_A_MAP)),
+    Case("two wrong bytes", load_map(lambda content: content[:20_000] + b"\0\0" + content[20_002:]), Fails(NOT_A_MAP)),
+    Case("a zip archive without a header", load_map(with_array("about", np.zeros(3, np.uint8))), Fails(NOT_A_MAP)),
+    Case("pickled objects", load_map(with_array("keyframe/stamp", np.array([{}, {}]))), Fails(NOT_A_MAP)),
     Case(
-        "a position that is no number",
-        given(with_array("landmark/point", np.full((644, 3), np.nan))),
-        Fails("{seq}/room.map: is a damaged map (landmark/point is not finite); give a file that --save-map wrote"),
-    ),
-    Case(
-        "landmarks that are missing",
-        given(with_array("landmark/point", np.zeros((3, 3)))),
-        Fails("{seq}/room.map: is a damaged map (...); give a file that --save-map wrote"),
-    ),
-    Case(
-        "an array that claims a terabyte",
-        given(with_array("view/colour", np.zeros((2, 3), np.uint8), claim=1 << 40)),
+        "landmark positions that are NaN",
+        load_map(with_array("landmark/point", np.full((644, 3), np.nan))),
         Fails(
-            "{seq}/room.map: is no map, or a damaged one (it claims to hold ... bytes in ...); give a file that"
-            " --save-map wrote"
+            "{seq}/room.map: is a damaged map file (landmark/point is not finite); give a file written by --save-map"
         ),
     ),
     Case(
-        "of another camera",
-        all_of(given(), edit("camera.yaml", replace_text("64.0", "66.0"))),
+        "missing landmarks",
+        load_map(with_array("landmark/point", np.zeros((3, 3)))),
+        Fails("{seq}/room.map: is a damaged map file (...); give a file written by --save-map"),
+    ),
+    Case(
+        "an array that claims to be a terabyte",
+        load_map(with_array("view/colour", np.zeros((2, 3), np.uint8), claim=1 << 40)),
+        Fails(
+            "{seq}/room.map: is not a map file or is damaged (it would unpack to ... bytes from ...); give a file"
+            " written by --save-map"
+        ),
+    ),
+    Case(
+        "a map of another camera",
+        all_of(load_map(), edit("camera.yaml", replace_text("64.0", "66.0"))),
         Fails("{seq}/room.map: was made with another camera (...) than the sequence's (...); give another map, or ..."),
     ),
     Case(
-        "of other features",
-        all_of(given(), add_options("--set", "features.levels=5")),
+        "a map with other feature settings",
+        all_of(load_map(), add_options("--set", "features.levels=5")),
         Fails("{seq}/room.map: was made with features.levels=8, not 5; add --set features.levels=8"),
     ),
     Case(
-        "of another room",
-        all_of(given(), of_another_room),
+        "a map of another room",
+        all_of(load_map(), show_another_room),
         Fails("{seq}/room.map: no frame of {seq} shows a place of this map; its results are in {out}", saved_poses=8),
     ),
     Case(
-        "to be saved as a folder",
-        saved("{seq}"),
+        "a map saved to a folder",
+        save_map("{seq}"),
         Fails("{seq}: cannot be written (Is a directory); give another file"),
     ),
     Case(
-        "to be saved below a file",
-        saved("{seq}/rgb.txt/room.map"),
+        "a map saved below a file",
+        save_map("{seq}/rgb.txt/room.map"),
         Fails("{seq}/rgb.txt/room.map: cannot be written (File exists); give another file"),
     ),
     Case(
-        "to be saved under a name of 5000 letters",
-        saved("{root}/" + 5000 * "x"),
+        "a map saved under a name of 5000 letters",
+        save_map("{root}/" + 5000 * "x"),
         Fails("{root}/...: cannot be written (File name too long); give another file"),
     ),
 ]

@@ -1,0 +1,56 @@
+"""Static views: undistortion, precision of depth, and their state."""
+
+from __future__ import annotations
+
+import torch
+from helpers.rooms import CAMERA, EYE, keyframe
+
+from v3d_torch.geometry.camera import PinholeCamera, back_project
+from v3d_torch.mapping.static_views import StaticViews
+
+ALL = torch.ones(240, 320, dtype=torch.bool)
+GREY = torch.full((3, 240, 320), 128, dtype=torch.uint8)
+
+
+def test_distortion_is_removed() -> None:
+    """Points lie on the rays of the distorted camera, and the pinhole projects them to their pixels."""
+    camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+    views = StaticViews(camera, 2)
+    v, u = torch.meshgrid(torch.arange(480), torch.arange(640), indexing="ij")
+    depth = 1 + 0.001 * (u + v)[None].float()
+    views.add(keyframe(), torch.zeros(3, 480, 640, dtype=torch.uint8), depth, torch.ones(480, 640, dtype=torch.bool))
+    (view,) = views
+    valid = view.depth > 0
+    points = back_project(view.depth[None, None], views.rays)[0]
+    pixels = views.camera.project(points[valid].double())
+    row, column = torch.nonzero(valid).double().unbind(dim=1)
+    assert (pixels - torch.stack([column, row], dim=1)).abs().max() < 0.26  # half a pixel of the image
+    expected = back_project(depth[None], camera.rays)[0].reshape(-1, 3)
+    sample = torch.randint(0, int(valid.sum()), (300,), generator=torch.Generator().manual_seed(0))
+    assert torch.cdist(points[valid][sample].double(), expected.double()).amin(dim=1).max() < 2e-4
+    assert valid.double().mean() > 0.94  # in the corners this lens covers less than the pinhole
+
+
+def test_depth_is_stored_with_a_tenth_of_a_millimetre() -> None:
+    depth = 0.5 + 15 * torch.rand(1, 240, 320, generator=torch.Generator().manual_seed(0))
+    views = StaticViews(CAMERA, 1)
+    views.add(keyframe(EYE), GREY, depth, ALL)
+    (view,) = views
+    near = depth[0] < 13
+    assert (view.depth - depth[0])[near].abs().max() < 1.1e-4
+    assert (view.depth[depth[0] > 13.2] == 0).all()
+
+
+def test_views_with_the_state_of_other_views_continue_like_them() -> None:
+    original, restored = StaticViews(CAMERA, 2), StaticViews(CAMERA, 2)
+    first, second, third = (keyframe(EYE, frame) for frame in range(3))
+    for own in (first, second):
+        original.add(own, GREY, torch.full((1, 240, 320), 1.0 + own.frame), ALL)
+    restored.load_state_dict({name: list(views) for name, views in original.state_dict().items()})
+    assert list(restored) == list(original)  # the same objects
+    first.reference = 1  # culled: its view is removed when the next one is added
+    for views in (original, restored):
+        views.add(third, GREY, torch.full((1, 240, 320), 3.0), ALL)
+        assert [view.keyframe for view in views] == [second, third]
+    for ours, other in zip(original, restored, strict=True):
+        assert torch.equal(ours.depth, other.depth) and torch.equal(ours.colour, other.colour)
