@@ -222,7 +222,7 @@ def test_landmark_positions_are_those_of_active_landmarks() -> None:
     sparse_map = map_of_two_keyframes(KINECT)
     first = sparse_map.keyframes[0]
     landmark_ids = torch.where(torch.arange(len(first.landmarks)) % 2 == 0, first.landmarks, -1)
-    sparse_map.landmarks["alive"][landmark_ids[4]] = False
+    sparse_map.landmarks["active"][landmark_ids[4]] = False
     found, points = sparse_map.landmark_positions(landmark_ids)
     assert found.tolist() == [i for i in range(0, len(landmark_ids), 2) if i != 4]
     assert torch.equal(points, sparse_map.landmarks["point"][first.landmarks[found]])
