@@ -109,15 +109,17 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
         expected = sum(int(reference[index].sum()) for index in segmenter.people)
         scores = run.mask_evaluation.compute_scores()
         truth = sequence.groundtruth
-        ate = truth and evaluate(truth, pipeline.slam.poses.trajectory(), frames=len(sequence)).ate.rmse
+        ate = None
+        if truth is not None:
+            ate = evaluate(truth, pipeline.slam.poses.trajectory(), frames=len(sequence)).ate.rmse
         yield {
             "sequence": sequence.name,
             "network": name,
             "ms": f"{1e3 * median(segmenter.seconds) / variant.every:.0f}",
             "people_found": format_value(found / expected if expected else None, ".1%"),
-            "moving_left_out": format_value(scores and scores.moving_left_out, ".1%"),
-            "static_left_out": format_value(scores and scores.static_left_out, ".1%"),
-            "id_changes": format_value(scores and scores.id_changes_per_60_frames, ".2f"),
+            "moving_left_out": format_value(scores.moving_left_out if scores else None, ".1%"),
+            "static_left_out": format_value(scores.static_left_out if scores else None, ".1%"),
+            "id_changes": format_value(scores.id_changes_per_60_frames if scores else None, ".2f"),
             "ate": format_value(ate, ".4f"),
         }
 

@@ -24,9 +24,10 @@ segmentation:
   model: yolo11n-seg
 ```
 
-`--config my.yaml` reads it, `--set objects.voting.distance_threshold=0.08` changes a single value. The package has configurations with names: `full` (the
-default), `paper`, `baseline`, and the variants of the [ablation study](commands/ablate.md). Unknown keys are rejected, and the message names the nearest one.
-Each run writes its whole configuration to `config.yaml`.
+`--config my.yaml` reads it, `--set objects.voting.distance_threshold=0.08` changes a single value. The package has
+named configurations: `full` (the default), `paper`, `baseline`, and the variants of the
+[ablation study](commands/ablate.md). Unknown keys are rejected, and the message names the nearest one. Each run writes
+its whole configuration to `config.yaml`.
 
 ::: v3d_torch.config.loading.load_config
 """
@@ -45,7 +46,9 @@ TAIL = """
 
 def page() -> str:
     """Return the text of the page."""
-    classes = {node.name: node for node in ast.parse(SCHEMA.read_text()).body if isinstance(node, ast.ClassDef)}
+    classes = {
+        node.name: node for node in ast.parse(SCHEMA.read_text(encoding="utf-8")).body if isinstance(node, ast.ClassDef)
+    }
     return HEAD + "".join(sections(classes, "Config", "")) + TAIL
 
 
@@ -73,8 +76,10 @@ def sections(classes: dict[str, ast.ClassDef], name: str, path: str) -> Iterator
 def default(value: ast.expr | None) -> str:
     """Return the default of a field as it is written in YAML."""
     literal = ast.literal_eval(value.args[0] if isinstance(value, ast.Call) else value or ast.Constant(None))
-    return str(literal).lower() if isinstance(literal, bool) else str(list(literal) if isinstance(literal, tuple) else literal)
+    if isinstance(literal, bool):
+        return str(literal).lower()
+    return str(list(literal) if isinstance(literal, tuple) else literal)
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page())
+    PAGE.write_text(page(), encoding="utf-8")

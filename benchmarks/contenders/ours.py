@@ -39,8 +39,8 @@ class Ours:
         set_num_threads(config.threads)
         torch.manual_seed(seed)
         self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
-        self.pipeline = Pipeline(sequence, self.slam, score=False)  # scoring the masks is not part of tracking
-        self.pipeline.get_ready()
+        self.pipeline = Pipeline(sequence, self.slam, evaluate_masks=False)  # not part of tracking
+        self.pipeline.start_prefetching()
 
     @property
     def stages(self) -> Mapping[str, float]:

@@ -37,13 +37,16 @@ CLASSIFIERS = {
 
 HEAD = """# Licences
 The code of v3d_torch is under Apache-2.0. This page lists its requirements and their dependencies, in the versions of
-`constraints.txt`, with the licence that each package states. `python docs/hooks/licences.py > docs/licences.md` writes it.
+`constraints.txt`, with the licence that each package states. `python docs/hooks/licences.py > docs/licences.md` writes
+it.
 
-- **No package that a run needs is under a copyleft licence.** The extras `ray`, `docs` and `test` include some under MPL-2.0.
+- **No package that a run needs is under a copyleft licence.** The extras `ray`, `docs` and `test` include some under
+  MPL-2.0.
 - Tests compare with evo and read files with plyfile: both are under the GPL, and only in the extra `test`.
 - Wheels can contain other libraries under their own licences, such as FFmpeg under LGPL-2.1 in OpenCV's: see their
   `*.dist-info` folders.
-- The weights of the network are under AGPL-3.0. They are not part of this package; a run with the network downloads them."""
+- The weights of the network are under AGPL-3.0. They are not part of this package; a run with the network downloads
+  them."""
 
 
 def page() -> Iterator[str]:

@@ -107,7 +107,7 @@ PARSERS: dict[str, Parser] = {
         compressed_message(content), 1000.0, "topic"
     ),
     "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
-    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_links),
+    "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_transforms),
     "ROS 1 bag": from_file("take.bag", read_bag),
     "ROS 2 bag": from_file("take.db3", read_bag),
     "mcap": from_file("take.mcap", read_bag),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -93,6 +94,11 @@ def test_page_of_command_lists_all_options(module: object, pages: dict[str, Page
         if parameter.name != "help":
             assert (max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else "") in text
             assert " ".join((parameter.help or "").split()) in text
+
+
+def test_configuration_page_is_written_from_the_schema() -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "write_configuration.py"))
+    assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
 
 
 def test_index_of_stages_links_every_stage(pages: dict[str, Page]) -> None:

@@ -121,7 +121,7 @@ def test_pickles_are_only_loaded_with_weights_only() -> None:
         if isinstance(node, ast.Call)
         and re.fullmatch(r"(pickle|torch|np|numpy|joblib)\.loads?", ast.unparse(node.func))
     ]
-    assert sorted(name for name, _ in calls) == ["io/state_file.py", "segmentation/pt_file.py"]
+    assert sorted(name for name, _ in calls) == ["io/state_file.py", "segmentation/pt_weights.py"]
     assert all("weights_only=True" in call for _, call in calls)
 
 

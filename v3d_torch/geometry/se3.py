@@ -127,7 +127,7 @@ def hat(xi: Tensor) -> Tensor:
         xi: Tangent vectors :math:`[\rho, \phi]`, shape :math:`(..., 6)`.
 
     Returns:
-        Matrices :math:`\begin{pmatrix} [\phi]_\times & \rho \\ 0 & 0 \end{pmatrix}`, shape :math:`(..., 4, 4)`.
+        Matrices :math:`\begin{pmatrix} {[\phi]}_\times & \rho \\ 0 & 0 \end{pmatrix}`, shape :math:`(..., 4, 4)`.
     """
     return (xi @ _GENERATORS.to(xi.dtype)).unflatten(-1, (4, 4))
 
