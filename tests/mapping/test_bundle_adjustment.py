@@ -15,7 +15,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.bundle_adjustment import BundleProblem, Observations, bundle_adjust
 from v3d_torch.optim.levenberg_marquardt import huber
-from v3d_torch.optim.reprojection import reprojection
+from v3d_torch.optim.reprojection import reprojection_residuals
 from v3d_torch.optim.schur import solve_normal_equations
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
@@ -71,7 +71,7 @@ class Scene:
 def residuals(T_cw: Tensor, points: Tensor, observations: Observations) -> Tensor:
     T = T_cw[observations.pose]
     in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
-    return reprojection(in_camera, observations, CAMERA)
+    return reprojection_residuals(in_camera, observations, CAMERA)
 
 
 def test_damped_step_equals_the_dense_solution() -> None:
@@ -87,7 +87,7 @@ def test_damped_step_equals_the_dense_solution() -> None:
     by_pose, by_point = torch.autograd.functional.jacobian(moved, zeros)
     r = moved(*zeros)
     J = torch.cat([by_pose.reshape(-1, 12), by_point.reshape(-1, 36)], dim=1)
-    _, weights = huber((r * r).sum(dim=-1), scene.observations.limit)
+    _, weights = huber((r * r).sum(dim=-1), scene.observations.chi2_threshold)
     weighted = (J * weights.repeat_interleave(3)[:, None]).T
     H = weighted @ J
     expected = torch.linalg.solve(H + damping * H.diagonal().diag(), -weighted @ r.flatten())
@@ -122,7 +122,7 @@ def test_reduced_cost_derivatives_equal_finite_differences_of_the_minimum_cost()
 
 def test_optimum_equals_scipy() -> None:
     scene = Scene(poses=3, points=12, observers=3)
-    limit = scene.observations.limit
+    limit = scene.observations.chi2_threshold
 
     def unpack(x: np.ndarray) -> tuple[Tensor, Tensor]:
         numbers = torch.from_numpy(x)
@@ -162,7 +162,7 @@ def test_optimum_equals_gtsam() -> None:
             float(observations.inverse_depth[m]),
             float(observations.pixel_sigma[m]),
         )
-        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(observations.limit[m].sqrt()))
+        kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(observations.chi2_threshold[m].sqrt()))
         keys = int(observations.pose[m]), 1000 + int(observations.point[m])
         if w > 0:
             noise = gtsam.noiseModel.Gaussian.Covariance(A @ np.diag([sigma**2, sigma**2, DEPTH_SIGMA**2]) @ A.T)
@@ -204,7 +204,7 @@ def test_outliers_are_detected_and_do_not_change_the_poses() -> None:
     result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed)
     clean = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
     assert se3_log(result.T_cw @ invert(clean.T_cw)).abs().max() < 0.005
-    outlier = result.chi2 > observations.limit
+    outlier = result.chi2 > observations.chi2_threshold
     assert outlier[shifted].double().mean() > 0.99
     assert outlier[~shifted].double().mean() < 0.15
 

@@ -144,7 +144,7 @@ def test_camera_in_another_room_stays_lost_and_leaves_the_map_unchanged(
     elsewhere = Slide(640, 960, step=16, seed=5)
     second = run(elsewhere, CONFIG, load_map(path, CAMERA, CONFIG))
     assert second.slam.poses.statuses == [TrackingStatus.LOST] * len(elsewhere)
-    assert not second.slam.poses.located
+    assert not second.slam.poses.is_located
     save_map(tmp_path / "after.map", second.slam.mapper.map, second.views)
     assert (tmp_path / "after.map").read_bytes() == path.read_bytes()
 
@@ -152,13 +152,13 @@ def test_camera_in_another_room_stays_lost_and_leaves_the_map_unchanged(
 def test_segmenter_gets_no_pose_before_relocalisation(wall: tuple[Path, Pipeline]) -> None:
     path, _ = wall
     has_pose: list[bool] = []
-    no_segmentation = NoSegmentation()
 
-    def segment(frame: RGBDFrame) -> Instances:
-        has_pose.append(frame.T_cw is not None)
-        return no_segmentation(frame)
+    class PoseRecorder(NoSegmentation):
+        def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+            has_pose.append(T_cw is not None)
+            return self(frame)
 
-    slam = V3DSLAM(CAMERA, segment, LOCALISE, load_map(path, CAMERA, LOCALISE).map)
+    slam = V3DSLAM(CAMERA, PoseRecorder(), LOCALISE, load_map(path, CAMERA, LOCALISE).map)
     for frame in Slide(400, 660, step=20):
         slam(frame)
     found = slam.poses.statuses.index(TrackingStatus.TRACKED)
