@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -24,7 +24,6 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
 from v3d_torch.runtime.process import trim_memory
-from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
@@ -38,6 +37,44 @@ _TRIM_INTERVAL = 200
 """Frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
+
+
+class Viewer(Protocol):
+    """Viewer of a run. A viewer never changes the state of the SLAM system."""
+
+    def show(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_seconds: Mapping[str, float]) -> None:
+        """Show a tracked frame.
+
+        Args:
+            frame: Images of the frame.
+            objects: Objects of the frame, and its static mask.
+            slam: SLAM system after it tracked the frame; its last pose is the pose of the frame.
+            stage_seconds: Time that each stage spent on the frame, seconds.
+        """
+
+    def finish(self, slam: V3DSLAM) -> None:
+        """Show the final map and trajectory, and close files and connections.
+
+        Args:
+            slam: SLAM system after the last frame.
+
+        Raises:
+            OutputError: If the recording cannot be written.
+        """
+
+
+class NullViewer:
+    """Viewer that shows nothing."""
+
+    def show(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_seconds: Mapping[str, float]) -> None:
+        """Do nothing."""
+
+    def finish(self, slam: V3DSLAM) -> None:
+        """Do nothing."""
+
+
+NULL_VIEWER = NullViewer()
+"""Viewer of a run that is not shown."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_text
 from v3d_torch.mapping.map_io import StoredMap
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
-from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
@@ -24,7 +24,6 @@ from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runs.results import write_results
 from v3d_torch.runtime.process import set_num_threads
-from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter

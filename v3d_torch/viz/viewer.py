@@ -6,7 +6,7 @@ from pathlib import Path
 
 from v3d_torch.datasets.base import RGBDStream
 from v3d_torch.errors import ConfigError, ViewerError
-from v3d_torch.runtime.viewer import NULL_VIEWER, Viewer
+from v3d_torch.pipeline import NULL_VIEWER, Viewer
 
 
 def make_viewer(viz: str | None, rerun_file: Path | None, sequence: RGBDStream) -> Viewer:
