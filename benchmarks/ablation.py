@@ -22,9 +22,9 @@ from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 
 CELLS = {
     "ate": ("ate.rmse", ".4f"),
-    "moving_left_out": ("masks.moving_left_out", ".1%"),
-    "static_left_out": ("masks.static_left_out", ".1%"),
-    "id_changes": ("masks.id_changes_per_60_frames", ".2f"),
+    "moving_masked": ("masks.moving_masked", ".1%"),
+    "static_masked": ("masks.static_masked", ".1%"),
+    "id_switches": ("masks.id_switches_per_60_frames", ".2f"),
 }
 """Column of ``ablation.csv`` and format of each cell."""
 
@@ -41,7 +41,7 @@ def summarise(runs: Sequence[Row]) -> Iterator[Row]:
 
 def table(rows: Sequence[Row]) -> Iterator[str]:
     """Yield a line per sequence and variant."""
-    yield markdown_row(["sequence", "variant", "ATE, m", "moving left out", "static left out", "id changes"])
+    yield markdown_row(["sequence", "variant", "ATE, m", "moving masked", "static masked", "ID switches"])
     yield markdown_row(["---", "---"] + ["---:"] * len(CELLS))
     yield from (markdown_row([cells["sequence"], cells["variant"], *(cells[name] for name in CELLS)]) for cells in rows)
 

@@ -144,9 +144,9 @@ def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     )
     yield ""
     rows = [
-        cells | {"objects": f"{cells['moving_left_out']} / {cells['static_left_out']} / {cells['id_changes']}"}
+        cells | {"objects": f"{cells['moving_masked']} / {cells['static_masked']} / {cells['id_switches']}"}
         for cells in rows_of(measurements)
-        if "moving_left_out" in cells
+        if "moving_masked" in cells
     ]
     yield from pivot(rows, "variant", "sequence", "objects", VARIANTS)
     yield ""
@@ -182,9 +182,9 @@ def segmentation_section(measurements: Sequence[Measurement]) -> Iterator[str]:
         "network": "network",
         "ms": "ms",
         "people_found": "people's pixels found",
-        "moving_left_out": "moving left out",
-        "static_left_out": "static left out",
-        "id_changes": "id changes",
+        "moving_masked": "moving masked",
+        "static_masked": "static masked",
+        "id_switches": "ID switches",
         "ate": "ATE, m",
     }
     for sequence in unique(cells["sequence"] for cells in rows):

@@ -117,9 +117,9 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
             "network": name,
             "ms": f"{1e3 * median(segmenter.seconds) / variant.every:.0f}",
             "people_found": format_value(found / expected if expected else None, ".1%"),
-            "moving_left_out": format_value(scores.moving_left_out if scores else None, ".1%"),
-            "static_left_out": format_value(scores.static_left_out if scores else None, ".1%"),
-            "id_changes": format_value(scores.id_changes_per_60_frames if scores else None, ".2f"),
+            "moving_masked": format_value(scores.moving_masked if scores else None, ".1%"),
+            "static_masked": format_value(scores.static_masked if scores else None, ".1%"),
+            "id_switches": format_value(scores.id_switches_per_60_frames if scores else None, ".2f"),
             "ate": format_value(ate, ".4f"),
         }
 
@@ -133,9 +133,9 @@ COLUMNS = {
     "network": "network",
     "ms": "ms per frame",
     "people_found": "people's pixels found",
-    "moving_left_out": "moving left out",
-    "static_left_out": "static left out",
-    "id_changes": "id changes",
+    "moving_masked": "moving masked",
+    "static_masked": "static masked",
+    "id_switches": "ID switches",
     "ate": "ATE, m",
 }
 """Headings of the table by the cell of a row."""

@@ -100,10 +100,10 @@ def test_csv_matches_metrics_of_runs(done: tuple[Path, str]) -> None:
         metrics = json.loads((done[0] / "moment" / row["variant"] / "seed0" / "metrics.json").read_text())
         assert row["failure"] == ""
         assert float(row["ate.rmse"]) == metrics["ate"]["rmse"]
-        assert float(row["masks.moving_left_out"]) == metrics["masks"]["moving_left_out"]
+        assert float(row["masks.moving_masked"]) == metrics["masks"]["moving_masked"]
         assert metrics["masks"]["frames"] == FRAMES
         assert row["rpe.trans.rmse"] == "" and metrics["rpe"] is None  # shorter than a second
-    moving = {row["variant"]: float(row["masks.moving_left_out"]) for row in rows}
+    moving = {row["variant"]: float(row["masks.moving_masked"]) for row in rows}
     assert moving["baseline"] == 0.0 and moving["full"] > 0.5
 
 

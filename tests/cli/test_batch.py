@@ -164,7 +164,7 @@ def test_runs_table_matches_metrics_of_each_run(done: subprocess.CompletedProces
                 assert cell == value, name
     good = table[table["sequence"] == "good"]
     assert (good["tracked"] == 6).all() and (good["coverage"] == 1).all() and (good["peak_memory_mb"] > 50).all()
-    assert (good["masks_moving_left_out"] == 0).all()  # true masks, but no segmentation
+    assert (good["masks_moving_masked"] == 0).all()  # true masks, but no segmentation
 
 
 def test_summaries_match_metrics_of_runs(done: subprocess.CompletedProcess[str], work: Path) -> None:

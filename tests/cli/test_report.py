@@ -216,7 +216,7 @@ def test_masked_percentages_are_shown_as_far_as_measured(
     copy: Path, moving: float | None, static: float | None, expected: str
 ) -> None:
     metrics = json.loads((copy / "metrics.json").read_text())
-    metrics["masks"] = {"moving_left_out": moving, "static_left_out": static}
+    metrics["masks"] = {"moving_masked": moving, "static_masked": static}
     write_text(copy / "metrics.json", json.dumps(metrics))
     assert f"Compared with the ground-truth masks, {expected} were left out of tracking." in page_of(copy).text
 

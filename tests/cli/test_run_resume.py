@@ -1,4 +1,4 @@
-"""``run --resume`` as a user calls it: killed at any frame, a run goes on to the same bytes; what cannot is said."""
+"""``run --resume`` as a user calls it: killed runs that are resumed to the same bytes, and error messages."""
 
 from __future__ import annotations
 
@@ -30,20 +30,19 @@ from v3d_torch.runs.checkpoint import CHECKPOINT
 from v3d_torch.runs.stored_run import read_run
 
 FRAMES = 20
-EVERY = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_share=1")
-"""A checkpoint after every frame."""
-SAME = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply", "mesh.ply")
+CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_share=1")
+RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply", "mesh.ply")
 
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A camera along a wall of noise, before which somebody walks; ids of whom are in ``ids``."""
+    """A camera moves along a wall of noise; a person walks in front of the wall, with id images in ``ids``."""
     folder = tmp_path_factory.mktemp("sequences") / "seq"
     stamps = [f"{1305031102 + i / 10:.6f}" for i in range(FRAMES)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(base, "STAMPS", stamps)
         patch.setattr(base, "FRAMES", FRAMES)
-        patch.setattr(base, "way", lambda frame: (frame, 4 + 2 * (frame % 4)))
+        patch.setattr(base, "camera_position", lambda frame: (frame, 4 + 2 * (frame % 4)))
         base.write_base(folder)
     (folder / "ids").mkdir()
     for i, stamp in enumerate(stamps):
@@ -57,13 +56,13 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def no_figures() -> Iterator[None]:
-    """They take most of the time of a run so short."""
+    """Skip the figures, which take most of the time of such short runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
         yield
 
 
-def asked(sequence: Path, out: Path, *more: str) -> list[str]:
+def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:
     return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", *more]
 
 
@@ -71,7 +70,7 @@ def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(run.app, [str(argument) for argument in arguments])
 
 
-def assert_one_sentence(done: Result, *words: str) -> None:
+def assert_error_line(done: Result, *words: str) -> None:
     assert done.exit_code == 2 and (done.exception is None or isinstance(done.exception, SystemExit)), done.exc_info
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
     for word in words:
@@ -79,35 +78,39 @@ def assert_one_sentence(done: Result, *words: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of a run that was never stopped."""
-    out = tmp_path_factory.mktemp("whole") / "out"
-    done = call(*asked(sequence, out, "--save-masks", "--save-map", str(out.parent / "room.map"), *EVERY))
+def whole_run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of an uninterrupted run."""
+    out = tmp_path_factory.mktemp("whole_run") / "out"
+    done = call(
+        *run_arguments(
+            sequence, out, "--save-masks", "--save-map", str(out.parent / "room.map"), *CHECKPOINT_EVERY_FRAME
+        )
+    )
     assert done.exit_code == 0, done.stderr
     return out
 
 
-def assert_same_results(out: Path, whole: Path, files: tuple[str, ...] = SAME) -> None:
+def assert_same_results(out: Path, expected: Path, files: tuple[str, ...] = RESULTS) -> None:
     for name in files:
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
-    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (out, whole))
+        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (out, expected))
     for key in ("ate", "rpe", "status", "frames", "processed", "keyframes", "landmarks", "loops", "failure"):
         assert first[key] == second[key], key
-    names = [{path.name for path in folder.iterdir()} - {"figures"} for folder in (out, whole)]
+    names = [{path.name for path in folder.iterdir()} - {"figures"} for folder in (out, expected)]
     assert names[0] == names[1]
 
 
-def interrupted(sequence: Path, out: Path, frame: int, *more: str) -> Result:
-    """Ctrl-C before a frame is read."""
+def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
+    """Start a run and press Ctrl-C before a frame is read."""
     with at_frame(frame, lambda: os.kill(os.getpid(), signal.SIGINT)):
-        return call(*asked(sequence, out, "--serial", *more))
+        return call(*run_arguments(sequence, out, "--serial", *more))
 
 
-# --- killed
+# --- killed runs
 
-ZYGOTE = """
+FORKING_COMMAND = """
 import os, sys
-import v3d_torch.runs.runner, v3d_torch.cli.run
+import v3d_torch.runs.run, v3d_torch.cli.run, v3d_torch.cli.run_command
 for line in sys.stdin:
     child = os.fork()
     if child == 0:
@@ -116,244 +119,248 @@ for line in sys.stdin:
         try:
             v3d_torch.cli.run.app(eval(line))
         except SystemExit as end:
-            os._exit(end.code or 0)  # threads that a library started before the fork are not here to be ended
+            os._exit(end.code or 0)  # a normal exit would wait for library threads that the fork did not copy
     print(child, flush=True)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Runs the command again and again in processes of its own, without the seconds that importing torch takes."""
+"""Program that runs the command in forked processes, so that torch is imported only once."""
 
 
 @pytest.fixture
 def start() -> Iterator[Callable[[list[str]], tuple[int, Callable[[], int]]]]:
-    """Starts the command; gives the number of its process, and what waits for its exit code."""
+    """Function that starts the command and returns its process id and a function that waits for its exit code."""
     with subprocess.Popen(  # noqa: S603
-        [sys.executable, "-c", ZYGOTE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", FORKING_COMMAND], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdin is not None and process.stdout is not None
-        given, said = process.stdin, process.stdout
+        stdin, stdout = process.stdin, process.stdout
 
         def begin(arguments: list[str]) -> tuple[int, Callable[[], int]]:
-            given.write(f"{arguments!r}\n")
-            given.flush()
-            return int(said.readline()), lambda: int(said.readline())
+            stdin.write(f"{arguments!r}\n")
+            stdin.flush()
+            return int(stdout.readline()), lambda: int(stdout.readline())
 
         yield begin
-        given.close()
+        stdin.close()
 
 
-def frames_in(log: Path) -> int:
+def count_frames(log: Path) -> int:
     return log.read_text().count(" INFO frame ") if log.is_file() else 0
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL, no fork")
-def test_killed_at_ten_frames_it_ends_with_the_same_bytes(
-    start: Callable[[list[str]], tuple[int, Callable[[], int]]], sequence: Path, whole: Path, tmp_path: Path
+def test_run_killed_at_ten_frames_resumes_to_the_same_bytes(
+    start: Callable[[list[str]], tuple[int, Callable[[], int]]], sequence: Path, whole_run: Path, tmp_path: Path
 ) -> None:
-    out, delays = tmp_path / "out", random.Random(0)  # noqa: S311
-    arguments = asked(sequence, out, "--save-masks", "--save-map", str(tmp_path / "room.map"), *EVERY)
-    for frame in sorted(delays.sample(range(1, FRAMES), 10)):
+    out, rng = tmp_path / "out", random.Random(0)  # noqa: S311
+    arguments = run_arguments(
+        sequence, out, "--save-masks", "--save-map", str(tmp_path / "room.map"), *CHECKPOINT_EVERY_FRAME
+    )
+    for frame in sorted(rng.sample(range(1, FRAMES), 10)):
         process, exit_code = start(arguments)
-        seen, deadline = frames_in(out / "run.log"), time.monotonic() + 60
+        logged, deadline = count_frames(out / "run.log"), time.monotonic() + 60
         done = json.loads((out / "metrics.json").read_text())["processed"] if (out / "metrics.json").exists() else 0
-        while frames_in(out / "run.log") - seen < frame - done and time.monotonic() < deadline:
+        while count_frames(out / "run.log") - logged < frame - done and time.monotonic() < deadline:
             time.sleep(0.001)
-        time.sleep(0.05 * delays.random())  # anywhere in a frame, or in the writing of what there is
+        time.sleep(0.05 * rng.random())  # kill within a frame, or while results are written
         os.kill(process, signal.SIGKILL)
         assert exit_code() == -signal.SIGKILL
-        # What is there can be read. It may lack the frame that was being written, and one more where the time before
-        # the kill came between the results and their checkpoint: then the run has gone on from the frame before.
-        so_far = read_run(out)
-        assert so_far.trajectory is not None and len(so_far.trajectory) == so_far.metrics.processed >= frame - 2
-        assert so_far.metrics.failure is not None and so_far.metrics.failure.startswith("killed, or still running")
+        # The results are readable. They can lack the frame that was being written, and one more if the previous kill
+        # came between the results and their checkpoint, because the run then resumed from the frame before.
+        partial = read_run(out)
+        assert partial.trajectory is not None and len(partial.trajectory) == partial.metrics.processed >= frame - 2
+        assert partial.metrics.failure is not None and partial.metrics.failure.startswith("killed or still running")
         assert (out / CHECKPOINT).is_file()
         arguments = ["--resume", str(out)]
     process, exit_code = start(arguments)
     assert exit_code() == 0
-    assert_same_results(out, whole)
-    for mask in (whole / "masks").iterdir():
+    assert_same_results(out, whole_run)
+    for mask in (whole_run / "masks").iterdir():
         assert (out / "masks" / mask.name).read_bytes() == mask.read_bytes()
-    assert (tmp_path / "room.map").read_bytes() == (whole.parent / "room.map").read_bytes()
+    assert (tmp_path / "room.map").read_bytes() == (whole_run.parent / "room.map").read_bytes()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
-def test_killed_as_a_user_starts_it(sequence: Path, whole: Path, tmp_path: Path) -> None:
-    """From another folder, with relative paths."""
+def test_killed_run_with_relative_paths_resumes_from_another_folder(
+    sequence: Path, whole_run: Path, tmp_path: Path
+) -> None:
     out, command = tmp_path / "out", [sys.executable, "-m", "v3d_torch.run"]
     shutil.copytree(sequence, tmp_path / "seq", copy_function=os.link)
-    arguments = asked(Path("seq"), Path("out"), "--save-masks", *EVERY)
+    arguments = run_arguments(Path("seq"), Path("out"), "--save-masks", *CHECKPOINT_EVERY_FRAME)
     with subprocess.Popen([*command, *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL) as process:  # noqa: S603
         deadline = time.monotonic() + 100
-        while frames_in(out / "run.log") < 9 and time.monotonic() < deadline:
+        while count_frames(out / "run.log") < 9 and time.monotonic() < deadline:
             time.sleep(0.005)
         process.kill()
     done = call("--resume", out)
     assert (done.exit_code, done.stderr) == (0, "")
     assert f"of {FRAMES} frames" in done.stdout and f"results: {out}" in done.stdout
-    assert_same_results(out, whole)
+    assert_same_results(out, whole_run)
 
 
-# --- interrupted, full disks
+# --- interrupted runs, full disks
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
-def test_after_ctrl_c_it_goes_on(sequence: Path, whole: Path, tmp_path: Path) -> None:
-    """Without a checkpoint on the way: the last one is written when the run is told to end."""
-    done = interrupted(sequence, tmp_path / "out", 10, "--save-masks")
-    assert_one_sentence(done, f"interrupted after 11 of {FRAMES} frames", f"; go on with --resume {tmp_path / 'out'})")
+def test_interrupted_run_resumes_to_the_same_results(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
+    """No checkpoint is due before Ctrl-C: the only one is written when the run ends."""
+    done = interrupt_run(sequence, tmp_path / "out", 10, "--save-masks")
+    assert_error_line(done, f"interrupted after 11 of {FRAMES} frames", f"; resume with --resume {tmp_path / 'out'})")
     assert {CHECKPOINT, "map.ply"} <= {path.name for path in (tmp_path / "out").iterdir()}
     done = call("--resume", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
-    assert f"goes on after 11 of {FRAMES} frames" in done.stdout
-    assert_same_results(tmp_path / "out", whole)
+    assert f"resuming after 11 of {FRAMES} frames" in done.stdout
+    assert_same_results(tmp_path / "out", whole_run)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="no limits of Unix")
-def test_a_disk_that_is_full_for_a_while_costs_checkpoints_only(
-    sequence: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="no file size limits")
+def test_temporarily_full_disk_only_prevents_checkpoints(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
     import resource
 
     out, limits = tmp_path / "out", resource.getrlimit(resource.RLIMIT_FSIZE)
 
-    def free_again() -> None:
-        assert (out / CHECKPOINT).stat().st_size > 10_000  # that of frame 5, whole
+    def free_disk() -> None:
+        assert (out / CHECKPOINT).stat().st_size > 10_000  # the complete checkpoint of frame 5
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
-    with full_from_frame(6), at_frame(11, free_again):
-        done = call(*asked(sequence, out, "--serial", *EVERY))
+    with full_from_frame(6), at_frame(11, free_disk):
+        done = call(*run_arguments(sequence, out, "--serial", *CHECKPOINT_EVERY_FRAME))
     assert (done.exit_code, done.stderr) == (0, "")
-    assert (
-        done.stdout.count("note: while the run went on, ") == 1 and "cannot be written (File too large)" in done.stdout
-    )
+    assert done.stdout.count("note: no checkpoint was saved, ") == 1
+    assert "cannot be written (File too large)" in done.stdout
     assert "WARNING no checkpoint: " in (out / "run.log").read_text()
-    assert (out / "trajectory.txt").read_bytes() == (whole / "trajectory.txt").read_bytes()
+    assert (out / "trajectory.txt").read_bytes() == (whole_run / "trajectory.txt").read_bytes()
     assert not list(out.glob(".*")) and not (out / CHECKPOINT).exists()
 
 
-@pytest.mark.skipif(os.name == "nt", reason="no limits of Unix")
-def test_where_the_disk_stays_full_the_last_checkpoint_is_gone_on_with(
-    sequence: Path, whole: Path, tmp_path: Path
-) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="no file size limits")
+def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with full_from_frame(6):
-        done = call(*asked(sequence, out, "--save-masks", "--serial", *EVERY))
-    assert_one_sentence(done, "cannot be written (File too large); free the disk or choose another folder")
+        done = call(*run_arguments(sequence, out, "--save-masks", "--serial", *CHECKPOINT_EVERY_FRAME))
+    assert_error_line(done, "cannot be written (File too large); free the disk or choose another folder")
     assert len((out / "trajectory.txt").read_text().splitlines()) == 6
     done = call("--resume", out)
-    assert done.exit_code == 0 and f"goes on after 6 of {FRAMES} frames" in done.stdout, done.stderr
-    assert_same_results(out, whole)
+    assert done.exit_code == 0 and f"resuming after 6 of {FRAMES} frames" in done.stdout, done.stderr
+    assert_same_results(out, whole_run)
 
 
-# --- what users get wrong
+# --- mistakes of the user
 
 
 @pytest.fixture(scope="module")
-def half(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def half_run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("half") / "out"
-    interrupted(sequence, out, 4)
+    interrupt_run(sequence, out, 4)
     return out
 
 
 @pytest.fixture
-def out(half: Path, tmp_path: Path) -> Path:
-    """An interrupted run."""
-    shutil.copytree(half, tmp_path / "out")
+def out(half_run: Path, tmp_path: Path) -> Path:
+    """Copy of the results of an interrupted run."""
+    shutil.copytree(half_run, tmp_path / "out")
     return tmp_path / "out"
 
 
-def test_a_finished_run_says_so(whole: Path) -> None:
-    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
-    done = call("--resume", whole)
-    assert (done.exit_code, done.stdout) == (
-        0,
-        f"{whole}: the run came to its end already; there is nothing left to do\n",
+def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")}
+    done = call("--resume", whole_run)
+    assert (done.exit_code, done.stdout) == (0, f"{whole_run}: the run is finished; nothing to resume\n")
+    assert {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")} == before
+
+
+def test_missing_checkpoint_is_rejected_with_a_suggestion(tmp_path: Path) -> None:
+    assert_error_line(
+        call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; give the folder of a run that ended early"
     )
-    assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
-
-
-def test_where_there_is_no_checkpoint(tmp_path: Path) -> None:
-    assert_one_sentence(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint to go on from; give")
-    assert_one_sentence(call("--resume", tmp_path / "no"), f"{tmp_path / 'no'}: is no folder; give")
-    run = tmp_path / "seq" / "2026-01-01"
-    run.mkdir(parents=True)
-    (run / CHECKPOINT).touch()
-    assert_one_sentence(call("--resume", tmp_path), f"; give the newest of the runs in it, {run}")
-    assert_one_sentence(call("--resume", run / CHECKPOINT), f"is no folder; give the folder that {CHECKPOINT} is in")
+    assert_error_line(
+        call("--resume", tmp_path / "no"),
+        f"{tmp_path / 'no'}: is not a folder; give the folder of a run that ended early",
+    )
+    newest = tmp_path / "seq" / "2026-01-01"
+    newest.mkdir(parents=True)
+    (newest / CHECKPOINT).touch()
+    assert_error_line(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; give the newest run in it, {newest}")
+    assert_error_line(
+        call("--resume", newest / CHECKPOINT), f"{newest / CHECKPOINT}: is not a folder; give its folder, {newest}"
+    )
     done = call()
     assert done.exit_code == 2 and "--resume" in done.stderr
 
 
-def test_a_damaged_checkpoint_or_one_of_another_version(out: Path) -> None:
+def test_damaged_checkpoint_or_one_of_another_version_is_rejected(out: Path) -> None:
     path = out / CHECKPOINT
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-10])
-    assert_one_sentence(call("--resume", out), f"{path}: is damaged or not a state of a run; start a new run")
-    path.write_bytes(whole.replace(b"state 8", b"state 9", 1))
-    assert_one_sentence(call("--resume", out), f"{path}: has state format 9, this program reads format 8")
+    content = path.read_bytes()
+    path.write_bytes(content[:-10])
+    assert_error_line(call("--resume", out), f"{path}: is damaged or not a state of a run; start a new run")
+    path.write_bytes(content.replace(b"state 9", b"state 10", 1))
+    assert_error_line(call("--resume", out), f"{path}: has state format 10, this program reads format 9; continue with")
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "option"),
     [
-        (["--seed", "3"], "seed=3: says otherwise than the run in"),
-        (["--config", "paper"], "--config paper: says otherwise"),
-        (["--segmenter", "none"], "segmentation.source=none: says otherwise"),
-        (["--save-masks"], "--save-masks: says otherwise"),
-        (["--load-map", "room.map"], "--load-map: says otherwise"),
-        (["--rgb-topic", "/rgb"], "--rgb-topic: says otherwise"),
-        (["--out", "elsewhere"], "--out elsewhere: says otherwise"),
+        (["--seed", "3"], "seed=3"),
+        (["--config", "paper"], "--config paper"),
+        (["--segmenter", "none"], "segmentation.source=none"),
+        (["--save-masks"], "--save-masks"),
+        (["--load-map", "room.map"], "--load-map"),
+        (["--rgb-topic", "/rgb"], "--rgb-topic"),
+        (["--out", "elsewhere"], "--out elsewhere"),
     ],
 )
-def test_options_that_say_otherwise(options: list[str], words: str, half: Path) -> None:
-    assert_one_sentence(call("--resume", half, *options), words)
+def test_conflicting_option_is_rejected(options: list[str], option: str, half_run: Path) -> None:
+    done = call("--resume", half_run, *options)
+    assert_error_line(done, f"error: {option}: conflicts with the run in {half_run}; remove this option\n")
 
 
-def test_the_whole_command_again_says_nothing_else(sequence: Path, whole: Path, out: Path) -> None:
-    done = call(*asked(sequence, out, "--serial"), "--resume", out)
+def test_same_options_beside_resume_do_not_conflict(sequence: Path, whole_run: Path, out: Path) -> None:
+    done = call(*run_arguments(sequence, out, "--serial"), "--resume", out)
     assert done.exit_code == 0, done.stderr
-    assert (out / "trajectory.txt").read_bytes() == (whole / "trajectory.txt").read_bytes()
+    assert (out / "trajectory.txt").read_bytes() == (whole_run / "trajectory.txt").read_bytes()
 
 
-def shorter(folder: Path) -> str:
+def shorten(folder: Path) -> str:
     for name in ("rgb.txt", "depth.txt"):
         path = folder / name
         path.write_text("".join(path.read_text().splitlines(keepends=True)[:16]))
-    return f"it has 16 frames and had {FRAMES}"
+    return f"16 frames instead of {FRAMES}"
 
 
-def later(folder: Path) -> str:
+def shift_timestamps(folder: Path) -> str:
     for name in ("rgb.txt", "depth.txt"):
         path = folder / name
         path.write_text(path.read_text().replace(".300000 ", ".310000 "))
-    return "its frames have other times"
+    return "other timestamps"
 
 
-def of_another_camera(folder: Path) -> str:
+def change_camera(folder: Path) -> str:
     (folder / "camera.yaml").write_text(base.CAMERA.replace("fx: 64", "fx: 65"))
-    return "its camera is another"
+    return "another camera"
 
 
-def repainted(folder: Path) -> str:
+def change_last_image(folder: Path) -> str:
     path = sorted((folder / "rgb").iterdir())[4]
     image = cv2.imread(str(path))
     image[0, 0] += 1
     path.write_bytes(base.png(image))
-    return "frame 4 shows something else"
+    return "frame 4 shows another image"
 
 
-@pytest.mark.parametrize("change", [shorter, later, of_another_camera, repainted])
-def test_a_sequence_that_changed(change: Callable[[Path], str], sequence: Path, out: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("change", [shorten, shift_timestamps, change_camera, change_last_image])
+def test_changed_sequence_is_rejected(change: Callable[[Path], str], sequence: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(sequence, tmp_path / "moved")
-    what = change(tmp_path / "moved")
+    difference = change(tmp_path / "moved")
     done = call("--resume", out, "--seq", tmp_path / "moved")
-    assert_one_sentence(
-        done, f"{tmp_path / 'moved'}: is not as it was when the run in {out} began, {what}; put it back"
+    assert_error_line(
+        done,
+        f"{tmp_path / 'moved'}: has changed since the run in {out} began ({difference}); restore the sequence, or",
     )
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 
 
-def test_where_sequences_are_by_the_environment_is_not_asked(
+def test_resumed_run_ignores_data_folder_of_the_environment(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     named = ["--seq", "seq", "--data-root", str(sequence.parent), "--segmenter", "none", "--serial"]
@@ -364,56 +371,56 @@ def test_where_sequences_are_by_the_environment_is_not_asked(
     assert done.exit_code == 0, done.stderr
 
 
-def test_a_sequence_that_was_moved(sequence: Path, whole: Path, out: Path, tmp_path: Path) -> None:
+def test_run_of_moved_sequence_resumes(sequence: Path, whole_run: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(sequence, tmp_path / "moved")
     done = call("--resume", out, "--seq", tmp_path / "moved")
     assert done.exit_code == 0, done.stderr
-    assert (out / "trajectory.txt").read_bytes() == (whole / "trajectory.txt").read_bytes()
+    assert (out / "trajectory.txt").read_bytes() == (whole_run / "trajectory.txt").read_bytes()
 
 
 # --- runs of a batch
 
 
-def test_a_run_of_a_batch_goes_on_where_it_was_ended(sequence: Path, tmp_path: Path) -> None:
+def test_interrupted_run_of_a_batch_resumes(sequence: Path, tmp_path: Path) -> None:
     config = load_config(overrides=["segmentation.source=none", "prefetch=false"])
 
     def job(name: str, config: Config = config) -> Job:
         return Job("seq", str(sequence), FRAMES, None, "own", config, tmp_path / name)
 
-    def stop(frames: int) -> None:
-        if frames == 6:
+    def stop(count: int) -> None:
+        if count == 6:
             raise KeyboardInterrupt
 
-    assert run_job(job("a"), lambda frames: None) is None
+    assert run_job(job("a"), lambda _: None) is None
     assert run_job(job("b"), stop) == f"interrupted after 6 of {FRAMES} frames"
-    seen: list[int] = []
-    assert run_job(job("b"), seen.append) is None
-    assert seen == list(range(7, FRAMES + 1))
-    assert_same_results(tmp_path / "b", tmp_path / "a", SAME[:-1])
-    # With other values, or a checkpoint that is damaged, it begins anew.
+    frames: list[int] = []
+    assert run_job(job("b"), frames.append) is None
+    assert frames == list(range(7, FRAMES + 1))
+    assert_same_results(tmp_path / "b", tmp_path / "a", RESULTS[:-1])
+    # With another configuration, the run starts again with the first frame.
     assert run_job(job("c"), stop) is not None
-    seen.clear()
-    assert run_job(job("c", config.model_copy(update={"seed": 1})), seen.append) is None
-    assert seen == list(range(1, FRAMES + 1))
+    frames.clear()
+    assert run_job(job("c", config.model_copy(update={"seed": 1})), frames.append) is None
+    assert frames == list(range(1, FRAMES + 1))
 
 
-# --- a map of an earlier run, streams
+# --- loaded maps, streams
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
-def test_a_run_in_a_known_map_goes_on_without_its_file(sequence: Path, whole: Path, tmp_path: Path) -> None:
+def test_run_in_loaded_map_resumes_without_the_map_file(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
     room = tmp_path / "room.map"
-    shutil.copy(whole.parent / "room.map", room)
-    assert call(*asked(sequence, tmp_path / "a", "--load-map", str(room), "--serial")).exit_code == 0
-    assert_one_sentence(interrupted(sequence, tmp_path / "b", 3, "--load-map", str(room)), "interrupted after 4")
+    shutil.copy(whole_run.parent / "room.map", room)
+    assert call(*run_arguments(sequence, tmp_path / "a", "--load-map", str(room), "--serial")).exit_code == 0
+    assert_error_line(interrupt_run(sequence, tmp_path / "b", 3, "--load-map", str(room)), "interrupted after 4")
     room.unlink()
     done = call("--resume", tmp_path / "b")
     assert done.exit_code == 0, done.stderr
-    assert "known map" in done.stdout
+    assert "loaded map" in done.stdout
     assert_same_results(tmp_path / "b", tmp_path / "a")
 
 
-def test_a_stream_cannot_be_gone_on_with(sequence: Path, tmp_path: Path) -> None:
+def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
     from v3d_torch.datasets import load_sequence
     from v3d_torch.pipeline import Pipeline
     from v3d_torch.runs.checkpoint import write_checkpoint
@@ -431,8 +438,9 @@ def test_a_stream_cannot_be_gone_on_with(sequence: Path, tmp_path: Path) -> None
 
     pipeline = Pipeline(Live(), V3DSLAM(frames.camera, NoSegmentation()))  # type: ignore[arg-type]
     assert pipeline().failure is None
-    write_checkpoint(tmp_path, pipeline, RunRequest("realsense:"))
-    assert_one_sentence(
-        call("--resume", tmp_path), f"{tmp_path}: is the run of a stream (realsense:)", "cannot be gone on"
+    write_checkpoint(tmp_path, pipeline, RunRequest("realsense:", Config()))
+    assert_error_line(
+        call("--resume", tmp_path),
+        f"{tmp_path}: the run of a live stream (realsense:) cannot be resumed; its results so far are in trajectory.txt",
     )
     torch.set_num_threads(1)

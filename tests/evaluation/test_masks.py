@@ -50,8 +50,8 @@ def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
     evaluation = MaskEvaluation()
     counts = {"moving": [0, 0], "static": [0, 0], "anywhere": [0, 0]}
     for stamp, seed in enumerate(seeds):
-        truth, left_out, measured = random_truth(seed), random_mask(seed + 1), random_mask(seed + 2, 0.7)
-        evaluation.add(float(stamp), truth, measured.float()[None], left_out, {})
+        truth, masked, measured = random_truth(seed), random_mask(seed + 1), random_mask(seed + 2, 0.7)
+        evaluation.add(float(stamp), truth, measured.float()[None], masked, {})
         for v in range(H):
             for u in range(W):
                 kinds = []
@@ -60,12 +60,12 @@ def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
                 elif truth[v, u] == 0:
                     kinds = ["anywhere", "static"] if measured[v, u] else ["anywhere"]
                 for kind in kinds:
-                    counts[kind][0] += int(left_out[v, u])
+                    counts[kind][0] += int(masked[v, u])
                     counts[kind][1] += 1
     scores = evaluation.compute_scores()
     assert scores is not None and scores.frames == len(seeds)
     for kind, score in zip(
-        counts, (scores.moving_left_out, scores.static_left_out, scores.static_left_out_anywhere), strict=True
+        counts, (scores.moving_masked, scores.static_masked, scores.static_masked_anywhere), strict=True
     ):
         assert score == (counts[kind][0] / counts[kind][1] if counts[kind][1] else None)
 
@@ -73,13 +73,13 @@ def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
 def test_tally_of_batch_equals_tally_of_each_image(seed: int) -> None:
-    left_out = torch.stack([random_mask(seed + k) for k in range(6)]).reshape(2, 3, H, W)
+    masked = torch.stack([random_mask(seed + k) for k in range(6)]).reshape(2, 3, H, W)
     region = torch.stack([random_mask(seed + 6 + k) for k in range(6)]).reshape(2, 3, H, W)
-    batch = tally(left_out, region)
+    batch = tally(masked, region)
     assert batch.shape == (2, 3, 2) and batch.dtype == torch.int64
     for i in range(2):
         for j in range(3):
-            assert torch.equal(batch[i, j], tally(left_out[i, j], region[i, j]))
+            assert torch.equal(batch[i, j], tally(masked[i, j], region[i, j]))
 
 
 def test_convention_fractions_are_over_pixels_not_frames() -> None:
@@ -92,8 +92,8 @@ def test_convention_fractions_are_over_pixels_not_frames() -> None:
     evaluation.add(1.0, corner, depth, torch.zeros(10, 10, dtype=torch.bool), {})
     scores = evaluation.compute_scores()
     assert scores is not None
-    assert scores.moving_left_out == 100 / 101
-    assert scores.static_left_out == 0.0
+    assert scores.moving_masked == 100 / 101
+    assert scores.static_masked == 0.0
 
 
 def test_unsure_pixels_are_neither_moving_nor_static() -> None:
@@ -102,8 +102,8 @@ def test_unsure_pixels_are_neither_moving_nor_static() -> None:
     evaluation.add(0.0, truth, torch.ones(1, 10, 10), torch.ones(10, 10, dtype=torch.bool), {})
     scores = evaluation.compute_scores()
     assert scores is not None
-    assert scores.moving_left_out is scores.static_left_out is scores.static_left_out_anywhere is None
-    assert scores.people == () and scores.id_changes_per_60_frames is None
+    assert scores.moving_masked is scores.static_masked is scores.static_masked_anywhere is None
+    assert scores.people == () and scores.id_switches_per_60_frames is None
 
 
 def test_evaluation_without_frames_has_no_scores() -> None:
@@ -207,10 +207,10 @@ def test_scores_of_two_people() -> None:
         evaluation.add(frame / 10, truth, depth, nothing, objects)
     scores = evaluation.compute_scores()
     assert scores is not None
-    assert [(p.id, p.in_view, p.found, p.id_changes) for p in scores.people] == [(1, 8, 6, 3), (2, 3, 3, 0)]
-    assert scores.id_changes_per_60_frames == pytest.approx(60 * 3 / 11)
+    assert [(p.id, p.in_view, p.found, p.id_switches) for p in scores.people] == [(1, 8, 6, 3), (2, 3, 3, 0)]
+    assert scores.id_switches_per_60_frames == pytest.approx(60 * 3 / 11)
     assert scores.people_found == 9 / 11
-    assert json.loads(json.dumps(scores.to_dict()))["people"][0]["id_changes"] == 3
+    assert json.loads(json.dumps(scores.to_dict()))["people"][0]["id_switches"] == 3
 
 
 def test_person_with_few_pixels_is_not_in_view() -> None:
@@ -313,10 +313,10 @@ def test_run_is_scored_and_does_not_depend_on_ground_truth_masks(folder: Path, t
     masks = metrics["masks"]
     assert isinstance(masks, dict)
     assert masks["frames"] == 5
-    assert masks["moving_left_out"] == 57 / 60
-    assert masks["static_left_out"] == masks["static_left_out_anywhere"] == 3 * 60 / (240 * 320 - 60 * 60)
-    assert masks["id_changes_per_60_frames"] == 0.0 and masks["people_found"] == 1.0
-    assert masks["people"] == [{"id": 1, "in_view": 5, "found": 5, "id_changes": 0}]
+    assert masks["moving_masked"] == 57 / 60
+    assert masks["static_masked"] == masks["static_masked_anywhere"] == 3 * 60 / (240 * 320 - 60 * 60)
+    assert masks["id_switches_per_60_frames"] == 0.0 and masks["people_found"] == 1.0
+    assert masks["people"] == [{"id": 1, "in_view": 5, "found": 5, "id_switches": 0}]
 
     shutil.rmtree(folder / "masks")
     assert run(folder, tmp_path / "unknown")["masks"] is None

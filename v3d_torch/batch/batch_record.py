@@ -20,8 +20,8 @@ METRIC_TYPES: Mapping[str, pa.DataType] = {
     **dict.fromkeys(("frames", "processed", *TrackingStatus, "keyframes", "loops"), pa.int64()),
     **dict.fromkeys(("coverage", "ate.rmse", "ate.std"), pa.float64()),
     **dict.fromkeys(("rpe.trans.rmse", "rpe.trans.std", "rpe.rot.rmse", "rpe.rot.std"), pa.float64()),
-    **dict.fromkeys(("masks.moving_left_out", "masks.static_left_out"), pa.float64()),
-    **dict.fromkeys(("masks.id_changes_per_60_frames", "masks.people_found"), pa.float64()),
+    **dict.fromkeys(("masks.moving_masked", "masks.static_masked"), pa.float64()),
+    **dict.fromkeys(("masks.id_switches_per_60_frames", "masks.people_found"), pa.float64()),
     **dict.fromkeys(("fps", "seconds", "peak_memory_mb"), pa.float64()),
 }
 """Metrics in ``runs.parquet`` by their key in ``metrics.json``, and their types.

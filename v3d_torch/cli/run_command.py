@@ -219,9 +219,9 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
         if evaluation.rpe is not None:
             table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
     if (masks := record.mask_evaluation.compute_scores()) is not None:
-        fractions = {"moving": masks.moving_left_out, "static": masks.static_left_out}
+        fractions = {"moving": masks.moving_masked, "static": masks.static_masked}
         texts = [f"{value:.1%} of the {name} pixels" for name, value in fractions.items() if value is not None]
         table.add_row("masked", ", ".join(texts))
-        if (changes := masks.id_changes_per_60_frames) is not None:
+        if (changes := masks.id_switches_per_60_frames) is not None:
             table.add_row("id switches", f"{changes:.1f} per 60 frames ({masks.people_found:.0%} found)")
     return table

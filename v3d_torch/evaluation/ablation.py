@@ -77,9 +77,9 @@ COLUMNS: Mapping[str, Column] = {
     "rpe.trans.rmse": Column("RPE, m/s", ".4f", True),
     "rpe.rot.rmse": Column("RPE, deg/s", ".3f", True),
     # The mask metrics are a trade-off: masking everything, or nothing, makes one of them perfect.
-    "masks.moving_left_out": Column("moving out", ".1%", False),
-    "masks.static_left_out": Column("static out", ".1%", False),
-    "masks.id_changes_per_60_frames": Column("id switches", ".2f", False),
+    "masks.moving_masked": Column("moving out", ".1%", False),
+    "masks.static_masked": Column("static out", ".1%", False),
+    "masks.id_switches_per_60_frames": Column("id switches", ".2f", False),
     "masks.people_found": Column("found", ".0%", False),
 }
 """Columns of the tables by their key in ``metrics.json``."""

@@ -28,13 +28,13 @@ class PersonScore:
         id: Id of the person in the ground-truth masks.
         in_view: Number of frames in which the person is in view.
         found: Number of these frames in which an object covers the person.
-        id_changes: Number of id switches: the object that covers the person has another id than the last one.
+        id_switches: Number of id switches: the object that covers the person has another id than the last one.
     """
 
     id: int
     in_view: int
     found: int
-    id_changes: int
+    id_switches: int
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class MaskScores:
 
     Attributes:
         frames: Number of frames with a ground-truth mask.
-        moving_left_out: Fraction of the moving pixels with depth that are left out of tracking.
-        static_left_out: Fraction of the static pixels with depth that are left out of tracking. Tracking uses pixels
+        moving_masked: Fraction of the moving pixels with depth that are left out of tracking.
+        static_masked: Fraction of the static pixels with depth that are left out of tracking. Tracking uses pixels
             with depth only.
-        static_left_out_anywhere: Fraction of all static pixels, with or without depth, that are left out of tracking.
-        id_changes_per_60_frames: Id switches of all people per 60 frames in view.
+        static_masked_anywhere: Fraction of all static pixels, with or without depth, that are left out of tracking.
+        id_switches_per_60_frames: Id switches of all people per 60 frames in view.
         people_found: Fraction of the frames in view in which an object covers the person. Needed to interpret the id
             switches: a person who is never found has none.
         people: Counts of each person.
     """
 
     frames: int
-    moving_left_out: float | None
-    static_left_out: float | None
-    static_left_out_anywhere: float | None
-    id_changes_per_60_frames: float | None
+    moving_masked: float | None
+    static_masked: float | None
+    static_masked_anywhere: float | None
+    id_switches_per_60_frames: float | None
     people_found: float | None
     people: tuple[PersonScore, ...]
 
@@ -88,7 +88,7 @@ class MaskEvaluation:
         self._moving, self._static, self._anywhere = torch.zeros(3, 2, dtype=torch.int64)
         self._ids_in_view: dict[int, list[tuple[float, int]]] = {}  # person: (stamp, id of the covering object)
 
-    def add(self, stamp: float, truth: Tensor, depth: Tensor, left_out: Tensor, objects: Mapping[int, Tensor]) -> None:
+    def add(self, stamp: float, truth: Tensor, depth: Tensor, masked: Tensor, objects: Mapping[int, Tensor]) -> None:
         """Add a frame. Frames are added in the order of their timestamps.
 
         Args:
@@ -96,15 +96,15 @@ class MaskEvaluation:
             truth: Ground-truth mask: 0 for static pixels, 1-254 for the id of a person, 255 for neither, uint8, shape
                 :math:`(H, W)`.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            left_out: Pixels left out of tracking, bool, shape :math:`(H, W)`.
+            masked: Masked pixels, bool, shape :math:`(H, W)`.
             objects: Mask of each object by its id (> 0), bool, shape :math:`(H, W)`; masks may overlap.
         """
         measured = depth[0] > 0
         static = truth == STATIC
         self._frames += 1
-        self._moving += tally(left_out, ~static & (truth != UNSURE) & measured)
-        self._static += tally(left_out, static & measured)
-        self._anywhere += tally(left_out, static)
+        self._moving += tally(masked, ~static & (truth != UNSURE) & measured)
+        self._static += tally(masked, static & measured)
+        self._anywhere += tally(masked, static)
         people = people_in_view(truth, measured, round(self.IN_VIEW * truth.numel()))
         for person, id_ in zip(people.tolist(), covering_ids(truth, people, objects).tolist(), strict=True):
             self._ids_in_view.setdefault(person, []).append((stamp, id_))
@@ -117,10 +117,10 @@ class MaskEvaluation:
         in_view = sum(person.in_view for person in people)
         return MaskScores(
             frames=self._frames,
-            moving_left_out=_ratio(*self._moving.tolist()),
-            static_left_out=_ratio(*self._static.tolist()),
-            static_left_out_anywhere=_ratio(*self._anywhere.tolist()),
-            id_changes_per_60_frames=_ratio(60 * sum(person.id_changes for person in people), in_view),
+            moving_masked=_ratio(*self._moving.tolist()),
+            static_masked=_ratio(*self._static.tolist()),
+            static_masked_anywhere=_ratio(*self._anywhere.tolist()),
+            id_switches_per_60_frames=_ratio(60 * sum(person.id_switches for person in people), in_view),
             people_found=_ratio(sum(person.found for person in people), in_view),
             people=people,
         )
@@ -129,21 +129,21 @@ class MaskEvaluation:
         stamps, ids = zip(*self._ids_in_view[person], strict=True)
         object_ids = torch.tensor(ids)
         switches = count_id_switches(torch.tensor(stamps, dtype=torch.float64), object_ids, self.ABSENCE)
-        return PersonScore(person, in_view=len(ids), found=int((object_ids > 0).sum()), id_changes=switches)
+        return PersonScore(person, in_view=len(ids), found=int((object_ids > 0).sum()), id_switches=switches)
 
 
-def tally(left_out: Tensor, region: Tensor) -> Tensor:
+def tally(masked: Tensor, region: Tensor) -> Tensor:
     """Count the pixels of a region, and those of them that are left out.
 
     Args:
-        left_out: Pixels left out of tracking, bool, shape :math:`(*, H, W)`.
+        masked: Masked pixels, bool, shape :math:`(*, H, W)`.
         region: Pixels to count, bool, shape :math:`(*, H, W)`.
 
     Returns:
         Number of pixels of the region that are left out, and number of pixels of the region, int64, shape
         :math:`(*, 2)`.
     """
-    return torch.stack([(left_out & region).sum(dim=(-2, -1)), region.sum(dim=(-2, -1))], dim=-1)
+    return torch.stack([(masked & region).sum(dim=(-2, -1)), region.sum(dim=(-2, -1))], dim=-1)
 
 
 def people_in_view(truth: Tensor, measured: Tensor, min_pixels: int) -> Tensor:
