@@ -1,4 +1,4 @@
-"""``python -m v3d_torch.run`` as a user calls it: results, errors in a sentence, Ctrl-C, the built-in demo."""
+"""``python -m v3d_torch.run`` as a user calls it: results, error messages, Ctrl-C, the built-in demo."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ FILES = {
     *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png"),
 }
-"""What every run leaves behind where there is ground truth."""
-OBJECTS = {"figures/voting.png", "figures/clusters.png"}
-"""And where objects were seen and voted."""
+"""Files that every run with ground truth writes."""
+OBJECT_FILES = {"figures/voting.png", "figures/clusters.png"}
+"""Files that are written if objects were detected and voted on."""
 
-WALKER_FROM, WALKER_Y = -1.75, 2.0
+WALKER_START_X, WALKER_Y = -1.75, 2.0
 STANDER = (-0.91, 3.05)
 SWAYER = (1.02, 2.98)
-"""Where the demo's people are on the floor, metres right and away (datasets/demo/room.py)."""
+"""Positions of the demo's people on the floor, metres right and away (datasets/demo/room.py)."""
 
 
 def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:
-    """The same in this process, which has loaded everything already."""
+    """Call the command in this process, which has imported everything already."""
     with chdir(cwd):
         return CliRunner().invoke(
             run.app, command(*arguments)[3:], env={"V3D_DATA": None, "COLUMNS": "120", "NO_COLOR": "1", **variables}
@@ -55,15 +55,17 @@ def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:
 
 @pytest.fixture(scope="session")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A second of the demo in which the walker crosses the room, in TUM layout."""
+    """One second of the demo in TUM layout, in which the walker crosses the room."""
     folder = tmp_path_factory.mktemp("sequences") / "second"
     write_sequence(folder, range(45, 75))
     return folder
 
 
 @pytest.fixture(scope="session")
-def shown(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """Results of that second with the masks that come with it, and what the screen showed."""
+def first_run(
+    sequence: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """Results of that second with its own masks, and the output of the command."""
     out = tmp_path_factory.mktemp("first") / "out [b]"
     done = with_masks(sequence, "--out", out, "--save-masks", "--profile", cwd=out.parent)
     assert done.returncode == 0, done.stderr
@@ -71,8 +73,8 @@ def shown(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 
 
 @pytest.fixture(scope="session")
-def first(shown: tuple[Path, subprocess.CompletedProcess[str]]) -> Path:
-    return shown[0]
+def first_out(first_run: tuple[Path, subprocess.CompletedProcess[str]]) -> Path:
+    return first_run[0]
 
 
 def with_masks(sequence: Path, *more: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -81,7 +83,7 @@ def with_masks(sequence: Path, *more: str | Path, cwd: Path) -> subprocess.Compl
 
 @pytest.fixture
 def copy(sequence: Path, tmp_path: Path) -> Path:
-    """The sequence, to be broken; the images are links, so replace them and do not write into them."""
+    """Copy of the sequence that a test can damage. The images are hard links: replace them, do not write to them."""
     folder = tmp_path / "copy"
     shutil.copytree(sequence, folder, copy_function=os.link)
     return folder
@@ -93,32 +95,32 @@ def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
     path.write_bytes(content)
 
 
-# --- a run
+# --- results
 
 
-def test_a_run_leaves_all_its_files(first: Path, sequence: Path) -> None:
-    assert {name for name in files_in(first) if not name.startswith("masks/")} == FILES | OBJECTS
-    trajectory = read_trajectory(first / "trajectory.txt")
+def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
+    assert {name for name in files_in(first_out) if not name.startswith("masks/")} == FILES | OBJECT_FILES
+    trajectory = read_trajectory(first_out / "trajectory.txt")
     listed = [float(line.split()[0]) for line in (sequence / "associations.txt").read_text().splitlines()]
     assert trajectory.stamps.tolist() == listed
-    metrics = json.loads((first / "metrics.json").read_text())
+    metrics = json.loads((first_out / "metrics.json").read_text())
     assert metrics["ate"]["rmse"] < 0.005
     assert metrics["tracked"] == metrics["frames"] == 30
-    log = (first / "run.log").read_text().splitlines()
+    log = (first_out / "run.log").read_text().splitlines()
     assert sum("frame" in line and "tracked" in line for line in log) == 30
 
 
-def test_the_screen_shows_scores_and_where_the_results_are(
-    shown: tuple[Path, subprocess.CompletedProcess[str]],
+def test_run_prints_scores_and_result_folder(
+    first_run: tuple[Path, subprocess.CompletedProcess[str]],
 ) -> None:
-    out, done = shown
+    out, done = first_run
     assert done.stderr == ""
     for words in ("ATE rmse", "30 of 30", "30 tracked", f"results: {out}"):
         assert words in done.stdout
 
 
-def test_the_profile_shows_what_each_stage_took(shown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
-    out, done = shown
+def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    out, done = first_run
     frames = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").to_numpy() * 1e3
     rows = [line.strip("│ ").split() for line in done.stdout.partition("time per frame, ms")[2].splitlines()]
     shown_rows = {row[0]: row[2::2] for row in rows if len(row) == 9 and row[-1].endswith("%")}
@@ -126,32 +128,34 @@ def test_the_profile_shows_what_each_stage_took(shown: tuple[Path, subprocess.Co
     assert list(shown_rows) == [*stages, "all"]
     for figures, taken in zip(shown_rows.values(), [*frames.T, frames.sum(axis=1)], strict=True):
         expected = [taken.mean(), np.median(taken), np.quantile(taken, 0.95)]
-        assert list(map(float, figures[:3])) == pytest.approx(expected, abs=0.06)  # a digit of theirs
+        assert list(map(float, figures[:3])) == pytest.approx(expected, abs=0.06)  # printed with one decimal
         assert float(figures[3].rstrip("%")) == pytest.approx(100 * taken.sum() / frames.sum(), abs=0.6)
 
 
-def test_saved_masks_are_black_and_white_and_named_by_stamp(first: Path, sequence: Path) -> None:
+def test_saved_masks_are_binary_and_named_by_timestamp(first_out: Path, sequence: Path) -> None:
     stamps = [line.split()[0] for line in (sequence / "associations.txt").read_text().splitlines()]
-    assert sorted(path.name for path in (first / "masks").iterdir()) == [f"{float(stamp):.6f}.png" for stamp in stamps]
+    assert sorted(path.name for path in (first_out / "masks").iterdir()) == [
+        f"{float(stamp):.6f}.png" for stamp in stamps
+    ]
     for stamp in stamps:
-        saved = cv2.imread(str(first / "masks" / f"{float(stamp):.6f}.png"), cv2.IMREAD_UNCHANGED)
+        saved = cv2.imread(str(first_out / "masks" / f"{float(stamp):.6f}.png"), cv2.IMREAD_UNCHANGED)
         truth = cv2.imread(str(sequence / "masks" / f"{stamp}.png"), cv2.IMREAD_UNCHANGED)
         assert saved.dtype == np.uint8 and saved.shape == (480, 640)
         assert set(np.unique(saved)) <= {0, 255}
-        assert (saved[truth > 0] == 255).mean() > 0.95  # who moves, or might, is left out
+        assert (saved[truth > 0] == 255).mean() > 0.95  # people who move, or could move, are masked
         assert (saved == 255).mean() < 0.6
 
 
-def test_the_same_bytes_again_with_any_number_of_threads(first: Path, sequence: Path, tmp_path: Path) -> None:
-    """The first run had one thread, this one, in another process, has two."""
+def test_results_are_the_same_bytes_with_two_threads(first_out: Path, sequence: Path, tmp_path: Path) -> None:
+    """The first run had one thread. This run has two, in another process."""
     done = with_masks(sequence, "--out", tmp_path, "--set", "threads=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
-        assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+        assert (tmp_path / name).read_bytes() == (first_out / name).read_bytes(), name
 
 
-def test_without_a_segmenter_and_without_out(moment: Path, tmp_path: Path) -> None:
-    """The newest results are behind ``latest``; without masks nobody is judged."""
+def test_run_without_segmenter_and_out_writes_a_folder_by_time(moment: Path, tmp_path: Path) -> None:
+    """The link ``latest`` points to the newest results. Without masks there are no objects."""
     runs = tmp_path / "results" / "moment"
     newest = []
     for seed in (3, 4):
@@ -167,22 +171,22 @@ def test_without_a_segmenter_and_without_out(moment: Path, tmp_path: Path) -> No
     assert {path.name for path in runs.iterdir()} == {"latest", *(path.name for path in newest)}
 
 
-def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Stopped(datetime):
+def test_runs_started_in_the_same_second_have_separate_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class FixedTime(datetime):
         @classmethod
-        def now(cls, tz: tzinfo | None = None) -> Stopped:
+        def now(cls, tz: tzinfo | None = None) -> FixedTime:
             return cls(2026, 1, 2, 3, 4, 5, tzinfo=tz)
 
-    monkeypatch.setattr(result_folder, "datetime", Stopped)
+    monkeypatch.setattr(result_folder, "datetime", FixedTime)
     monkeypatch.chdir(tmp_path)
-    made = [result_folder.make_result_folder(None, "fr3/w/xyz") for _ in range(3)]
-    assert [folder.name for folder in made] == [f"2026-01-02_03-04-05{end}" for end in ("", "_2", "_3")]
-    assert (tmp_path / "results" / "fr3_w_xyz" / "latest").resolve() == made[-1].resolve()
+    folders = [result_folder.make_result_folder(None, "fr3/w/xyz") for _ in range(3)]
+    assert [folder.name for folder in folders] == [f"2026-01-02_03-04-05{suffix}" for suffix in ("", "_2", "_3")]
+    assert (tmp_path / "results" / "fr3_w_xyz" / "latest").resolve() == folders[-1].resolve()
 
 
-def test_where_there_can_be_no_links_there_is_no_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_make_result_folder_without_symlink_permission_makes_no_latest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object) -> None:
         raise OSError(errno.EPERM, "A required privilege is not held by the client")
 
@@ -192,15 +196,15 @@ def test_where_there_can_be_no_links_there_is_no_latest(tmp_path: Path, monkeypa
     assert folder.is_dir() and [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
-def test_where_no_folder_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_make_result_folder_that_fails_raises_output_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "results").symlink_to("nowhere")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(OutputError, match=r"demo: cannot be made \(.*\); choose another folder with --out"):
         result_folder.make_result_folder(None, "demo")
 
 
-def test_a_configuration_file_and_the_command_line_over_it(moment: Path, tmp_path: Path) -> None:
-    (tmp_path / "own.yaml").write_text("mapping: {max_gap: 4, min_tracked: 90}\n")
+def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text("mapping: {max_keyframe_interval: 4, min_tracked: 90}\n")
     arguments = (
         "--config",
         tmp_path / "own.yaml",
@@ -212,35 +216,35 @@ def test_a_configuration_file_and_the_command_line_over_it(moment: Path, tmp_pat
     done = call_here("--seq", moment, "--segmenter", "none", *arguments, "--out", tmp_path / "out", cwd=tmp_path)
     assert done.exit_code == 0, done.stderr
     written = (tmp_path / "out" / "config.yaml").read_text()
-    for line in ("max_gap: 7", "min_tracked: 90", "count: 900", "source: none"):
+    for line in ("max_keyframe_interval: 7", "min_tracked: 90", "count: 900", "source: none"):
         assert line in written
 
 
-# --- what users get wrong
+# --- mistakes of the user
 
 
-def test_an_unknown_key_is_answered_with_the_nearest(sequence: Path, tmp_path: Path) -> None:
+def test_unknown_key_is_rejected_with_the_nearest_key(sequence: Path, tmp_path: Path) -> None:
     done = call("--seq", sequence, "--set", "objects.voting.vote_treshold=3", cwd=tmp_path)
     assert_error_line(done, "objects.voting.vote_treshold", "objects.voting.vote_threshold")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unknown_sequence_is_answered_with_the_nearest(tmp_path: Path) -> None:
+def test_unknown_sequence_is_rejected_with_the_nearest_name(tmp_path: Path) -> None:
     assert_error_line(call_here("--seq", "fr3/w/xzy", cwd=tmp_path), "fr3/w/xzy", "fr3/w/xyz")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_path_that_is_not_there(tmp_path: Path) -> None:
+def test_missing_path_is_rejected(tmp_path: Path) -> None:
     assert_error_line(call_here("--seq", tmp_path / "nowhere", cwd=tmp_path), str(tmp_path / "nowhere"))
 
 
-def test_a_folder_without_depth(copy: Path, tmp_path: Path) -> None:
+def test_folder_without_depth_is_rejected(copy: Path, tmp_path: Path) -> None:
     (copy / "associations.txt").unlink()
     (copy / "depth.txt").unlink()
     assert_error_line(call_here("--seq", copy, "--segmenter", "none", cwd=tmp_path), str(copy), "depth.txt")
 
 
-def test_masks_of_another_folder(sequence: Path, tmp_path: Path) -> None:
+def test_missing_id_images_are_rejected(sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     arguments = ("--seq", sequence, "--segmenter", "masks")
     assert_error_line(call_here(*arguments, "--masks", tmp_path / "empty", cwd=tmp_path), str(tmp_path / "empty"))
@@ -249,12 +253,11 @@ def test_masks_of_another_folder(sequence: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
 @pytest.mark.parametrize("index", [0, 6])
-def test_a_truncated_image(kind: str, index: int, copy: Path, tmp_path: Path) -> None:
-    """The results up to there are kept."""
-    broken = sorted((copy / kind).iterdir())[index]
-    rewrite(broken, lambda content: content[: len(content) // 2])
+def test_truncated_image_ends_the_run_with_partial_results(kind: str, index: int, copy: Path, tmp_path: Path) -> None:
+    damaged = sorted((copy / kind).iterdir())[index]
+    rewrite(damaged, lambda content: content[: len(content) // 2])
     done = call_here("--seq", copy, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
-    assert_error_line(done, str(broken))
+    assert_error_line(done, str(damaged))
     trajectory = tmp_path / "out" / "trajectory.txt"
     assert len(trajectory.read_text().splitlines() if trajectory.exists() else []) == index
     if index:
@@ -263,7 +266,7 @@ def test_a_truncated_image(kind: str, index: int, copy: Path, tmp_path: Path) ->
         assert json.loads((tmp_path / "out" / "metrics.json").read_text())["processed"] == index
 
 
-def test_colour_and_depth_swapped(copy: Path, tmp_path: Path) -> None:
+def test_swapped_colour_and_depth_are_rejected(copy: Path, tmp_path: Path) -> None:
     (copy / "associations.txt").unlink()
     colour, depth = (copy / "rgb.txt").read_bytes(), (copy / "depth.txt").read_bytes()
     rewrite(copy / "rgb.txt", lambda _: depth)
@@ -272,7 +275,7 @@ def test_colour_and_depth_swapped(copy: Path, tmp_path: Path) -> None:
     assert_error_line(done, str(sorted((copy / "depth").iterdir())[0]), "swapped")
 
 
-def test_depth_with_8_bits(copy: Path, tmp_path: Path) -> None:
+def test_8_bit_depth_is_rejected(copy: Path, tmp_path: Path) -> None:
     path = sorted((copy / "depth").iterdir())[0]
     grey = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
     rewrite(path, lambda _: cv2.imencode(".png", grey)[1].tobytes())
@@ -281,19 +284,24 @@ def test_depth_with_8_bits(copy: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("below", [False, True])
-def test_a_file_where_the_results_belong(below: bool, sequence: Path, tmp_path: Path) -> None:
+def test_result_folder_at_or_below_a_file_is_rejected(below: bool, sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     out = tmp_path / "taken" / "out" if below else tmp_path / "taken"
     done = call_here("--seq", sequence, "--segmenter", "none", "--out", out, cwd=tmp_path)
     assert_error_line(done, str(tmp_path / "taken"))
 
 
-def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
-    """Where there is a network this would fetch 500 MB: a proxy that nobody listens at keeps it off."""
+def test_failed_download_is_reported_and_leaves_no_files(tmp_path: Path) -> None:
+    """A proxy address without a server prevents a real download of 500 MB."""
     (tmp_path / "data").mkdir()
     start = time.monotonic()
-    nobody = dict.fromkeys(("https_proxy", "http_proxy", "HTTPS_PROXY", "HTTP_PROXY"), "http://127.0.0.1:9")
-    variables = {"V3D_DATA": str(tmp_path / "data"), "V3D_CACHE": str(tmp_path / "cache"), "no_proxy": "", **nobody}
+    dead_proxies = dict.fromkeys(("https_proxy", "http_proxy", "HTTPS_PROXY", "HTTP_PROXY"), "http://127.0.0.1:9")
+    variables = {
+        "V3D_DATA": str(tmp_path / "data"),
+        "V3D_CACHE": str(tmp_path / "cache"),
+        "no_proxy": "",
+        **dead_proxies,
+    }
     done = call_here("--seq", "fr3/w/xyz", cwd=tmp_path, **variables)
     assert time.monotonic() - start < 20
     name = "rgbd_dataset_freiburg3_walking_xyz"
@@ -302,7 +310,7 @@ def test_a_sequence_that_cannot_be_downloaded(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
-def test_ctrl_c_keeps_what_was_computed(sequence: Path, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_partial_results(sequence: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = command("--seq", sequence, "--segmenter", "none", "--save-masks", "--out", out)
     with subprocess.Popen(  # noqa: S603
@@ -321,12 +329,12 @@ def test_ctrl_c_keeps_what_was_computed(sequence: Path, tmp_path: Path) -> None:
     assert {name for name in files_in(out) if not name.startswith("masks/")} == FILES | {"checkpoint.v3d"}
 
 
-def test_help_is_instant_and_names_every_option() -> None:
+def test_help_is_fast_and_names_every_option() -> None:
     before = os.times()
     done = subprocess.run(
         [sys.executable, "-m", "v3d_torch.run", "--help"], capture_output=True, text=True, env=environment(), check=True
     )
-    assert os.times().children_user - before.children_user < 3  # of the processor, which others may use too
+    assert os.times().children_user - before.children_user < 3  # processor time, independent of other processes
     for option in (
         "seq",
         "data-root",
@@ -353,7 +361,7 @@ def test_help_is_instant_and_names_every_option() -> None:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """Results of the whole demo as ``--seq demo`` gives them out of the box, and what the screen showed."""
+    """Results of the whole demo with default options, and the output of the command."""
     out = tmp_path_factory.mktemp("demo")
     done = call("--seq", "demo", "--out", out, cwd=out)
     assert done.returncode == 0, done.stderr
@@ -362,7 +370,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @pytest.fixture(scope="session")
 def people(demo: tuple[Path, str]) -> pd.DataFrame:
-    """The rows of all people that the network saw, their centroids in the room's own axes: x right, y away, z up."""
+    """Rows of all detected people, with centroids in the axes of the room: x right, y away, z up."""
     table = pd.read_parquet(demo[0] / "dynamics.parquet")
     table = table[(table["class"] == "person") & ~table["missed"] & table["x"].notna()].copy()
     T_ge = np.array(json.loads((demo[0] / "metrics.json").read_text())["alignment"]["T_ge"])
@@ -370,31 +378,31 @@ def people(demo: tuple[Path, str]) -> pd.DataFrame:
     return table
 
 
-def near(people: pd.DataFrame, x: pd.Series | float, y: float, within: float) -> pd.DataFrame:
-    """Rows of people whose centroid is at a place on the floor."""
-    return people[np.hypot(people["x"] - x, people["y"] - y) < within]
+def near(people: pd.DataFrame, x: pd.Series | float, y: float, radius: float) -> pd.DataFrame:
+    """Rows of people with a centroid near a position on the floor."""
+    return people[np.hypot(people["x"] - x, people["y"] - y) < radius]
 
 
-def test_demo_every_file_every_frame(demo: tuple[Path, str]) -> None:
+def test_demo_writes_all_files_and_a_pose_for_each_frame(demo: tuple[Path, str]) -> None:
     out, stdout = demo
-    assert files_in(out) == FILES | OBJECTS
+    assert files_in(out) == FILES | OBJECT_FILES
     assert len((out / "trajectory.txt").read_text().splitlines()) == FRAME_COUNT == 120
     assert "ATE rmse" in stdout
-    for name in ("figures/trajectory.png", "figures/masks.png", *OBJECTS):
+    for name in ("figures/trajectory.png", "figures/masks.png", *OBJECT_FILES):
         image = cv2.imread(str(out / name))
         assert image is not None and min(image.shape[:2]) >= 300 and max(image.shape[:2]) <= 4000
 
 
-def test_demo_trajectory(demo: tuple[Path, str]) -> None:
+def test_demo_trajectory_is_accurate(demo: tuple[Path, str]) -> None:
     metrics = json.loads((demo[0] / "metrics.json").read_text())
     assert metrics["ate"]["rmse"] < 0.02
     assert metrics["rpe"]["trans"]["rmse"] < 0.02 and metrics["rpe"]["rot"]["rmse"] < 0.5
     assert metrics["coverage"] == 1.0 and metrics["lost"] == 0 and metrics["failure"] is None
 
 
-def test_demo_the_walker_is_voted_dynamic(people: pd.DataFrame) -> None:
-    way = WALKER_FROM + WALK_SPEED * (people["frame"] / FRAME_RATE - WALK_START)
-    walker = near(people, way, WALKER_Y, within=0.3)
+def test_demo_walker_is_voted_dynamic(people: pd.DataFrame) -> None:
+    walker_x = WALKER_START_X + WALK_SPEED * (people["frame"] / FRAME_RATE - WALK_START)
+    walker = near(people, walker_x, WALKER_Y, radius=0.3)
     walker = walker[walker["frame"].between(30, 105)]  # in view from head to hip
     assert walker["frame"].nunique() >= 60
     for _, rows in walker.groupby("frame"):
@@ -402,8 +410,8 @@ def test_demo_the_walker_is_voted_dynamic(people: pd.DataFrame) -> None:
     assert (walker["votes"] > 0).mean() > 0.5
 
 
-def test_demo_the_photographer_stands_still(people: pd.DataFrame) -> None:
-    stander = near(people, *STANDER, within=0.35)
+def test_demo_standing_person_is_static(people: pd.DataFrame) -> None:
+    stander = near(people, *STANDER, radius=0.35)
     stander = stander[stander["y"] > WALKER_Y + 0.5]
     assert stander["frame"].nunique() >= 90
     assert (stander["motion_state"] == "static").mean() > 0.6
@@ -411,12 +419,12 @@ def test_demo_the_photographer_stands_still(people: pd.DataFrame) -> None:
     assert not stander["motion_state"].isin(["dynamic", "deforming"]).any()
 
 
-def test_demo_who_sways_deforms(people: pd.DataFrame) -> None:
-    swayer = near(people, *SWAYER, within=0.35)
+def test_demo_swaying_person_is_deforming(people: pd.DataFrame) -> None:
+    swayer = near(people, *SWAYER, radius=0.35)
     swayer = swayer[swayer["y"] > WALKER_Y + 0.5]
     assert swayer["frame"].nunique() >= 90
-    alone = swayer[swayer["frame"].between(15, 70)]  # before the walker hides them
-    assert (alone.groupby("frame")["motion_state"].agg(set).map(lambda said: "deforming" in said)).mean() > 0.7
+    alone = swayer[swayer["frame"].between(15, 70)]  # before the walker occludes this person
+    assert (alone.groupby("frame")["motion_state"].agg(set).map(lambda states: "deforming" in states)).mean() > 0.7
     assert (swayer["motion_state"] != "static").all()
 
 
@@ -426,6 +434,6 @@ def test_demo_moving_people_are_not_in_the_map(demo: tuple[Path, str]) -> None:
     T_ge = np.array(json.loads((demo[0] / "metrics.json").read_text())["alignment"]["T_ge"])
     x, y, z = (points @ T_ge[:3, :3].T + T_ge[:3, 3]).T
     assert len(points) > 20_000
-    # The corridor that the walker crosses, above the furniture's height, is empty but for a few stray points.
+    # The corridor that the walker crosses is empty above the furniture, except for a few stray points.
     corridor = (np.abs(y - WALKER_Y) < 0.2) & (z > 1.0) & (z < 1.6) & (np.abs(x) < 1.2)
     assert corridor.sum() < 0.002 * len(points)

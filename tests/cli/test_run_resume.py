@@ -441,6 +441,7 @@ def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
     write_checkpoint(tmp_path, pipeline, RunRequest("realsense:", Config()))
     assert_error_line(
         call("--resume", tmp_path),
-        f"{tmp_path}: the run of a live stream (realsense:) cannot be resumed; its results so far are in trajectory.txt",
+        f"{tmp_path}: the run of a live stream (realsense:) cannot be resumed; its results so far are in",
+        " in trajectory.txt\n",
     )
     torch.set_num_threads(1)

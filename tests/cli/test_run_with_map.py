@@ -20,27 +20,27 @@ from v3d_torch.types import Trajectory
 OPTIONS = ("--segmenter", "none", "--set", "features.count=800")
 
 
-def written(folder: Path, slide: Slide) -> Path:
+def write_sequence(folder: Path, slide: Slide) -> Path:
     with TUMWriter(folder, CAMERA, slide.groundtruth) as writer:
         for frame in slide:
             writer.add(frame)
     return folder
 
 
-def joined(*paths: Path) -> Trajectory:
+def join_trajectories(*paths: Path) -> Trajectory:
     parts = [read_trajectory(path) for path in paths]
     return Trajectory(torch.cat([part.stamps for part in parts]), torch.cat([part.T_wc for part in parts]))
 
 
 @pytest.fixture(scope="module")
 def halves(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two recordings of a wall; the second goes on from within the first, a minute later."""
+    """Two overlapping recordings of a wall; the second is recorded a minute later."""
     folder = tmp_path_factory.mktemp("halves")
     later = Slide(700, 940, step=12)
     later.stamps += 60
     assert later.groundtruth is not None
     later.groundtruth.stamps[:] = later.stamps
-    return written(folder / "first", Slide(600, 800, step=12)), written(folder / "second", later)
+    return write_sequence(folder / "first", Slide(600, 800, step=12)), write_sequence(folder / "second", later)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def first(halves: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return out / "results", room
 
 
-def test_the_mesh_and_the_map_are_written(first: tuple[Path, Path]) -> None:
+def test_mesh_and_map_are_written(first: tuple[Path, Path]) -> None:
     results, room = first
     assert {"map.ply", "mesh.ply", "trajectory.ply"} <= files_in(results)
     mesh = plyfile.PlyData.read(results / "mesh.ply")
@@ -63,7 +63,7 @@ def test_the_mesh_and_the_map_are_written(first: tuple[Path, Path]) -> None:
 
 
 @pytest.mark.parametrize("localise", [False, True])
-def test_the_second_half_is_tracked_in_the_map_of_the_first(
+def test_second_recording_is_tracked_in_the_map_of_the_first(
     localise: bool, halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path
 ) -> None:
     results, room = first
@@ -78,39 +78,39 @@ def test_the_second_half_is_tracked_in_the_map_of_the_first(
     assert f"{known} keyframes" in done.stdout
     keyframes = (tmp_path / "out" / "keyframes.txt").read_text().splitlines()
     assert len(keyframes) == metrics["keyframes"] and (metrics["keyframes"] == 0) == localise
-    # The trajectory is in the world of the first half: one alignment serves both.
-    estimate = joined(results / "trajectory.txt", tmp_path / "out" / "trajectory.txt")
-    truth = joined(*(folder / "groundtruth.txt" for folder in halves))
+    # The trajectory is in the world frame of the first recording: one alignment fits both.
+    estimate = join_trajectories(results / "trajectory.txt", tmp_path / "out" / "trajectory.txt")
+    truth = join_trajectories(*(folder / "groundtruth.txt" for folder in halves))
     assert evaluate(truth, estimate, frames=len(estimate)).ate.rmse < 0.02
-    # The coloured map is that of both.
+    # The coloured map covers both recordings.
     extent = [np.ptp(plyfile.PlyData.read(folder / "map.ply")["vertex"]["x"]) for folder in (results, tmp_path / "out")]
     assert (extent[1] > extent[0] + 0.5) != localise
 
 
-# --- what users get wrong
+# --- mistakes of the user
 
 
-def test_localise_without_a_map(halves: tuple[Path, Path], tmp_path: Path) -> None:
+def test_localise_without_map_is_rejected(halves: tuple[Path, Path], tmp_path: Path) -> None:
     assert_error_line(call("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_is_no_map(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
+def test_damaged_map_file_is_rejected(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "half.map").write_bytes(first[1].read_bytes()[:5000])
     done = call("--seq", halves[1], *OPTIONS, "--load-map", "half.map", cwd=tmp_path)
     assert_error_line(done, "half.map", "--save-map")
     assert files_in(tmp_path) == {"half.map"}
 
 
-def test_a_map_of_another_room(first: tuple[Path, Path], tmp_path: Path) -> None:
-    """The results are written all the same: they say that every frame is lost."""
-    other = written(tmp_path / "other", Slide(0, 60, step=12, seed=3))
+def test_map_of_another_room_is_reported_after_the_results(first: tuple[Path, Path], tmp_path: Path) -> None:
+    """The results are still written, with every frame lost."""
+    other = write_sequence(tmp_path / "other", Slide(0, 60, step=12, seed=3))
     done = call("--seq", other, *OPTIONS, "--load-map", first[1], "--out", tmp_path / "out", cwd=tmp_path)
     assert_error_line(done, str(first[1]), str(tmp_path / "out"))
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["lost"] == 6
 
 
-def test_a_map_that_could_not_be_written_is_told_before_the_run(halves: tuple[Path, Path], tmp_path: Path) -> None:
+def test_unwritable_map_file_is_rejected_before_the_run(halves: tuple[Path, Path], tmp_path: Path) -> None:
     done = call("--seq", halves[0], *OPTIONS, "--save-map", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
     assert_error_line(done, f"{tmp_path}: cannot be written")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The configuration: layers, refusals, round trip."""
+"""Loading of configurations: precedence, errors, round trip."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from v3d_torch.config.loading import CONFIGS, dump_config, find_config, load_con
 from v3d_torch.errors import ConfigError
 
 
-def test_the_command_line_goes_over_the_file_over_the_defaults(tmp_path: Path) -> None:
+def test_overrides_take_precedence_over_the_file_and_the_defaults(tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
     file.write_text("seed: 3\nobjects:\n  voting:\n    vote_threshold: 4\n    distance_threshold: 0.1\n")
     config = load_config(file, ["objects.voting.distance_threshold=0.05"])
@@ -21,11 +21,11 @@ def test_the_command_line_goes_over_the_file_over_the_defaults(tmp_path: Path) -
     assert config.objects.clouds == Config().objects.clouds
 
 
-def test_one_value_needs_no_list() -> None:
+def test_single_override_needs_no_list() -> None:
     assert load_config("paper", "seed=3") == load_config("paper", ["seed=3"])
 
 
-def test_a_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
+def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
     config = load_config(None, ["objects.voting.baselines=[0.0, 0.5]", "loop.enabled=false"])
     file = tmp_path / "config.yaml"
     file.write_text(dump_config(config))
@@ -46,7 +46,7 @@ def test_a_written_configuration_reads_back_the_same(tmp_path: Path) -> None:
         ("segmentation.height=481", "multiple of 32"),
     ],
 )
-def test_what_is_wrong_is_refused_with_the_cure(override: str, message: str) -> None:
+def test_invalid_override_is_rejected_with_a_fix(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match="--set") as raised:
         load_config(None, [override])
     assert message in str(raised.value)
@@ -60,7 +60,7 @@ def test_what_is_wrong_is_refused_with_the_cure(override: str, message: str) -> 
         ("seeed: 1\n", "did you mean seed?"),
     ],
 )
-def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_file_is_rejected_with_its_path(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=r"bad\.yaml") as raised:
@@ -68,37 +68,37 @@ def test_a_bad_file_is_refused_by_name(tmp_path: Path, text: str, message: str) 
     assert message in str(raised.value)
 
 
-def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+def test_missing_file_is_rejected_with_its_path(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: is neither the name of a configuration .* nor a YAML file"):
         load_config(tmp_path / "none.yaml")
 
 
-def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
+def test_empty_file_gives_the_defaults(tmp_path: Path) -> None:
     file = tmp_path / "empty.yaml"
     file.write_text("# nothing\n")
     assert load_config(file) == Config()
 
 
-def test_every_configuration_of_the_package_loads_by_its_name() -> None:
+def test_every_configuration_of_the_package_loads_by_name() -> None:
     assert {"full", "default", "paper", "baseline", "no_voting"} <= set(CONFIGS)
     for name, file in CONFIGS.items():
-        assert file.is_relative_to(Path(v3d_torch.__file__).parent)  # so that a wheel has it
+        assert file.is_relative_to(Path(v3d_torch.__file__).parent)  # so that it is in the wheel
         assert find_config(name) == file
         load_config(file)
     assert load_config(find_config("full")) == Config()
     assert load_config(find_config("baseline")).segmentation.source == "none"
 
 
-def test_a_configuration_is_found_by_path_and_an_unknown_one_is_answered_with_the_names(tmp_path: Path) -> None:
-    mine = tmp_path / "mine.yaml"
-    mine.write_text("seed: 3\n")
-    assert load_config(find_config(mine)).seed == 3
+def test_find_config_accepts_paths_and_rejects_unknown_names_with_a_list(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("seed: 3\n")
+    assert load_config(find_config(own)).seed == 3
     with pytest.raises(ConfigError, match=r"papper: is neither.*paper") as raised:
         find_config("papper")
     assert "no_voting" in str(raised.value)
 
 
-def test_a_mistake_is_laid_to_whom_it_belongs(tmp_path: Path) -> None:
+def test_error_names_the_source_of_the_value(tmp_path: Path) -> None:
     file = tmp_path / "good.yaml"
     file.write_text("seed: 3\n")
     for override in ("sed=2", "seed=-1"):

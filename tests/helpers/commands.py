@@ -1,4 +1,4 @@
-"""The run command in a process of its own, and assertions on what commands print."""
+"""The run command in a subprocess, and assertions on the output of commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typer.testing import Result
 
 
 def command(*arguments: str | Path) -> list[str]:
-    # One thread: several would wait for each other on shared cores, and results do not depend on their number.
+    # One thread: several would wait for each other on shared cores, and the results are the same.
     return [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"]
 
 

@@ -105,7 +105,7 @@ CASES = [
         edit(RGB[5], first_half),
         Fails(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; go on with --resume {out})",
+            " of the 5 frames before are in {out}; resume with --resume {out})",
             saved_poses=5,
         ),
     ),
@@ -114,7 +114,7 @@ CASES = [
         edit(DEPTH[5], first_half),
         Fails(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; go on with --resume {out})",
+            " of the 5 frames before are in {out}; resume with --resume {out})",
             saved_poses=5,
         ),
     ),
@@ -123,7 +123,7 @@ CASES = [
         edit(RGB[5], flip_bit),
         Fails(
             "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; go on with --resume {out})",
+            " of the 5 frames before are in {out}; resume with --resume {out})",
             saved_poses=5,
         ),
     ),
@@ -132,7 +132,7 @@ CASES = [
         edit(DEPTH[5], flip_bit),
         Fails(
             "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; go on with --resume {out})",
+            " of the 5 frames before are in {out}; resume with --resume {out})",
             saved_poses=5,
         ),
     ),
@@ -141,7 +141,7 @@ CASES = [
         write(RGB[5], ""),
         Fails(
             "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            " results of the 5 frames before are in {out}; resume with --resume {out})",
             saved_poses=5,
         ),
     ),
@@ -150,7 +150,7 @@ CASES = [
         write(DEPTH[5], ""),
         Fails(
             "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results of the 5 frames before are in {out}; go on with --resume {out})",
+            " results of the 5 frames before are in {out}; resume with --resume {out})",
             saved_poses=5,
         ),
     ),
@@ -159,7 +159,7 @@ CASES = [
         write(RGB[2], PAGE),
         Fails(
             "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results of the 2 frames before are in {out}; go on with --resume {out})",
+            " results of the 2 frames before are in {out}; resume with --resume {out})",
             saved_poses=2,
         ),
     ),
@@ -176,7 +176,7 @@ CASES = [
         write(RGB[4], png(depth())),
         Fails(
             "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image, expected a colour image; check that"
-            " colour and depth are not swapped (the results of the 4 frames before are in {out}; go on with"
+            " colour and depth are not swapped (the results of the 4 frames before are in {out}; resume with"
             " --resume {out})",
             saved_poses=4,
         ),
@@ -186,7 +186,7 @@ CASES = [
         write(DEPTH[4], png(colour(0))),
         Fails(
             "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour"
-            " and depth are not swapped (the results of the 4 frames before are in {out}; go on with --resume"
+            " and depth are not swapped (the results of the 4 frames before are in {out}; resume with --resume"
             " {out})",
             saved_poses=4,
         ),
@@ -204,7 +204,7 @@ CASES = [
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
         Fails(
             "{seq}/depth/1305031102.400000.png: is an 8-bit image, depth needs 16 bits; export depth again"
-            " without rescaling (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            " without rescaling (the results of the 4 frames before are in {out}; resume with --resume {out})",
             saved_poses=4,
         ),
     ),
@@ -286,7 +286,7 @@ CASES = [
         write(RGB[3], png(SMALL)),
         Fails(
             "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
-            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; resume"
             " with --resume {out})",
             saved_poses=3,
         ),
@@ -296,7 +296,7 @@ CASES = [
         write(DEPTH[3], png(depth()[::2, ::2])),
         Fails(
             "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
-            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; resume"
             " with --resume {out})",
             saved_poses=3,
         ),
@@ -306,7 +306,7 @@ CASES = [
         write(DEPTH[3], png(depth().T.copy())),
         Fails(
             "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
-            " that is registered to the colour image (the results of the 3 frames before are in {out}; go on"
+            " that is registered to the colour image (the results of the 3 frames before are in {out}; resume"
             " with --resume {out})",
             saved_poses=3,
         ),
@@ -316,7 +316,7 @@ CASES = [
         write(RGB[3], bomb(40000, 40000, 8, 2)),
         Fails(
             "{seq}/rgb/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
-            " export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            " export it again (the results of the 3 frames before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),
@@ -325,7 +325,7 @@ CASES = [
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
         Fails(
             "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy"
-            " or export it again (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            " or export it again (the results of the 3 frames before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),

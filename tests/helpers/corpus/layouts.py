@@ -158,7 +158,7 @@ CASES = [
         changed(seven_scenes(), "frame-000003.depth.png", first_half),
         Fails(
             "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again (the"
-            " results of the 3 frames before are in {out}; go on with --resume {out})",
+            " results of the 3 frames before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),

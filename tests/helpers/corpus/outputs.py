@@ -176,7 +176,7 @@ CASES = [
         lambda place: None,
         Fails(
             "{seq}/rgb/1305031102.400000.png: is listed but does not exist; copy the whole sequence again (the"
-            " results of the 4 frames before are in {out}; go on with --resume {out})",
+            " results of the 4 frames before are in {out}; resume with --resume {out})",
             saved_poses=4,
         ),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.folder)),
@@ -186,7 +186,7 @@ CASES = [
         lambda place: None,
         Fails(
             "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
-            " (the results of the 4 frames before are in {out}; go on with --resume {out})",
+            " (the results of the 4 frames before are in {out}; resume with --resume {out})",
             saved_poses=4,
         ),
         lambda place: at_frame(4, broke),
@@ -195,7 +195,7 @@ CASES = [
         "Ctrl-C",
         SERIAL,
         Fails(
-            "interrupted after 5 of 8 frames (the results of the 5 frames before are in {out}; go on with --resume"
+            "interrupted after 5 of 8 frames (the results of the 5 frames before are in {out}; resume with --resume"
             " {out})",
             saved_poses=5,
         ),
@@ -212,7 +212,7 @@ CASES = [
         unreadable(f"rgb/{STAMPS[4]}.png"),
         Fails(
             "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check its permissions (the"
-            " results of the 4 frames before are in {out}; go on with --resume {out})",
+            " results of the 4 frames before are in {out}; resume with --resume {out})",
             saved_poses=4,
         ),
         lambda place: without_root_rights(),

@@ -72,8 +72,8 @@ CASES = [
         "people in the whole image",
         masks(lambda i: ids(1, 1.0)),
         Fails(
-            "seq: the camera was found in none of the 8 frames, people and what else may move cover them;"
-            " see figures/masks.png, and try --segmenter none (the results are in {out})",
+            "seq: the camera was not found in any of the 8 frames, masked objects cover the images; see"
+            " figures/masks.png, and try --segmenter none (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -82,7 +82,7 @@ CASES = [
         masks(lambda i: ids(1), STAMPS[::2]),
         Fails(
             "{seq}/ids: has no id image for frame 1 at 1305031102.100000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 1 frames before are in {out}; go on with --resume {out})",
+            " belongs to this sequence (the results of the 1 frames before are in {out}; resume with --resume {out})",
             saved_poses=1,
         ),
     ),
@@ -91,7 +91,7 @@ CASES = [
         masks(lambda i: ids(1), ["0", "1", "2"]),
         Fails(
             "{seq}/ids: has no id image for frame 3 at 1305031102.300000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 3 frames before are in {out}; go on with --resume {out})",
+            " belongs to this sequence (the results of the 3 frames before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),
@@ -127,7 +127,7 @@ CASES = [
         masks(lambda i: ids(1)[: 60 if i == 3 else None]),
         Fails(
             "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again (the results of"
-            " the 3 frames before are in {out}; go on with --resume {out})",
+            " the 3 frames before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),
@@ -136,7 +136,7 @@ CASES = [
         masks(lambda i: b"masks" if i == 3 else ids(1)),
         Fails(
             "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again (the results of"
-            " the 3 frames before are in {out}; go on with --resume {out})",
+            " the 3 frames before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),

@@ -172,7 +172,7 @@ CASES = [
         write(GROUND_TRUTH, bytes(range(256))),
         Fails(
             "{seq}/groundtruth.txt: is not a UTF-8 text file; convert it to UTF-8 (a trajectory has lines of"
-            " timestamp tx ty tz qx qy qz qw (the results are in {out}))",
+            " timestamp tx ty tz qx qy qz qw) (the results are in {out})",
             saved_poses=8,
         ),
     ),

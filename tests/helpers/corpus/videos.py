@@ -55,7 +55,7 @@ CASES = [
         change_bytes("colour.mkv", first_half),
         Fails(
             "{root}/take/colour.mkv: is truncated at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
-            " before are in {out}; go on with --resume {out})",
+            " before are in {out}; resume with --resume {out})",
             saved_poses=3,
         ),
     ),

@@ -42,8 +42,8 @@ CASES = [
         "all black",
         every(RGB, lambda i: plain(0)),
         Fails(
-            "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
-            " it again, with light and an open lens (the results are in {out})",
+            "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
+            " again, with light and an open lens (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -51,8 +51,8 @@ CASES = [
         "all white",
         every(RGB, lambda i: plain(255)),
         Fails(
-            "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
-            " it again, with light and an open lens (the results are in {out})",
+            "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
+            " again, with light and an open lens (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -60,8 +60,8 @@ CASES = [
         "no depth",
         every(DEPTH, lambda i: png(depth(0.0))),
         Fails(
-            "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
-            " depth images again (the results are in {out})",
+            "seq: the camera was not found in any of the 8 frames, the depth images are empty; record or"
+            " export them again (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -69,8 +69,8 @@ CASES = [
         "saturated depth",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 65535, np.uint16))),
         Fails(
-            "seq: the camera was found in none of the 8 frames, they have no depth; record or export the"
-            " depth images again (the results are in {out})",
+            "seq: the camera was not found in any of the 8 frames, the depth images are empty; record or"
+            " export them again (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -78,8 +78,8 @@ CASES = [
         "black without depth",
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
         Fails(
-            "seq: the camera was found in none of the 8 frames, their colour is the same all over; record"
-            " it again, with light and an open lens (the results are in {out})",
+            "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
+            " again, with light and an open lens (the results are in {out})",
             saved_poses=8,
         ),
     ),
