@@ -84,7 +84,7 @@ def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
         V3DError: If an input is not valid, or the run ended early; its results so far are written.
     """
     if request.load_map is None and not request.config.mapping.enabled:
-        raise ConfigError("mapping.enabled=false needs a map to localise in; give one with --load-map")
+        raise ConfigError("mapping.enabled=false: there is no map to localise in; give one with --load-map")
     _run(request, out, None, display)
 
 
@@ -194,7 +194,8 @@ def _print_summary(
         raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
         raise InputError(
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; its results are in {folder}"
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; give a map of the same place, or run"
+            f" without --load-map (the results are in {folder})"
         )
     if (problem := diagnose(pipeline, evaluation)) is not None:
         raise InputError(f"{problem} (the results are in {folder})")

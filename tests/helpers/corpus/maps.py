@@ -88,7 +88,7 @@ CASES = [
     Case(
         "--localise without a map",
         add_options("--localise"),
-        Fails("mapping.enabled=false: there is no map to find the camera in; give one with --load-map"),
+        Fails("mapping.enabled=false: there is no map to localise in; give one with --load-map"),
     ),
     Case(
         "a missing file",
@@ -140,7 +140,11 @@ CASES = [
     Case(
         "a map of another room",
         all_of(load_map(), show_another_room),
-        Fails("{seq}/room.map: no frame of {seq} shows a place of this map; its results are in {out}", saved_poses=8),
+        Fails(
+            "{seq}/room.map: no frame of {seq} was localised in this map; give a map of the same place, or run without"
+            " --load-map (the results are in {out})",
+            saved_poses=8,
+        ),
     ),
     Case(
         "a map saved to a folder",

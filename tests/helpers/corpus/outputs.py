@@ -1,4 +1,4 @@
-"""Where results are written, and what may happen there."""
+"""Invalid folders of results, and failures during a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from v3d_torch.datasets.tum import TUMSequence
 
 @contextmanager
 def no_file_larger_than(size: int) -> Iterator[None]:
-    """What a disk does that is nearly full."""
+    """Limit the size of files, which fails like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -29,13 +29,13 @@ def no_file_larger_than(size: int) -> Iterator[None]:
 
 
 @contextmanager
-def at_frame(index: int, happens: Callable[[], object]) -> Iterator[None]:
-    """Something happens just before a frame is read."""
+def at_frame(index: int, event: Callable[[], object]) -> Iterator[None]:
+    """Call a function just before a frame is read."""
     read = TUMSequence.__getitem__
 
     def reading(self: TUMSequence, i: int) -> object:
         if i == index:
-            happens()
+            event()
         return read(self, i)
 
     with patch.object(TUMSequence, "__getitem__", reading):
@@ -44,13 +44,14 @@ def at_frame(index: int, happens: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def full_from_frame(index: int) -> Iterator[None]:
-    """A disk on which there is room until this frame."""
+    """Make the disk full just before a frame is read."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with no_file_larger_than(soft), at_frame(index, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20, hard))):
         yield
 
 
-def broke() -> None:
+def raise_bug() -> None:
+    """Raise an unexpected exception."""
     raise ZeroDivisionError("an error of the program")
 
 
@@ -63,7 +64,9 @@ def out_below_a_file(place: Workspace) -> None:
     place.options += ["--out", str(place.root / "file" / "out")]
 
 
-def closed(path_of: Callable[[Workspace], Path]) -> Damage:
+def make_read_only(path_of: Callable[[Workspace], Path]) -> Damage:
+    """Make a folder that cannot be written."""
+
     def make(place: Workspace) -> None:
         path = path_of(place)
         path.mkdir(parents=True, exist_ok=True)
@@ -73,17 +76,17 @@ def closed(path_of: Callable[[Workspace], Path]) -> Damage:
 
 
 def results_of_an_earlier_run(place: Workspace) -> None:
-    """With masks of other times and a file of the user's own."""
+    """Write results with masks of other timestamps, and a file of the user."""
     (place.out / "masks").mkdir(parents=True)
     for name in ("trajectory.txt", "run.log", "masks/1.000000.png", "notes.txt"):
         (place.out / name).write_text("of an earlier run")
 
 
-def same_as_the_sequence(place: Workspace) -> None:
+def use_sequence_folder(place: Workspace) -> None:
     place.options += ["--out", str(place.folder)]
 
 
-def unreadable(file: str) -> Damage:
+def make_unreadable(file: str) -> Damage:
     def make(place: Workspace) -> None:
         (place.folder / file).chmod(0)
 
@@ -92,87 +95,91 @@ def unreadable(file: str) -> Damage:
 
 SAVE = add_options("--save-masks")
 SERIAL = add_options("--serial")
-"""A frame is read when the one before is done with, so that what happens then happens at the same place each time."""
+"""Each frame is read after the previous one is complete, so that events occur at the same place in every run."""
 
 CASES = [
-    Case("a file", out_is_a_file, Fails("{out}: cannot be made (File exists); choose another folder with --out")),
     Case(
-        "below a file",
+        "file instead of a folder",
+        out_is_a_file,
+        Fails("{out}: cannot be made (File exists); choose another folder with --out"),
+    ),
+    Case(
+        "folder below a file",
         out_below_a_file,
         Fails("{root}/file/out: cannot be made (Not a directory); choose another folder with --out"),
     ),
     Case(
-        "a loop of links",
+        "symlink loop",
         lambda place: place.out.symlink_to(place.out),
         Fails("{out}: cannot be made (File exists); choose another folder with --out"),
     ),
     Case(
-        "a name of 5000 letters",
+        "name with 5000 letters",
         add_options("--out", "{root}/" + 5000 * "x"),
         Fails("{root}/...: cannot be made (File name too long); choose another folder with --out"),
     ),
     Case(
-        "the folder of the sequence",
-        same_as_the_sequence,
-        Fails("{seq}/groundtruth.txt: is there and was left by no run; choose another folder with --out"),
+        "folder of the sequence",
+        use_sequence_folder,
+        Fails("{seq}/groundtruth.txt: exists and was not written by a run; choose another folder with --out"),
     ),
     Case(
-        "a folder with a map of somebody else's",
-        write("../out/map.ply", "of somebody else"),
-        Fails("{out}/map.ply: is there and was left by no run; choose another folder with --out"),
+        "folder with a foreign map",
+        write("../out/map.ply", "of another program"),
+        Fails("{out}/map.ply: exists and was not written by a run; choose another folder with --out"),
     ),
-    Case("a folder with something else", write("../out/thesis.tex", ""), Succeeds()),
+    Case("folder with unrelated files", write("../out/thesis.tex", ""), Succeeds()),
     Case(
-        "masks that are read from where they would be written",
+        "id images in the folder of the saved masks",
         all_of(write("../out/masks/1.png", ""), add_options("--segmenter", "masks", "--masks", "{out}/masks")),
-        Fails("{out}/masks: would be written to while it is read; choose another folder with --out"),
+        Fails("{out}/masks: would be written while it is read; choose another folder with --out"),
     ),
-    Case("an empty folder", lambda place: place.out.mkdir(), Succeeds()),
+    Case("empty folder", lambda place: place.out.mkdir(), Succeeds()),
     Case("results of an earlier run", all_of(results_of_an_earlier_run, SAVE), Succeeds()),
     Case(
-        "a folder that may not be written",
-        closed(lambda place: place.out),
+        "read-only folder",
+        make_read_only(lambda place: place.out),
         Fails("{out}/run.log: cannot be written (Permission denied); choose another folder with --out"),
         lambda place: without_root_rights(),
     ),
     Case(
-        "in a folder that may not be written",
-        all_of(closed(lambda place: place.root / "closed"), add_options("--out", "{root}/closed/out")),
+        "folder in a read-only folder",
+        all_of(make_read_only(lambda place: place.root / "closed"), add_options("--out", "{root}/closed/out")),
         Fails("{root}/closed/out: cannot be made (Permission denied); choose another folder with --out"),
         lambda place: without_root_rights(),
     ),
     Case(
-        "the disk is full from the start",
+        "disk full at the start",
         lambda place: None,
         Fails("{out}/config.yaml: cannot be written (File too large); free the disk or choose another folder"),
         lambda place: no_file_larger_than(0),
     ),
     Case(
-        "the disk becomes full",
+        "disk full during the run",
         lambda place: None,
         Fails("{out}/...: cannot be written (File too large); free the disk or choose another folder", saved_poses=8),
         lambda place: no_file_larger_than(9000),
     ),
     Case(
-        "the disk becomes full while masks are saved",
+        "disk full while masks are saved",
         all_of(SAVE, SERIAL),
         Fails("{out}/trajectory.txt: cannot be written (File too large); free the disk or choose another folder"),
         lambda place: full_from_frame(3),
     ),
     Case(
-        "the folder is removed during the run",
+        "folder removed during the run",
         all_of(SAVE, SERIAL),
         Succeeds(),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.out)),
     ),
     Case(
-        "the folder becomes a file during the run",
+        "folder replaced by a file during the run",
         all_of(SAVE, SERIAL),
         Fails("{out}/trajectory.txt: cannot be written (File exists); free the disk or choose another folder"),
         lambda place: at_frame(4, lambda: (shutil.rmtree(place.out), place.out.write_text(""))),
     ),
     Case(
-        "the sequence is removed during the run",
+        "sequence removed during the run",
         lambda place: None,
         Fails(
             "{seq}/rgb/1305031102.400000.png: is listed but does not exist; copy the whole sequence again (the"
@@ -182,14 +189,14 @@ CASES = [
         lambda place: at_frame(4, lambda: shutil.rmtree(place.folder)),
     ),
     Case(
-        "the program fails at a frame",
+        "bug in the program at a frame",
         lambda place: None,
         Fails(
             "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
             " (the results of the 4 frames before are in {out}; resume with --resume {out})",
             saved_poses=4,
         ),
-        lambda place: at_frame(4, broke),
+        lambda place: at_frame(4, raise_bug),
     ),
     Case(
         "Ctrl-C",
@@ -202,14 +209,14 @@ CASES = [
         lambda place: at_frame(4, lambda: os.kill(os.getpid(), signal.SIGINT)),
     ),
     Case(
-        "a list that may not be read",
-        unreadable("rgb.txt"),
+        "list without read permission",
+        make_unreadable("rgb.txt"),
         Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and that you may read it"),
         lambda place: without_root_rights(),
     ),
     Case(
-        "an image that may not be read",
-        unreadable(f"rgb/{STAMPS[4]}.png"),
+        "image without read permission",
+        make_unreadable(f"rgb/{STAMPS[4]}.png"),
         Fails(
             "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check its permissions (the"
             " results of the 4 frames before are in {out}; resume with --resume {out})",
@@ -218,28 +225,28 @@ CASES = [
         lambda place: without_root_rights(),
     ),
     Case(
-        "a folder of images that may not be read",
-        unreadable("rgb"),
+        "image folder without read permission",
+        make_unreadable("rgb"),
         Fails("{seq}/rgb/1305031102.000000.png: cannot be read (Permission denied); check its name and permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
-        "a sequence that may not be read",
-        unreadable("."),
+        "sequence without read permission",
+        make_unreadable("."),
         Fails("{seq}/metadata.yaml: cannot be read (Permission denied); check its name and permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
-        "a camera that may not be read",
-        unreadable("camera.yaml"),
+        "camera without read permission",
+        make_unreadable("camera.yaml"),
         Fails(
             "{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and that you may read it"
         ),
         lambda place: without_root_rights(),
     ),
     Case(
-        "a ground truth that may not be read",
-        unreadable("groundtruth.txt"),
+        "ground truth without read permission",
+        make_unreadable("groundtruth.txt"),
         Fails(
             "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and that you"
             " may read it (the results are in {out})",
@@ -248,7 +255,7 @@ CASES = [
         lambda place: without_root_rights(),
     ),
     Case(
-        "true masks of another size",
+        "damaged true mask",
         write(f"masks/{STAMPS[3]}.png", b"\x89PNG\r\n\x1a\n"),
         Fails(
             "{seq}/masks/1305031102.300000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"

@@ -244,14 +244,14 @@ CASES = [
     Case(
         "damaged JPEG",
         bag("mcap", replace_messages(RGB, lambda to, at: to.compressed(at, "jpeg", b"\xff\xd8\xff" + NOISE))),
-        Fails("{root}/take/take.mcap: /camera/color/image_raw: is truncated or broken; copy or download it again"),
+        Fails("{root}/take/take.mcap: /camera/color/image_raw: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "truncated compressed depth",
         bag("mcap", replace_messages(DEPTH, lambda to, at: to.compressed(at, "16UC1; compressedDepth", b"1234"))),
         Fails(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is no image, or none of PNG,"
-            " JPEG or TIFF; copy or export it again"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: is not a PNG, JPEG or TIFF image;"
+            " copy or export it again"
         ),
     ),
     Case(
@@ -289,6 +289,6 @@ CASES = [
     Case(
         "--fps for a bag",
         all_of(bag("mcap"), add_options("--fps", "30")),
-        Fails("{root}/take/take.mcap: is a bag, --fps means nothing to it; leave it out"),
+        Fails("{root}/take/take.mcap: is a bag, which does not support --fps; remove this option"),
     ),
 ]

@@ -15,19 +15,19 @@ MASKS = ("--segmenter", "masks", "--masks", "{seq}/ids")
 
 
 def masks(make_image: Callable[[int], bytes], names: list[str] = STAMPS) -> Damage:
-    """A folder of id images, made from their indices, and the options to use it."""
+    """Write a folder of id images, made from their indices, and use it."""
     return all_of(*(write(f"ids/{name}.png", make_image(i)) for i, name in enumerate(names)), replace_options(*MASKS))
 
 
 def ids(value: int, width_fraction: float = 0.25, dtype: type = np.uint8) -> bytes:
-    """An id image with one instance on the left, as PNG."""
+    """Id image with one instance on the left, as PNG."""
     image = np.zeros((HEIGHT, WIDTH), dtype)
     image[:, : int(width_fraction * WIDTH)] = value
     return png(image)
 
 
 def network(file: str, inputs: list[int | str]) -> Damage:
-    """An ONNX network that returns its input, and the option to use it."""
+    """Write an ONNX network that returns its input, and use it."""
     value = helper.make_tensor_value_info
     graph = helper.make_graph(
         [helper.make_node("Identity", ["images"], ["output0"])],
@@ -40,7 +40,7 @@ def network(file: str, inputs: list[int | str]) -> Damage:
 
 
 def head(value: float, cells: int | None = None) -> Damage:
-    """An ONNX network with constant outputs of the shapes of a segmentation head, and the option to use it."""
+    """Write an ONNX network with constant outputs in the shapes of a segmentation head, and use it."""
     height, width = 64, 96
     count = cells or sum(height * width // stride**2 for stride in (8, 16, 32))
     shapes = {"output0": [1, 116, count], "output1": [1, 32, height // 4, width // 4]}

@@ -96,8 +96,8 @@ CASES = [
         "depth of another size",
         replace_video("depth.mkv", depth()[::2, ::2].copy()),
         Fails(
-            "{root}/take/depth.mkv: has 40x30 pixels, its colour image 80x60; export the depth that is"
-            " registered to colour, pixel by pixel"
+            "{root}/take/depth.mkv: has 40x30 pixels, but its colour image has 80x60; export depth that is"
+            " registered to the colour image"
         ),
     ),
     Case(
@@ -124,11 +124,11 @@ CASES = [
     Case(
         "--fps nan",
         all_of(videos, add_options("--fps", "nan")),
-        Fails("--fps nan: give frames a second, between 0.01 and 10000"),
+        Fails("--fps nan: is out of range; pass between 0.01 and 10000 Hz"),
     ),
     Case(
         "--fps inf",
         all_of(videos, add_options("--fps", "inf")),
-        Fails("--fps inf: give frames a second, between 0.01 and 10000"),
+        Fails("--fps inf: is out of range; pass between 0.01 and 10000 Hz"),
     ),
 ]
