@@ -1,8 +1,9 @@
-"""The system as a researcher calls it: one line to make it, one to take in a frame, stages that can be replaced."""
+"""V3DSLAM as a library: one call to make it, one call per frame, stages that can be replaced."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_seque
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.types import TrackingStatus
@@ -26,27 +26,34 @@ def demo() -> RGBDSequence:
     return load_sequence("demo")
 
 
-def test_frames_bring_their_camera_and_poses_come_back(demo: RGBDSequence) -> None:
-    slam = V3DSLAM(config=NO_NETWORK)
+def test_call_returns_pose_status_and_objects_of_the_frame(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(demo.camera, config=NO_NETWORK)
     for index in range(3):
-        pose = slam(demo[index])
-        assert isinstance(pose, FrameResult)
-        assert pose.stamp == float(demo.stamps[index])
-        assert pose.T_wc.shape == (4, 4) and pose.T_wc.dtype == torch.float64
-        assert torch.equal(pose.T_wc, invert(slam.poses.T_cw))
-        assert pose.status is TrackingStatus.TRACKED
-        assert pose.static_mask.shape == (480, 640) and pose.objects == []
+        result = slam(demo[index])
+        assert isinstance(result, FrameResult)
+        assert result.stamp == float(demo.stamps[index])
+        assert result.T_wc.shape == (4, 4) and result.T_wc.dtype == torch.float64
+        assert torch.equal(result.T_wc, invert(slam.poses.T_cw))
+        assert result.status is TrackingStatus.TRACKED
+        assert result.static_mask.shape == (480, 640) and result.objects == []
 
 
-def test_a_camera_given_or_carried_gives_the_same(demo: RGBDSequence) -> None:
-    given = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
-    carried = V3DSLAM(config=NO_NETWORK)
+def test_frames_with_and_without_a_camera_give_the_same_poses(demo: RGBDSequence) -> None:
+    first, second = (V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK) for _ in range(2))
     for index in range(3):
-        assert torch.equal(given(demo[index]).T_wc, carried(demo[index]).T_wc)
+        with_camera = replace(demo[index], camera=demo.camera)
+        without_camera = replace(demo[index], camera=None)
+        assert torch.equal(first(with_camera).T_wc, second(without_camera).T_wc)
 
 
-def test_arrays_as_opencv_gives_them_give_the_same(demo: RGBDSequence) -> None:
-    stored, from_arrays = V3DSLAM(config=NO_NETWORK), V3DSLAM(config=NO_NETWORK)
+def test_segmenter_of_the_config_equals_the_same_segmenter_as_an_argument(demo: RGBDSequence) -> None:
+    configured, passed = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
+    for index in range(3):
+        assert torch.equal(configured(demo[index]).T_wc, passed(demo[index]).T_wc)
+
+
+def test_frames_from_opencv_arrays_give_the_same_poses(demo: RGBDSequence) -> None:
+    stored, from_arrays = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, config=NO_NETWORK)
     for index in range(3):
         frame = demo[index]
         image = frame.image.permute(1, 2, 0).numpy()
@@ -57,7 +64,7 @@ def test_arrays_as_opencv_gives_them_give_the_same(demo: RGBDSequence) -> None:
         assert torch.equal(stored(frame).T_wc, from_arrays(made).T_wc)
 
 
-def test_depth_in_the_cameras_units_becomes_metres(demo: RGBDSequence) -> None:
+def test_integer_depth_in_camera_units_becomes_metres(demo: RGBDSequence) -> None:
     image = torch.zeros(480, 640, 3, dtype=torch.uint8)
     units = np.full((480, 640), 5000, np.uint16)
     assert (
@@ -78,20 +85,20 @@ def test_depth_in_the_cameras_units_becomes_metres(demo: RGBDSequence) -> None:
     ],
     ids=["grey", "channels first", "float colour", "depth with a channel", "depth of another size"],
 )
-def test_arrays_of_another_shape_or_type_are_refused(image: np.ndarray, depth: np.ndarray) -> None:
+def test_arrays_of_wrong_shape_or_type_are_rejected(image: np.ndarray, depth: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"frame 7: .*; give "):
         RGBDFrame.from_arrays(7, 0.0, image, depth)
 
 
-def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
+def test_images_of_other_libraries_become_the_same_frame(demo: RGBDSequence) -> None:
     frame = demo[0]
     rgb, metres = frame.image.permute(1, 2, 0).numpy(), frame.depth[0]
     bgr = np.ascontiguousarray(rgb[..., ::-1])
     for image, depth in (
-        (bgr[..., ::-1], metres),  # OpenCV's, the usual way round
+        (bgr[..., ::-1], metres),  # an OpenCV image, reversed to RGB
         (rgb[:, ::-1][:, ::-1], metres.numpy()[:, ::-1][:, ::-1]),
         (Image.fromarray(rgb), Image.fromarray(metres.numpy())),
-        (torch.from_numpy(rgb), metres.clone().requires_grad_()),  # a network's
+        (torch.from_numpy(rgb), metres.clone().requires_grad_()),  # output of a network
     ):
         made = RGBDFrame.from_arrays(0, frame.stamp, image, depth, demo.camera)
         assert torch.equal(made.image, frame.image) and torch.equal(made.depth, frame.depth)
@@ -108,7 +115,7 @@ def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
         ({"depth": np.ones((480, 640), complex)}, "the depth image is complex128; give metres"),
         ({"stamp": math.nan}, "the stamp is nan; give seconds"),
         ({"stamp": None}, "the stamp is None; give seconds"),
-        ({"delay": math.inf}, "the delay is inf; give seconds"),
+        ({"depth_delay": math.inf}, "the delay is inf; give seconds"),
         ({"camera": np.eye(3)}, "the camera is a ndarray; give a PinholeCamera"),
         (
             {"camera": PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240)},
@@ -116,50 +123,58 @@ def test_images_as_other_libraries_give_them(demo: RGBDSequence) -> None:
         ),
     ],
 )
-def test_what_is_no_frame_is_said(change: dict[str, object], message: str) -> None:
-    given = {"stamp": 0.0, "image": np.zeros((480, 640, 3), np.uint8), "depth": np.ones((480, 640))} | change
+def test_invalid_arguments_of_from_arrays_are_named(change: dict[str, object], message: str) -> None:
+    arguments = {"stamp": 0.0, "image": np.zeros((480, 640, 3), np.uint8), "depth": np.ones((480, 640))} | change
     with pytest.raises(InputError, match=f"^frame 7: {message}"):
-        RGBDFrame.from_arrays(7, **given)
+        RGBDFrame.from_arrays(7, **arguments)
 
 
-def test_without_any_camera_it_says_so(demo: RGBDSequence) -> None:
-    frame = demo[0]
-    with pytest.raises(ConfigError, match="camera"):
-        V3DSLAM(config=NO_NETWORK)(RGBDFrame(0, 0.0, frame.image, frame.depth))
-
-
-@pytest.mark.parametrize("known", [True, False], ids=["camera given", "camera in the frames"])
-def test_a_stage_can_be_replaced_at_any_time(demo: RGBDSequence, known: bool) -> None:
-    slam = V3DSLAM(demo.camera if known else None, NoSegmentation(), NO_NETWORK)
-    seen = []
-    smooth = slam.smooth_depth if known else DepthSmoother(5, 1.0, 0.05)
-    slam.smooth_depth = lambda depth: seen.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
+def test_frames_of_another_camera_are_rejected(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(demo.camera, config=NO_NETWORK)
     slam(demo[0])
-    assert seen == [(1, 1, 480, 640)]
+    with pytest.raises(InputError, match=r"^frame 1: its camera differs from that of the V3DSLAM; make one V3DSLAM"):
+        slam(replace(demo[1], camera=replace(demo.camera, fx=demo.camera.fx + 1)))
+    assert slam(demo[1]).status is TrackingStatus.TRACKED
 
 
-def test_arrays_instead_of_a_frame_are_refused(demo: RGBDSequence) -> None:
-    with pytest.raises(InputError, match=r"this is a ndarray; .* RGBDFrame\.of"):
+def test_missing_camera_is_named() -> None:
+    with pytest.raises(ConfigError, match="needs a PinholeCamera, got a NoneType; give one, such as sequence.camera"):
+        V3DSLAM(None, config=NO_NETWORK)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("frames", [0, 1], ids=["before the first frame", "between two frames"])
+def test_replaced_stage_is_called(demo: RGBDSequence, frames: int) -> None:
+    slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
+    for index in range(frames):
+        slam(demo[index])
+    shapes, smooth = [], slam.smooth_depth
+    slam.smooth_depth = lambda depth: shapes.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
+    slam(demo[frames])
+    assert shapes == [(1, 1, 480, 640)]
+
+
+def test_array_instead_of_a_frame_is_rejected(demo: RGBDSequence) -> None:
+    with pytest.raises(InputError, match=r"expected an RGBDFrame, got a ndarray; RGBDFrame\.from_arrays makes frames"):
         V3DSLAM(demo.camera, config=NO_NETWORK)(np.zeros((480, 640, 3), np.uint8))
 
 
-def test_a_map_that_drops_what_nobody_needs_tracks_the_same_to_the_bit(
+def test_compaction_of_the_map_leaves_poses_and_landmarks_identical(
     demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Landmarks that are dead and that nobody refers to go; the others get other ids, and nothing else changes."""
+    """Compaction removes unused landmarks and renumbers the others; nothing else changes."""
     runs = {}
-    for name, worth in (("never", math.inf), ("with every keyframe", 0)):
-        monkeypatch.setattr("v3d_torch.mapping.landmark_ids._MAX_LANDMARKS_PER_OBSERVATION", worth)
+    for name, max_ratio in (("never", math.inf), ("with every keyframe", 0)):
+        monkeypatch.setattr("v3d_torch.mapping.landmark_ids._MAX_LANDMARKS_PER_OBSERVATION", max_ratio)
         slam = V3DSLAM(demo.camera, config=load_config(None, ("segmentation.source=none",)))
         for index in range(60):
             slam(demo[index])
         slam.flush()
         runs[name] = slam
-    packed, whole = runs["with every keyframe"].mapper.map, runs["never"].mapper.map
-    assert len(packed.keyframes) == len(whole.keyframes) > 3
-    assert len(packed.landmarks) < 0.9 * len(whole.landmarks)
+    compacted, full = runs["with every keyframe"].map, runs["never"].map
+    assert len(compacted.keyframes) == len(full.keyframes) > 3
+    assert len(compacted.landmarks) < 0.9 * len(full.landmarks)
     assert torch.equal(*(slam.poses.trajectory().T_wc for slam in runs.values()))
-    for name, column in packed.landmarks.columns.items():
-        assert torch.equal(column[packed.landmarks["active"]], whole.landmarks[name][whole.landmarks["active"]])
-    places = [known.landmarks["point"][known.observations["landmark"]] for known in (packed, whole)]
-    assert torch.equal(*places)
+    for name, column in compacted.landmarks.columns.items():
+        assert torch.equal(column[compacted.landmarks["active"]], full.landmarks[name][full.landmarks["active"]])
+    observed_points = [each.landmarks["point"][each.observations["landmark"]] for each in (compacted, full)]
+    assert torch.equal(*observed_points)

@@ -1,4 +1,4 @@
-"""The next frame is looked at while one is tracked: it makes no difference to what comes out."""
+"""Prefetching preprocesses the next frames while one is tracked, and does not change the results."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def demo() -> RGBDSequence:
     return load_sequence("demo")
 
 
-class Expecting:
-    """A segmenter that sees nothing, and notes where it was told that each frame is and in which thread."""
+class RecordingSegmenter:
+    """Segmenter without instances that records the predicted pose and the thread of each call."""
 
     def __init__(self) -> None:
         self.poses: list[torch.Tensor | None] = []
@@ -45,37 +45,37 @@ class Expecting:
         return NoSegmentation()(frame)
 
 
-def run(demo: RGBDSequence, *, ahead: bool) -> tuple[V3DSLAM, Expecting]:
-    seen = Expecting()
-    slam = V3DSLAM(demo.camera, seen, NO_NETWORK)
-    with closing(FramePrefetcher((demo[index] for index in range(FRAMES)), slam, ahead=ahead)) as percepts:
-        for percept in percepts:
-            slam.track(percept)
-    return slam, seen
+def run(demo: RGBDSequence, *, ahead: bool) -> tuple[V3DSLAM, RecordingSegmenter]:
+    segmenter = RecordingSegmenter()
+    slam = V3DSLAM(demo.camera, segmenter, NO_NETWORK)
+    with closing(FramePrefetcher((demo[index] for index in range(FRAMES)), slam, ahead=ahead)) as prefetcher:
+        for preprocessed in prefetcher:
+            slam.track(preprocessed)
+    return slam, segmenter
 
 
-def test_ahead_one_by_one_and_called_by_hand_are_the_same_to_the_bit(demo: RGBDSequence) -> None:
-    by_hand = Expecting()
-    called = V3DSLAM(demo.camera, by_hand, NO_NETWORK)
+def test_prefetched_frames_give_the_same_results_as_calls(demo: RGBDSequence) -> None:
+    expected = RecordingSegmenter()
+    called = V3DSLAM(demo.camera, expected, NO_NETWORK)
     for index in range(FRAMES):
         called(demo[index])
     for ahead in (False, True):
-        slam, seen = run(demo, ahead=ahead)
+        slam, segmenter = run(demo, ahead=ahead)
         assert torch.equal(slam.poses.trajectory().T_wc, called.poses.trajectory().T_wc)
-        for told, expected in zip(seen.poses, by_hand.poses, strict=True):
-            assert told is not None and expected is not None and torch.equal(told, expected)
+        for T_cw, expected_T_cw in zip(segmenter.poses, expected.poses, strict=True):
+            assert T_cw is not None and expected_T_cw is not None and torch.equal(T_cw, expected_T_cw)
 
 
-def test_only_ahead_is_another_thread_at_work(demo: RGBDSequence) -> None:
-    here = threading.current_thread().name
-    assert run(demo, ahead=False)[1].threads == {here}
+def test_thread_is_used_only_ahead(demo: RGBDSequence) -> None:
+    main_thread = threading.current_thread().name
+    assert run(demo, ahead=False)[1].threads == {main_thread}
     others = run(demo, ahead=True)[1].threads
-    assert len(others) == 1 and here not in others
+    assert len(others) == 1 and main_thread not in others
     assert not others & {thread.name for thread in threading.enumerate()}
 
 
 @pytest.mark.parametrize("ahead", [False, True])
-def test_so_many_frames_are_read_ahead_and_no_more(demo: RGBDSequence, ahead: bool) -> None:
+def test_number_of_frames_read_ahead_is_limited(demo: RGBDSequence, ahead: bool) -> None:
     read: list[int] = []
 
     def frames() -> Iterator[RGBDFrame]:
@@ -84,52 +84,52 @@ def test_so_many_frames_are_read_ahead_and_no_more(demo: RGBDSequence, ahead: bo
             yield demo[index]
 
     slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
-    with closing(FramePrefetcher(frames(), slam, ahead=ahead)) as percepts:
-        for taken, percept in enumerate(percepts):
-            slam.track(percept)
-            assert percept.frame.index == taken
-            assert len(read) <= taken + 1 + ahead * PREFETCHED_FRAMES
-            assert set(percept.seconds) == {"read", "segmentation", "depth", "features"}
+    with closing(FramePrefetcher(frames(), slam, ahead=ahead)) as prefetcher:
+        for tracked, preprocessed in enumerate(prefetcher):
+            slam.track(preprocessed)
+            assert preprocessed.frame.index == tracked
+            assert len(read) <= tracked + 1 + ahead * PREFETCHED_FRAMES
+            assert set(preprocessed.seconds) == {"read", "segmentation", "depth", "features"}
     assert read == list(range(FRAMES))
 
 
 @pytest.mark.parametrize("ahead", [False, True])
-def test_a_broken_frame_is_told_of_after_those_before_it(demo: RGBDSequence, ahead: bool) -> None:
+def test_error_of_a_frame_is_raised_after_the_frames_before_it(demo: RGBDSequence, ahead: bool) -> None:
     def frames() -> Iterator[RGBDFrame]:
         yield from (demo[0], demo[1])
         raise InputError("depth/2.png: is truncated")
 
     slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
-    given: list[PreprocessedFrame] = []
+    tracked: list[PreprocessedFrame] = []
     with (
         pytest.raises(InputError, match="truncated"),
-        closing(FramePrefetcher(frames(), slam, ahead=ahead)) as percepts,
+        closing(FramePrefetcher(frames(), slam, ahead=ahead)) as prefetcher,
     ):
-        for percept in percepts:
-            slam.track(percept)
-            given.append(percept)
-    assert [percept.frame.index for percept in given] == [0, 1]
+        for preprocessed in prefetcher:
+            slam.track(preprocessed)
+            tracked.append(preprocessed)
+    assert [preprocessed.frame.index for preprocessed in tracked] == [0, 1]
 
 
-def test_who_stops_early_leaves_no_thread_behind(demo: RGBDSequence) -> None:
+def test_closing_early_stops_the_thread(demo: RGBDSequence) -> None:
     slam = V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
     before = set(threading.enumerate())
-    percepts = FramePrefetcher((demo[index] for index in range(FRAMES)), slam, ahead=True)
-    next(iter(percepts))
+    prefetcher = FramePrefetcher((demo[index] for index in range(FRAMES)), slam, ahead=True)
+    next(iter(prefetcher))
     (thread,) = set(threading.enumerate()) - before
-    percepts.close()
+    prefetcher.close()
     assert not thread.is_alive()
 
 
-def test_a_pipeline_does_as_its_configuration_says(demo: RGBDSequence) -> None:
+def test_pipeline_prefetches_as_configured(demo: RGBDSequence) -> None:
     class Short:
         camera, name, groundtruth = demo.camera, "short", None
 
         def __iter__(self) -> Iterator[RGBDFrame]:
             return (demo[index] for index in range(3))
 
-    for lookahead in (False, True):
-        seen = Expecting()
-        config = NO_NETWORK.model_copy(update={"lookahead": lookahead})
-        Pipeline(Short(), V3DSLAM(demo.camera, seen, config))()
-        assert (threading.current_thread().name in seen.threads) is not lookahead
+    for prefetch in (False, True):
+        segmenter = RecordingSegmenter()
+        config = NO_NETWORK.model_copy(update={"prefetch": prefetch})
+        Pipeline(Short(), V3DSLAM(demo.camera, segmenter, config))()
+        assert (threading.current_thread().name in segmenter.threads) is not prefetch

@@ -1,4 +1,4 @@
-"""A second process looks at frames: the same bytes, and nothing is lost when it cannot."""
+"""Preprocessing in a second process: identical results, and no frame is lost if the process fails."""
 
 from __future__ import annotations
 
@@ -37,172 +37,175 @@ def demo() -> StoredSequence:
     return sequence
 
 
-def same(one: object, other: object) -> bool:
-    """Whether two values, of tensors all the way down, are the same to the bit."""
-    if isinstance(one, Tensor):
-        return (
-            isinstance(other, Tensor) and one.dtype == other.dtype and torch.equal(one.nan_to_num(), other.nan_to_num())
-        )
-    if hasattr(one, "__dataclass_fields__"):
-        names = [field.name for field in fields(one)]  # type: ignore[arg-type]
-        return all(same(getattr(one, name), getattr(other, name)) for name in names)
-    if isinstance(one, dict):
-        return isinstance(other, dict) and one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
-    if isinstance(one, tuple):
-        return isinstance(other, tuple) and all(map(same, one, other))
-    return one == other
+def are_identical(a: object, b: object) -> bool:
+    """Compare two nested values to the bit."""
+    if isinstance(a, Tensor):
+        return isinstance(b, Tensor) and a.dtype == b.dtype and torch.equal(a.nan_to_num(), b.nan_to_num())
+    if hasattr(a, "__dataclass_fields__"):
+        names = [field.name for field in fields(a)]  # type: ignore[arg-type]
+        return all(are_identical(getattr(a, name), getattr(b, name)) for name in names)
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(are_identical(a[key], b[key]) for key in a)
+    if isinstance(a, tuple):
+        return isinstance(b, tuple) and all(map(are_identical, a, b))
+    return a == b
 
 
-def without_times(percept: PreprocessedFrame) -> PreprocessedFrame:
-    return replace(percept, seconds={})
+def without_times(preprocessed: PreprocessedFrame) -> PreprocessedFrame:
+    return replace(preprocessed, seconds={})
 
 
-def test_it_sees_what_is_seen_here_to_the_bit(demo: StoredSequence) -> None:
-    """With the network, upright, and what that remembers of the frames before."""
-    here, slam = V3DSLAM(demo.camera, config=SMALL), V3DSLAM(demo.camera, config=SMALL)
-    outlook = here.outlook()
-    with closing(PreprocessWorker(slam, demo)) as second:
-        second.submit(0, outlook)
+def test_worker_gives_the_same_results_as_this_process(demo: StoredSequence) -> None:
+    """With the network and the state of its upright segmentation."""
+    local, slam = V3DSLAM(demo.camera, config=SMALL), V3DSLAM(demo.camera, config=SMALL)
+    prediction = local.predictions[0]
+    with closing(PreprocessWorker(slam, demo)) as worker:
+        worker.submit(0, prediction)
         for index in range(3):
-            second.submit(index + 1, outlook)
-            expected = here.preprocess(demo[index], outlook)
-            seen = second.result()
-            assert seen is not None and same(without_times(seen), without_times(expected))
-            assert same(segmenter_state_of(slam.segment), expected.segmenter_state)
-            assert set(seen.seconds) == {"read", "segmentation", "depth", "features"}
-            assert seen.frame.camera is demo.camera
+            worker.submit(index + 1, prediction)
+            expected = local.preprocess(demo[index], prediction)
+            preprocessed = worker.result()
+            assert preprocessed is not None
+            assert are_identical(without_times(preprocessed), without_times(expected))
+            assert are_identical(segmenter_state_of(slam.segment), expected.segmenter_state)
+            assert set(preprocessed.seconds) == {"read", "segmentation", "depth", "features"}
+            assert preprocessed.frame.camera is demo.camera
 
 
-def test_numbers_are_checked_there_too(demo: StoredSequence) -> None:
+def test_worker_of_a_checked_system_gives_the_same_results(demo: StoredSequence) -> None:
     slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
-    with closing(PreprocessWorker(slam, demo)) as second:
-        second.submit(0, slam.outlook())
-        seen = second.result()
-    assert seen is not None and same(without_times(seen), without_times(slam.preprocess(demo[0], slam.outlook())))
+    with closing(PreprocessWorker(slam, demo)) as worker:
+        worker.submit(0, slam.predictions[0])
+        preprocessed = worker.result()
+    expected = slam.preprocess(demo[0], slam.predictions[0])
+    assert preprocessed is not None and are_identical(without_times(preprocessed), without_times(expected))
 
 
 @pytest.fixture
-def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second process is begun for any number of frames."""
-    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_WORTH", 1)
-    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_cores", lambda: 2)
+def worker_for_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start a second process for any number of frames."""
+    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_MIN_FRAMES_FOR_WORKER", 1)
+    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_available_cores", lambda: 2)
 
 
-def tracked(
+def track_all(
     config: Config, frames: Iterator[RGBDFrame], sequence: StoredSequence
 ) -> tuple[V3DSLAM, list[PreprocessedFrame]]:
-    slam, given = V3DSLAM(sequence.camera, config=config), []
-    with closing(FramePrefetcher(frames, slam, ahead=True)) as percepts:
-        for percept in percepts:
-            slam.track(percept)
-            given.append(percept)
-    return slam, given
+    slam, tracked = V3DSLAM(sequence.camera, config=config), []
+    with closing(FramePrefetcher(frames, slam, ahead=True)) as prefetcher:
+        for preprocessed in prefetcher:
+            slam.track(preprocessed)
+            tracked.append(preprocessed)
+    return slam, tracked
 
 
-@pytest.mark.usefixtures("at_once")
-def test_the_trajectory_is_that_without(demo: StoredSequence) -> None:
+@pytest.mark.usefixtures("worker_for_any_length")
+def test_trajectory_with_a_worker_equals_that_without(demo: StoredSequence) -> None:
     class Short(FrameIterator):
         @property
-        def left(self) -> int:
+        def remaining(self) -> int:
             return max(6 - self.index, 0)
 
-    slam, given = tracked(SMALL, Short(demo, 0), demo)
-    plain, _ = tracked(SMALL, (demo[index] for index in range(6)), demo)
-    assert [percept.frame.index for percept in given] == list(range(6))
+    slam, tracked = track_all(SMALL, Short(demo, 0), demo)
+    plain, _ = track_all(SMALL, (demo[index] for index in range(6)), demo)
+    assert [preprocessed.frame.index for preprocessed in tracked] == list(range(6))
     assert torch.equal(slam.poses.trajectory().T_wc, plain.poses.trajectory().T_wc)
-    assert same(segmenter_state_of(slam.segment), segmenter_state_of(plain.segment))
+    assert are_identical(segmenter_state_of(slam.segment), segmenter_state_of(plain.segment))
 
 
-@pytest.mark.usefixtures("at_once")
-def test_when_it_dies_the_run_goes_on_without(demo: StoredSequence) -> None:
-    slam, given = V3DSLAM(demo.camera, config=NO_NETWORK), []
-    with closing(FramePrefetcher(iter(demo), slam, ahead=True)) as percepts:
-        second = percepts._second
-        assert second is not None and second._process is not None
-        for percept in percepts:
-            slam.track(percept)
-            given.append(percept.frame.index)
-            if len(given) == 3:
-                assert second._process.poll() is None and second.is_alive
-                second._process.kill()
-            if len(given) == 7:
-                assert not second.is_alive
+@pytest.mark.usefixtures("worker_for_any_length")
+def test_run_continues_after_the_worker_is_killed(demo: StoredSequence) -> None:
+    slam, tracked = V3DSLAM(demo.camera, config=NO_NETWORK), []
+    with closing(FramePrefetcher(iter(demo), slam, ahead=True)) as prefetcher:
+        worker = prefetcher._worker
+        assert worker is not None and worker._process is not None
+        for preprocessed in prefetcher:
+            slam.track(preprocessed)
+            tracked.append(preprocessed.frame.index)
+            if len(tracked) == 3:
+                assert worker._process.poll() is None and worker.is_alive
+                worker._process.kill()
+            if len(tracked) == 7:
+                assert not worker.is_alive
                 break
-    assert given == list(range(7))
+    assert tracked == list(range(7))
 
 
-def test_what_cannot_be_sent_is_looked_at_here(demo: StoredSequence) -> None:
+@pytest.mark.usefixtures("worker_for_any_length")
+def test_segmenter_that_cannot_be_pickled_runs_in_this_process(demo: StoredSequence) -> None:
     def segment(frame: RGBDFrame) -> Instances:
         return NoSegmentation()(frame)
 
     slam = V3DSLAM(demo.camera, segment, NO_NETWORK)
-    with closing(PreprocessWorker(slam, demo)) as second:
-        assert not second.is_alive
-        second.submit(0, None)
-        assert second.result() is None
-    with closing(FramePrefetcher(iter(demo), slam, ahead=True)) as percepts:
-        assert percepts._second is None and percepts._thread is not None
+    with closing(PreprocessWorker(slam, demo)) as worker:
+        assert not worker.is_alive
+        worker.submit(0, None)
+        assert worker.result() is None
+    with closing(FramePrefetcher(iter(demo), slam, ahead=True)) as prefetcher:
+        assert prefetcher._worker is None and prefetcher._thread is not None
 
 
-@pytest.mark.usefixtures("at_once")
-def test_a_broken_image_is_told_of_by_its_own_error_after_those_before_it(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("worker_for_any_length")
+def test_truncated_image_raises_its_own_error_after_the_frames_before_it(tmp_path: Path) -> None:
     write_base(tmp_path)
     sequence = load_sequence(str(tmp_path))
     assert isinstance(sequence, StoredSequence) and len(sequence) > 3
     broken = sorted((tmp_path / "rgb").iterdir())[3]
     broken.write_bytes(broken.read_bytes()[: broken.stat().st_size // 2])
-    given = []
+    tracked = []
     slam = V3DSLAM(sequence.camera, config=NO_NETWORK)
     with (
         pytest.raises(InputError, match=rf"{broken.name}: is truncated"),
-        closing(FramePrefetcher(iter(sequence), slam, ahead=True)) as percepts,
+        closing(FramePrefetcher(iter(sequence), slam, ahead=True)) as prefetcher,
     ):
-        for percept in percepts:
-            slam.track(percept)
-            given.append(percept.frame.index)
-    assert given == [0, 1, 2]
+        for preprocessed in prefetcher:
+            slam.track(preprocessed)
+            tracked.append(preprocessed.frame.index)
+    assert tracked == [0, 1, 2]
 
 
-def test_its_end_is_waited_for(demo: StoredSequence) -> None:
+def test_close_ends_the_process(demo: StoredSequence) -> None:
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    second = PreprocessWorker(slam, demo)
-    process = second._process
+    worker = PreprocessWorker(slam, demo)
+    process = worker._process
     assert process is not None and process.poll() is None
-    second.close()
+    worker.close()
     assert process.returncode is not None
-    second.submit(0, None)
-    assert second.result() is None
+    worker.submit(0, None)
+    assert worker.result() is None
 
 
 @pytest.mark.parametrize(("cores", "ahead", "frames"), [(1, True, 100), (2, False, 100), (2, True, 3)])
-def test_none_is_begun_that_would_not_pay(
+def test_no_worker_is_started_without_benefit(
     demo: StoredSequence, monkeypatch: pytest.MonkeyPatch, cores: int, ahead: bool, frames: int
 ) -> None:
     class Short(FrameIterator):
         @property
-        def left(self) -> int:
+        def remaining(self) -> int:
             return max(frames - self.index, 0)
 
-    def none(slam: V3DSLAM, sequence: StoredSequence) -> PreprocessWorker:
+    def fail(slam: V3DSLAM, sequence: StoredSequence) -> PreprocessWorker:
         raise AssertionError
 
-    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_WORTH", 4)
-    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_cores", lambda: cores)
-    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "PreprocessWorker", none)
+    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_MIN_FRAMES_FOR_WORKER", 4)
+    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_available_cores", lambda: cores)
+    monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "PreprocessWorker", fail)
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    with closing(FramePrefetcher(Short(demo, 0), slam, ahead=ahead)) as percepts:
-        for percept in islice(percepts, 4):
-            slam.track(percept)
+    with closing(FramePrefetcher(Short(demo, 0), slam, ahead=ahead)) as prefetcher:
+        for preprocessed in islice(prefetcher, 4):
+            slam.track(preprocessed)
 
 
-def test_without_memory_to_share_and_without_processes(demo: StoredSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_without_shared_memory_works_and_without_process_fails(
+    demo: StoredSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    monkeypatch.setattr("v3d_torch.prefetch.preprocess_worker.new_arena", lambda values: None)
-    with closing(PreprocessWorker(slam, demo)) as second:
-        second.submit(1, slam.outlook())
-        assert second.result() is not None
+    monkeypatch.setattr("v3d_torch.prefetch.preprocess_worker.new_shared_memory", lambda values: None)
+    with closing(PreprocessWorker(slam, demo)) as worker:
+        worker.submit(1, slam.predictions[0])
+        assert worker.result() is not None
     monkeypatch.setattr("v3d_torch.prefetch.preprocess_worker.sys.executable", "/nowhere/python")
-    with closing(PreprocessWorker(slam, demo)) as second:
-        assert second._process is None
-        second.submit(1, slam.outlook())
-        assert second.result() is None
+    with closing(PreprocessWorker(slam, demo)) as worker:
+        assert worker._process is None
+        worker.submit(1, slam.predictions[0])
+        assert worker.result() is None

@@ -1,4 +1,4 @@
-"""Frames and instances that callers make themselves: what is wrong with them is said at the door."""
+"""Checks of the frames, instances and parameters that callers pass in."""
 
 from __future__ import annotations
 
@@ -22,61 +22,68 @@ FRAME = RGBDFrame(7, 2.0, torch.zeros(3, 48, 64, dtype=torch.uint8), torch.ones(
 INSTANCES = Instances(torch.ones(2, 48, 64).bool(), torch.tensor([0, 56]), torch.ones(2), torch.zeros(2, 4))
 
 
-def slam(segment: Callable[[RGBDFrame], Any] | None = None) -> V3DSLAM:
-    return V3DSLAM(None, segment, load_config(overrides=["segmentation.source=none"]))
+def make_slam(segment: Callable[[RGBDFrame], Any] | None = None) -> V3DSLAM:
+    return V3DSLAM(CAMERA, segment, load_config(overrides=["segmentation.source=none"]))
 
 
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
-        (torch.zeros(3, 48, 64), "takes frames, this is a Tensor"),
+        (torch.zeros(3, 48, 64), r"expected an RGBDFrame, got a Tensor; RGBDFrame\.from_arrays"),
         (replace(FRAME, image=FRAME.image.permute(1, 2, 0)), r"colour image is torch.uint8 of shape \(48, 64, 3\)"),
         (replace(FRAME, image=FRAME.image.float()), "colour image is torch.float32"),
         (replace(FRAME, image=FRAME.image.numpy()), "colour image is a ndarray"),
         (replace(FRAME, depth=FRAME.depth[0]), r"depth image is torch.float32 of shape \(48, 64\)"),
         (replace(FRAME, depth=FRAME.depth.double()), "depth image is torch.float64"),
         (replace(FRAME, depth=None), "depth image is a NoneType"),
-        (replace(FRAME, stamp=float("nan")), "the stamp is nan"),
-        (replace(FRAME, delay=float("inf")), "the delay of depth is inf"),
-        (replace(FRAME, camera=replace(CAMERA, width=80)), r"colour image .* of shape \(3, 48, 80\)"),
+        (replace(FRAME, stamp=float("nan")), "frame 7: the stamp is nan; give a finite number of seconds"),
+        (replace(FRAME, depth_delay=float("inf")), "frame 7: the depth delay is inf; give a finite number of seconds"),
+        (
+            replace(FRAME, image=torch.zeros(3, 48, 80, dtype=torch.uint8), camera=replace(CAMERA, width=80)),
+            r"colour image is torch.uint8 of shape \(3, 48, 80\), expected .* of shape \(3, 48, 64\)",
+        ),
+        (replace(FRAME, camera=replace(CAMERA, width=80)), "frame 7: its camera differs from that of the V3DSLAM"),
     ],
 )
-def test_what_is_no_frame(frame: RGBDFrame, message: str) -> None:
+def test_invalid_frame_is_rejected(frame: RGBDFrame, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        slam()(frame)
+        make_slam()(frame)
 
 
-def test_what_is_right_is_taken_and_tells_the_camera() -> None:
-    system = slam(lambda _: INSTANCES)
-    assert system.camera is None
-    assert system(FRAME).stamp == 2.0 and system.camera == CAMERA
-    assert system(replace(FRAME, stamp=2.1, camera=None)).stamp == 2.1
+def test_valid_frames_are_tracked_with_and_without_a_camera() -> None:
+    slam = make_slam(lambda _: INSTANCES)
+    assert slam.camera == CAMERA
+    assert slam(FRAME).stamp == 2.0
+    assert slam(replace(FRAME, stamp=2.1, camera=None)).stamp == 2.1
+    assert make_slam()(replace(FRAME, camera=None)).stamp == 2.0
 
 
-def test_a_frame_of_another_camera() -> None:
-    system = slam()
-    system(FRAME)
-    with pytest.raises(InputError, match="frame 7: carries another camera"):
-        system(replace(FRAME, stamp=3.0, camera=replace(CAMERA, fx=61.0)))
-    with pytest.raises(ConfigError, match="the camera is not known"):
-        slam()(replace(FRAME, camera=None))
+def test_frame_of_another_camera_is_rejected() -> None:
+    slam, other = make_slam(), replace(CAMERA, fx=61.0)
+    message = "frame 7: its camera differs from that of the V3DSLAM; make one V3DSLAM for each camera"
+    with pytest.raises(InputError, match=message):
+        slam(replace(FRAME, camera=other))
+    slam(FRAME)
+    with pytest.raises(InputError, match=message):
+        slam(replace(FRAME, stamp=3.0, camera=other))
+    assert len(slam.poses.statuses) == 1
 
 
 @pytest.mark.parametrize("stamp", [2.0, 1.9])
-def test_a_frame_that_is_not_after_the_last_costs_nothing(stamp: float) -> None:
-    system = slam()
-    system(FRAME)
+def test_frame_that_is_not_later_is_rejected_without_effect(stamp: float) -> None:
+    slam = make_slam()
+    slam(FRAME)
     with pytest.raises(InputError, match=rf"its stamp, {stamp:.6f} s, is not after 2\.000000 s"):
-        system(replace(FRAME, stamp=stamp))
-    assert len(system.poses.statuses) == 1
-    system(replace(FRAME, stamp=2.2))
-    assert system.poses.trajectory().stamps.tolist() == [2.0, 2.2]
+        slam(replace(FRAME, stamp=stamp))
+    assert len(slam.poses.statuses) == 1
+    slam(replace(FRAME, stamp=2.2))
+    assert slam.poses.trajectory().stamps.tolist() == [2.0, 2.2]
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("returned", "message"),
     [
-        (None, "gave a NoneType for frame 7"),
+        (None, "the segmenter returned a NoneType for frame 7; it must return Instances"),
         (replace(INSTANCES, masks=INSTANCES.masks.numpy()), "masks for frame 7 are a ndarray"),
         (replace(INSTANCES, masks=INSTANCES.masks.float()), "masks for frame 7 are torch.float32"),
         (replace(INSTANCES, masks=INSTANCES.masks[:, ::2, ::2]), r"masks for frame 7 are torch.bool of shape \(2, 24"),
@@ -85,20 +92,21 @@ def test_a_frame_that_is_not_after_the_last_costs_nothing(stamp: float) -> None:
         (replace(INSTANCES, boxes=torch.zeros(2, 5)), r"boxes for frame 7 are torch.float32 of shape \(2, 5\)"),
     ],
 )
-def test_what_a_segmenter_must_not_give(given: Any, message: str) -> None:
+def test_invalid_output_of_the_segmenter_is_rejected(returned: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        slam(lambda _: given)(FRAME)
+        make_slam(lambda _: returned)(FRAME)
 
 
 @pytest.mark.parametrize(
-    ("parts", "message"),
+    ("parameters", "message"),
     [
-        ({"config": "paper"}, r'config .* is a str; .* load_config\("paper"\)'),
-        ({"config": {"seed": 1}}, "config .* is a dict"),
-        ({"camera": "tum_fr1"}, "camera .* is a str"),
-        ({"camera": np.eye(3)}, "camera .* is a ndarray"),
+        ({"config": "paper"}, r'needs a Config, got a str; .* load_config\("paper"\)'),
+        ({"config": {"seed": 1}}, "needs a Config, got a dict"),
+        ({"camera": None}, r"needs a PinholeCamera, got a NoneType; .* sequence\.camera"),
+        ({"camera": "tum_fr1"}, r"needs a PinholeCamera, got a str; .* sequence\.camera"),
+        ({"camera": np.eye(3)}, r"needs a PinholeCamera, got a ndarray; .* sequence\.camera"),
     ],
 )
-def test_what_no_system_is_made_of(parts: dict[str, Any], message: str) -> None:
+def test_parameter_of_wrong_type_is_rejected(parameters: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        V3DSLAM(segment=NoSegmentation(), **parts)
+        V3DSLAM(**{"camera": CAMERA, "segment": NoSegmentation(), **parameters})

@@ -1,4 +1,4 @@
-"""Memory that lies free between what is kept goes back to the system."""
+"""Unused memory of the C library is returned to the system."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ def resident_mb() -> float:
     return float(psutil.Process().memory_info().rss / 2**20)
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc keeps it")
-def test_what_lies_between_is_given_back() -> None:
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc keeps free pages")
+def test_trim_memory_returns_free_pages_between_used_blocks() -> None:
     blocks = [bytearray(b"x" * 60_000) for _ in range(4000)]
-    kept = blocks[::20]  # pages between these are free, and not at the end of the heap
+    used = blocks[::20]  # pages between these are free, and not at the end of the heap
     del blocks
     before = resident_mb()
     trim_memory()
     assert before - resident_mb() > 100
-    assert all(block[-1] == ord("x") for block in kept)
+    assert all(block[-1] == ord("x") for block in used)
 
 
 @pytest.mark.parametrize("platform", ["win32", "darwin"])
-def test_other_systems_are_left_alone(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trim_memory_does_nothing_on_other_systems(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr("v3d_torch.runtime.process.ctypes.CDLL", None)
     trim_memory()
 
 
-def test_a_library_that_cannot_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trim_memory_does_nothing_with_other_c_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v3d_torch.runtime.process.ctypes.CDLL", lambda name: object())
     trim_memory()
 
 
-def test_a_run_gives_back_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    demo, given = load_sequence("demo"), []
+def test_pipeline_trims_memory_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    demo, trimmed_after = load_sequence("demo"), []
     config = load_config(None, ["segmentation.source=none", "prefetch=false"])
     pipeline = Pipeline(demo, V3DSLAM(demo.camera, config=config))
-    monkeypatch.setattr(Pipeline, "_TIDY", 3)
-    monkeypatch.setattr(v3d_torch.pipeline, "give_back", lambda: given.append(len(pipeline.record.frames)))
+    monkeypatch.setattr(v3d_torch.pipeline, "_TRIM_INTERVAL", 3)
+    monkeypatch.setattr(v3d_torch.pipeline, "trim_memory", lambda: trimmed_after.append(len(pipeline.record.frames)))
 
     def stop(frame: RGBDFrame, *_: object) -> None:
         if frame.index == 7:
             raise KeyboardInterrupt
 
-    assert pipeline(stop).interrupted and given == [3, 6]
+    assert pipeline(stop).interrupted and trimmed_after == [3, 6]
