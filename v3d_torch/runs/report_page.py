@@ -97,7 +97,7 @@ def _differences(section: Section, default: Section, prefix: str) -> list[tuple[
 
 def _masked_percentages(scores: Mapping[str, Any]) -> list[str]:
     """Return the masked percentages of the moving and static pixels as text, without those that were not measured."""
-    fractions = {name: scores.get(f"{name}_left_out") for name in ("moving", "static")}
+    fractions = {name: scores.get(f"{name}_masked") for name in ("moving", "static")}
     return [f"{100 * fraction:.1f} % of the {name}" for name, fraction in fractions.items() if fraction is not None]
 
 
