@@ -1,4 +1,4 @@
-"""Shared fixtures: where real sequences are, one thread for the same bytes everywhere."""
+"""Shared fixtures and settings; one thread, so that results are the same on every machine."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from v3d_torch.datasets.demo.sequence import write_sequence
 torch.set_num_threads(1)
 
 SLOWEST = ("test_real_sequences.py", "cli/test_run.py", "test_corpus.py", "cli/test_ablate.py")
-"""Begin with these, so that with several workers (``-n 2``) none is left alone with one of them in the end."""
+"""Files that run first, so that several workers (``-n 2``) finish at about the same time."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that take long first, each with its tests in their order."""
+    """Run the slowest files first; tests within a file keep their order."""
     items.sort(key=lambda item: SLOWEST.index(item.path.name) if item.path.name in SLOWEST else len(SLOWEST))
 
 
 collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
-"""Full disks and little memory are made with the limits of Unix."""
+"""Files that need Unix: full disks and little memory are simulated with its resource limits."""
 
 
 @pytest.fixture(scope="session")
 def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fifth of a second of the demo, six frames with true masks, in which the walker is in the middle of the room."""
+    """Folder of six frames of the demo with true masks, in which the walker is in the middle of the room."""
     folder = tmp_path_factory.mktemp("sequences") / "moment"
     write_sequence(folder, range(52, 58))
     return folder
@@ -35,7 +35,7 @@ def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def v3d_data() -> Path:
-    """Folder of real and composed sequences: ``$V3D_DATA``, else ``../shared/data`` beside the checkout."""
+    """Folder of recorded and composed sequences: ``$V3D_DATA``, else ``../shared/data`` beside the checkout."""
     root = Path(os.environ.get("V3D_DATA", Path(__file__).parents[2] / "shared" / "data"))
     if not root.is_dir():
         pytest.skip(f"no real data: {root} is not there; set V3D_DATA to a folder of TUM-layout sequences")

@@ -1,4 +1,4 @@
-"""The same input gives the same bytes: run after run, ahead or one by one, with one thread or two."""
+"""The same input gives the same bytes in every run, with and without prefetching, with one thread or two."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from v3d_torch.pipeline import Pipeline
 FRAMES = 14
 RUNS = {
     "by default": (),
-    "one by one": ("prefetch=false",),
+    "without prefetching": ("prefetch=false",),
     "two threads for the network": ("segmentation.threads=2",),
-    "one by one, two threads": ("prefetch=false", "threads=2"),
+    "without prefetching, two threads": ("prefetch=false", "threads=2"),
     "two threads": ("threads=2",),
 }
 
 
-class Beginning:
+class FirstFrames:
     """The first frames of a sequence."""
 
-    name, groundtruth = "beginning", None
+    name, groundtruth = "first frames", None
 
     def __init__(self, sequence: RGBDSequence) -> None:
         self._sequence, self.camera = sequence, sequence.camera
@@ -39,6 +39,7 @@ class Beginning:
 
 @pytest.fixture
 def one_thread_after() -> Iterator[None]:
+    """Restore one thread after the test."""
     yield
     torch.set_num_threads(1)
 
@@ -46,18 +47,20 @@ def one_thread_after() -> Iterator[None]:
 def trajectory(sequence: RGBDSequence, overrides: tuple[str, ...], path: Path) -> bytes:
     config = load_config(None, overrides)
     torch.set_num_threads(config.threads)
-    flow = Pipeline(Beginning(sequence), V3DSLAM(sequence.camera, config=config))
-    assert flow().failure is None
-    write_trajectory(path, flow.slam.poses.trajectory())
+    pipeline = Pipeline(FirstFrames(sequence), V3DSLAM(sequence.camera, config=config))
+    assert pipeline().failure is None
+    write_trajectory(path, pipeline.slam.poses.trajectory())
     return path.read_bytes()
 
 
 @pytest.mark.parametrize("name", ["demo", "walkers_desk", "crowd_rpy"])
 @pytest.mark.usefixtures("one_thread_after")
-def test_every_run_gives_the_same_bytes(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    """walkers_desk rolls: its images are turned by what an earlier frame tells. The network is the real one."""
+def test_trajectory_is_identical_in_every_run(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """With the network. The camera of walkers_desk rolls, so its images are rotated by the predicted pose."""
     root = None if name == "demo" else request.getfixturevalue("v3d_data")
     sequence = load_sequence(name, data_root=root)
-    written = {run: trajectory(sequence, overrides, tmp_path / "trajectory.txt") for run, overrides in RUNS.items()}
-    assert len(written["by default"].splitlines()) == FRAMES
-    assert {run for run, content in written.items() if content != written["by default"]} == set()
+    trajectories = {
+        run: trajectory(sequence, overrides, tmp_path / "trajectory.txt") for run, overrides in RUNS.items()
+    }
+    assert len(trajectories["by default"].splitlines()) == FRAMES
+    assert {run for run, content in trajectories.items() if content != trajectories["by default"]} == set()

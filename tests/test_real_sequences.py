@@ -1,4 +1,4 @@
-"""Sequences with real images through the whole system and the real network: every frame has a pose, and a good one."""
+"""Recorded images through the whole system with the network: every frame has an accurate pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Run = Callable[..., dict[str, Any]]
 
 @pytest.fixture(scope="module")
 def run(v3d_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Runs a sequence from the command line and returns its metrics."""
+    """Function that runs a sequence from the command line and returns its metrics."""
 
     def run_sequence(name: str, *options: str) -> dict[str, Any]:
         out = tmp_path_factory.mktemp(name)
@@ -37,25 +37,25 @@ def run(v3d_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run_sequence
 
 
-def test_a_camera_that_stands_among_walkers(run: Run) -> None:
+def test_static_camera_among_walkers_is_tracked_accurately(run: Run) -> None:
     metrics = run("crowd_static")
     assert metrics["frames"] == 108
     assert metrics["ate"]["rmse"] < 0.01
     assert metrics["lost"] + metrics["disconnected"] == 0
 
 
-def test_a_camera_that_turns_among_walkers_needs_to_know_who_moves(run: Run) -> None:
-    metrics, without = run("crowd_rpy"), run("crowd_rpy", "--segmenter", "none")
+def test_rotating_camera_among_walkers_is_more_accurate_with_masks(run: Run) -> None:
+    metrics, unmasked = run("crowd_rpy"), run("crowd_rpy", "--segmenter", "none")
     assert metrics["frames"] == 180
     assert metrics["ate"]["rmse"] < 0.03
     assert abs(metrics["readout"]) < 0.002  # a rendered camera has no rolling shutter
-    assert metrics["ate"]["rmse"] < 0.6 * without["ate"]["rmse"]
+    assert metrics["ate"]["rmse"] < 0.6 * unmasked["ate"]["rmse"]
     assert metrics["lost"] + metrics["disconnected"] == 0
 
 
-def test_fast_turns_before_a_desk(run: Run) -> None:
-    """TUM's fr1_rpy: real noise, real blur, a strong lens."""
+def test_fast_rotation_is_tracked_and_its_readout_calibrated(run: Run) -> None:
+    """TUM fr1_rpy: sensor noise, motion blur, strong lens distortion."""
     metrics = run("fr1_rpy")
     assert metrics["frames"] == 694
-    assert metrics["ate"]["rmse"] < 0.015  # ORB-SLAM2 and 3, which know no rolling shutter: 0.021
+    assert metrics["ate"]["rmse"] < 0.015  # better than ORB-SLAM2 and 3, which do not model the rolling shutter
     assert 0.018 < metrics["readout"] < 0.032

@@ -58,7 +58,7 @@ class Wall:
 
 
 def square(frame: RGBDFrame) -> Instances:
-    """A person in the middle of the image."""
+    """Segment a square in the middle of the image as a person."""
     mask = torch.zeros(1, 240, 320, dtype=torch.bool)
     mask[:, 90:150, 130:190] = True
     box = torch.tensor([[130.0, 90, 190, 150]])

@@ -1,4 +1,4 @@
-"""A camera that loses its way finds it again, says so in between, and claims nothing wrong (benchmarks/lost.py)."""
+"""Recovery of a lost camera: it is found again, and its poses are flagged meanwhile (benchmarks/lost.py)."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from v3d_torch.types import TrackingStatus
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
+import interruptions
 import lost
 
 CONFIG = load_config(None, ("segmentation.source=none",))
@@ -25,53 +26,59 @@ TRACKED, LOST, ODOMETRY = TrackingStatus.TRACKED, TrackingStatus.LOST, TrackingS
 
 @pytest.fixture(scope="module")
 def slide() -> Slide:
-    """Along the wall and, as the cases need more frames than there are, back again."""
+    """Frames along a wall; the cases play them forth and back, because they need more frames."""
     return Slide(0, 240)
 
 
 @pytest.fixture(scope="module")
 def plain(slide: Slide) -> lost.Result:
-    return lost.follow(slide, lost.uninterrupted(len(slide), BEFORE + 150 + AFTER), CONFIG, None)
+    return lost.run_case(slide, interruptions.uninterrupted(len(slide), BEFORE + 150 + AFTER), CONFIG, None)
 
 
 @pytest.mark.parametrize(
     "case",
     [
-        *(make(31, BEFORE, gap, AFTER) for make in (lost.covered, lost.dropped) for gap in (30, 60, 150)),
-        lost.elsewhere(31, BEFORE, AFTER),
+        *(
+            make(31, BEFORE, gap, AFTER)
+            for make in (interruptions.covered, interruptions.dropped)
+            for gap in (30, 60, 150)
+        ),
+        interruptions.elsewhere(31, BEFORE, AFTER),
     ],
     ids=lambda case: case.name,
 )
-def test_is_found_again_and_says_what_it_does_not_know(slide: Slide, plain: lost.Result, case: lost.Case) -> None:
-    result = lost.follow(slide, case, CONFIG, None)
+def test_interrupted_camera_is_found_again_and_flags_unreliable_poses(
+    slide: Slide, plain: lost.Result, case: interruptions.Case
+) -> None:
+    result = lost.run_case(slide, case, CONFIG, None)
     scored = lost.score(case, result, plain, slide.T_wc)
     assert scored.recovery is not None and scored.recovery <= 10
     assert scored.unflagged == 0
     assert scored.worst < 0.1
     assert scored.ate <= max(1.5 * scored.reference, 1e-3)
-    assert all(result.online[k] is LOST for k, index in enumerate(case.shown) if index == lost.COVERED)
+    assert all(result.online[k] is LOST for k, index in enumerate(case.shown) if index == interruptions.COVERED)
 
 
 class TestCases:
-    def test_covered(self) -> None:
-        case = lost.covered(4, 2, 3, 2)
-        assert case.shown == [0, 1, -1, -1, -1, 1, 0] and case.beats == case.plain == list(range(7))
+    def test_covered_frames_keep_their_times(self) -> None:
+        case = interruptions.covered(4, 2, 3, 2)
+        assert case.shown == [0, 1, -1, -1, -1, 1, 0] and case.times == case.plain == list(range(7))
         assert (case.cut, case.back) == (2, 5)
 
-    def test_dropped(self) -> None:
-        case = lost.dropped(4, 2, 3, 2)
-        assert case.shown == [0, 1, 1, 0] and case.beats == case.plain == [0, 1, 5, 6]
+    def test_dropped_frames_leave_a_gap_in_time(self) -> None:
+        case = interruptions.dropped(4, 2, 3, 2)
+        assert case.shown == [0, 1, 1, 0] and case.times == case.plain == [0, 1, 5, 6]
         assert (case.cut, case.back) == (2, 2)
 
-    def test_elsewhere(self) -> None:
-        case = lost.elsewhere(100, 2, 3)
+    def test_frames_elsewhere_have_no_uninterrupted_position(self) -> None:
+        case = interruptions.elsewhere(100, 2, 3)
         assert case.shown == [0, 1, *range(70, 100), 2, 3, 4] and case.plain == [0, 1, *(30 * [-1]), 2, 3, 4]
         assert (case.cut, case.back) == (2, 32)
 
 
-def test_scores_are_those_of_a_run_made_by_hand() -> None:
-    """Three frames on a triangle, two covered, then back at the second: lost once, and then 0.2 m off."""
-    case = lost.Case("", [0, 1, 2, -1, -1, 1, 1, 1], list(range(8)), list(range(8)), cut=3, back=5)
+def test_scores_of_a_made_up_run_equal_values_by_hand() -> None:
+    """Three frames on a triangle, two covered, then three at the second position: lost once, and finally 0.2 m off."""
+    case = interruptions.Case("", [0, 1, 2, -1, -1, 1, 1, 1], list(range(8)), list(range(8)), cut=3, back=5)
     truth = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
     truth[1, 0, 3], truth[2, 1, 3] = 1.0, 1.0
     T_wc = truth[[0, 1, 2, 2, 2, 1, 1, 1]]
@@ -79,7 +86,7 @@ def test_scores_are_those_of_a_run_made_by_hand() -> None:
     exact = lost.Result(T_wc, online, online)
     scored = lost.score(case, exact, exact, truth)
     assert scored.recovery == 2 and scored.unflagged == 1 and scored.found == pytest.approx(5 / 6)
-    assert scored.worst == pytest.approx(0, abs=1e-12) and not scored.holds
+    assert scored.worst == pytest.approx(0, abs=1e-12) and not scored.passes
     off = T_wc.clone()
     off[7, 2, 3] += 0.2
     wrong = lost.score(case, lost.Result(off, online, online), exact, truth)
@@ -91,8 +98,8 @@ def test_scores_are_those_of_a_run_made_by_hand() -> None:
     assert never == torch.inf
 
 
-def test_a_place_that_was_never_seen_is_not_waited_for() -> None:
-    case = lost.covered(10, 2, 1, 2)
+def test_recovery_at_an_unknown_place_is_none() -> None:
+    case = interruptions.covered(10, 2, 1, 2)
     far = se3_exp(torch.tensor([[0.0] * 6, [0.1, 0, 0, 0, 0, 0], [9.0, 0, 0, 0, 0, 0]], dtype=torch.float64))
     turned = se3_exp(torch.tensor([[0.0, 0, 0, 0, 0.5, 0]], dtype=torch.float64))
     assert lost.recovery(case, 5 * [LOST], torch.cat([far, far[2:], turned])) is None

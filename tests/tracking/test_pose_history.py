@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from v3d_torch.features.features import Features
-from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.motion_model import MotionModel
@@ -55,9 +55,11 @@ class Camera:
         new: Keyframe | None = None,
     ) -> Tensor | None:
         """Append a frame; ``T_cp`` is the measured motion since the previous one, None if it is not measured."""
-        predicted = self.model.predict(self.poses).motion_until(stamp)
-        pairs = torch.zeros(0, 2, dtype=torch.int64)
-        motion = CameraMotion(predicted if T_cp is None else T_cp, self.model.velocity, pairs, T_cp is not None)
+        predicted, pairs = self.model.predict(self.poses), torch.zeros(0, 2, dtype=torch.int64)
+        if T_cp is None:
+            motion = CameraMotion(predicted.motion_until(stamp), predicted.velocity, pairs, is_measured=False)
+        else:
+            motion = CameraMotion(T_cp, se3_log(T_cp) / (stamp - self.poses.stamp), pairs, is_measured=True)
         self.model.update(self.poses, stamp, pose, motion)
         return self.poses.append(stamp, pose, motion, reference, new)
 
@@ -113,17 +115,17 @@ def test_prediction_extrapolates_at_most_a_fifth_of_a_second() -> None:
     torch.testing.assert_close(camera.predict(5.0), se3_exp(TWIST * 0.3), rtol=0, atol=1e-9)
 
 
-def test_prediction_of_a_lost_camera_moves_shortly_and_then_stands() -> None:
+def test_prediction_of_a_lost_camera_continues_shortly_and_then_stands_still() -> None:
     stamps = [k / 30 for k in range(40)]
     camera = walk(stamps[:10])
-    where = []
+    positions = []
     for stamp in stamps[10:]:
-        where.append(invert(camera.predict(stamp))[:3, 3])
+        positions.append(invert(camera.predict(stamp))[:3, 3])
         camera.append(stamp, frame_pose(camera.predict(stamp), TrackingStatus.LOST), None)
-    steps = torch.stack(where).diff(dim=0).norm(dim=1)
+    steps = torch.stack(positions).diff(dim=0).norm(dim=1)
     speed = float(TWIST[:3].norm())
-    assert steps[:4].min() > 0.9 * speed / 30  # goes on
-    assert (steps[8:] < 1e-12).all()  # stands
+    assert steps[:4].min() > 0.9 * speed / 30  # continues
+    assert (steps[8:] < 1e-12).all()  # stands still
     assert steps.sum() < 0.3 * speed
 
 
@@ -150,9 +152,9 @@ def test_jump_of_a_relocalised_camera_is_not_a_velocity() -> None:
 def test_previous_velocity_is_unknown_after_a_jump_without_measured_motion() -> None:
     """A camera can be relocalised in the next frame, without having been lost in between."""
     camera, step = Camera(), se3_exp(0.1 * TWIST)
-    there = [EYE, step, step @ step, se3_exp(30 * TWIST), step @ se3_exp(30 * TWIST), step @ step @ se3_exp(30 * TWIST)]
+    T_cws = [EYE, step, step @ step, se3_exp(30 * TWIST), step @ se3_exp(30 * TWIST), step @ step @ se3_exp(30 * TWIST)]
     velocities = []
-    for index, T_cw in enumerate(there):
+    for index, T_cw in enumerate(T_cws):
         camera.append(0.1 * index, frame_pose(T_cw), None, None if index in (0, 3) else step)
         velocities.append(camera.model.previous_velocity)
     assert velocities[0] is None and velocities[3] is None
