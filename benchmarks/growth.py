@@ -74,7 +74,7 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
     slam = system.slam
 
     def take_snapshot() -> Snapshot:
-        keyframes = len(slam.mapper.map.active_keyframes)
+        keyframes = len(slam.map.active_keyframes)
         return Snapshot(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loop_closer.loop_count)
 
     snapshots = [take_snapshot()]

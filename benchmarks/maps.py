@@ -63,7 +63,7 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
     views, masked, unmasked = (StaticViews(sequence.camera, config.dense_map.stride) for _ in range(3))
     for frame in sequence:
         objects = slam(frame)
-        keyframes = slam.mapper.map.keyframes
+        keyframes = slam.map.keyframes
         if not keyframes or keyframes[-1].frame != frame.index:
             continue
         truth = sequence.motion_mask(frame.index) if isinstance(sequence, HasMotionMasks) else None
@@ -103,7 +103,7 @@ def measure_costs(sequence: RGBDSequence, slam: V3DSLAM, views: StaticViews) -> 
         path = Path(folder) / "room.map"
         points, cloud = timed(lambda: fuse_points(views, slam.config))
         faces, mesh = timed(lambda: fuse_mesh(views, slam.config.dense_map))
-        saving, _ = timed(lambda: save_map(path, slam.mapper.map, views))
+        saving, _ = timed(lambda: save_map(path, slam.map, views))
         loading, _ = timed(lambda: load_map(path, sequence.camera, slam.config))
         return {
             "sequence": sequence.name,

@@ -59,8 +59,8 @@ def speed_section(measurements: Sequence[Measurement], stages: Sequence[Measurem
         yield ""
         yield (
             "Time of each stage, ms per frame. Stages run in parallel with those of the next frame, so that the sum"
-            " can exceed the time of a frame. `background` is the free-space check, `motion` the odometry, `bundle`"
-            " local bundle adjustment. `v3d-torch run --profile` prints such a table for any run."
+            " can exceed the time of a frame. `motion` is the odometry, `bundle` local bundle"
+            " adjustment. `v3d-torch run --profile` prints such a table for any run."
         )
         yield ""
         yield from pivot(rows_of(stages), "stage", "sequence", "ms")
@@ -138,9 +138,9 @@ def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield "## Objects: masks and ids"
     yield ""
     yield (
-        "Moving left out: fraction of the true moving pixels with depth that tracking does not use, higher is"
-        " better. Static left out: the same for static pixels, lower is better. Id changes: how often a person in"
-        " view gets another id in 60 frames, lower is better. Each cell has the three values in this order."
+        "Moving masked: fraction of the true moving pixels with depth that tracking does not use, higher is"
+        " better. Static masked: the same for static pixels, lower is better. ID switches: how often a person in"
+        " view gets another ID in 60 frames, lower is better. Each cell has the three values in this order."
     )
     yield ""
     rows = [

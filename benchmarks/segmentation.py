@@ -150,9 +150,8 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
 
 ABOUT = (
     "ms per frame: wall time of one core, including rotation, decoding and, at first, the network on all four"
-    f" rotations. People's pixels: fraction of those that {REFERENCE}, finds on the same frames. Left out: fraction of"
-    " the true moving and static pixels with depth that the whole system leaves out. Id changes: of a person, in 60"
-    " frames."
+    f" rotations. People's pixels: fraction of those that {REFERENCE}, finds on the same frames. Masked: fraction of"
+    " the true moving and static pixels with depth that the whole system masks. ID switches: of a person, in 60 frames."
 )
 
 

@@ -99,7 +99,7 @@ def test_source_archive_builds_the_same_wheel(built: tuple[Path, Path, Path]) ->
 def test_source_archive_contains_tests_and_documents(built: tuple[Path, Path, Path]) -> None:
     with tarfile.open(built[0]) as archive:
         contained = {name.partition("/")[2] for name in archive.getnames()}
-    tests = {f"tests/{path.name}" for path in (ROOT / "tests").glob("*.py")}
+    tests = {f"tests/{name}" for name in files_in(ROOT / "tests")}
     assert (
         tests | {"constraints.txt", "CITATION.cff", "CHANGELOG.md", "LICENSE", "mkdocs.yml", "docs/index.md"}
         <= contained
