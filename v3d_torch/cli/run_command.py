@@ -194,8 +194,8 @@ def _print_summary(
         raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
         raise InputError(
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; give a map of the same place, or run"
-            f" without --load-map (the results are in {folder})"
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; give a map of the same place, or"
+            f" run without --load-map (the results are in {folder})"
         )
     if (problem := diagnose(pipeline, evaluation)) is not None:
         raise InputError(f"{problem} (the results are in {folder})")
