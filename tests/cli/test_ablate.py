@@ -71,7 +71,9 @@ def done(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 
 
 def test_spaces_around_variants_are_ignored() -> None:
-    assert_error_line(call("--seq", "nowhere", "--variants", " baseline, full "), "nowhere: is neither")
+    assert_error_line(
+        call("--seq", "nowhere", "--variants", " baseline, full "), "nowhere: is not a file, a folder or the name"
+    )
 
 
 def test_one_table_contains_all_variants(done: tuple[Path, str]) -> None:

@@ -127,7 +127,7 @@ def test_nonempty_folder_and_missing_camera_are_errors(tmp_path: Path) -> None:
     save(tmp_path / "depth" / "1.png", depth_of(0))
     (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
     done = call_in_process("--seq", tmp_path, "--fps", "30", "--out", tmp_path / "full")
-    assert_error_line(done, str(tmp_path / "full"), "holds something already; choose another")
+    assert_error_line(done, str(tmp_path / "full"), "already exists and is not an empty folder; choose another")
     assert_error_line(call_in_process("--out", tmp_path / "new"), "realsense: ")
     assert not (tmp_path / "new").exists()
 

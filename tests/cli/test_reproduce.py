@@ -182,12 +182,12 @@ def test_study_has_all_variants_and_tables_have_chosen_configs(
     assert ours == ["sequence", "full", "paper", "baseline"]
 
     study = table_in((out / "ablation.md").read_text(), "Ablation: ATE, m")
-    assert list(study) == [*SHORT, "times full", "times full (paper)"]
+    assert list(study) == [*SHORT, "ratio to full", "ratio to full (paper)"]
     assert [method for method in study["fr3/w/xyz"] if method != "sequence"] == list(VARIANTS)
     assert study["fr3/w/xyz"]["no_voting"] == "0.0200" and study["fr3/s/xyz"]["no_voting"] == "not here"
     full = 1 + VARIANTS.index("full")
-    assert study["times full"]["no_voting"] == f"{2 / full:.2f}" and study["times full"]["full"] == "1.00"
-    assert (study["times full (paper)"]["no_voting"], study["times full (paper)"]["not_upright"]) == ("4.00", "-")
+    assert study["ratio to full"]["no_voting"] == f"{2 / full:.2f}" and study["ratio to full"]["full"] == "1.00"
+    assert (study["ratio to full (paper)"]["no_voting"], study["ratio to full (paper)"]["not_upright"]) == ("4.00", "-")
     for name in ("summary.tex", "ablation.tex"):
         text = (out / name).read_text()
         assert text.startswith("% \\usepackage{booktabs}") and "not here" in text
@@ -196,7 +196,7 @@ def test_study_has_all_variants_and_tables_have_chosen_configs(
     )
     rows = list(csv.DictReader((out / "ablation.csv").open(newline="")))
     assert len(rows) == len(fake_runs) and {row["variant"] for row in rows} == set(VARIANTS)
-    assert "times full" in result.stdout
+    assert "ratio to full" in result.stdout
     assert len(pd.read_parquet(out / "runs.parquet")) == len(fake_runs)
 
 

@@ -161,10 +161,10 @@ def test_trajectory_is_created_from_arrays_and_lists(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stamps", "T_wc", "message"),
     [
-        (np.zeros(2), np.zeros((3, 4, 4)), r"T_wc of a trajectory have the shape \(3, 4, 4\); give"),
-        (np.zeros(2), np.zeros((2, 7)), r"T_wc of a trajectory have the shape \(2, 7\); give"),
-        (np.zeros((2, 1)), np.zeros((2, 4, 4)), r"stamps of a trajectory have the shape \(2, 1\); give"),
-        (["then", "now"], np.zeros((2, 4, 4)), "stamps of a trajectory are no numbers"),
+        (np.zeros(2), np.zeros((3, 4, 4)), r"T_wc of a trajectory have shape \(3, 4, 4\); give"),
+        (np.zeros(2), np.zeros((2, 7)), r"T_wc of a trajectory have shape \(2, 7\); give"),
+        (np.zeros((2, 1)), np.zeros((2, 4, 4)), r"stamps of a trajectory have shape \(2, 1\); give"),
+        (["then", "now"], np.zeros((2, 4, 4)), "stamps of a trajectory are not numbers"),
         (None, None, "stamps of a trajectory"),
     ],
 )

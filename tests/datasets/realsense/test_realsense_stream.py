@@ -135,7 +135,7 @@ def test_missing_camera_is_an_input_error(name: str, label: str) -> None:
     with pytest.raises(InputError, match=f"^{label}: no camera is connected; plug it into a USB 3 port$"):
         open_source(name)
     assert time.monotonic() - start < 5
-    with pytest.raises(InputError, match="is a live camera, --depth-topic means nothing to it"):
+    with pytest.raises(InputError, match="is a live camera, which does not support --depth-topic; remove this option"):
         open_source(name, options=SourceOptions(depth_topic="/a"))
 
 

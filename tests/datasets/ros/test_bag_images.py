@@ -122,10 +122,14 @@ def test_compressed_depth_of_integers_and_floats_is_decoded() -> None:
             "holds rgb8 images, not depth; choose another topic with --depth-topic",
         ),
         ("depth", ROS2.compressed(1, "16UC1; compressedDepth rvl", b"1" * 40), "RVL-compressed depth is not supported"),
-        ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "is no image"),
+        ("depth", ROS2.compressed(1, "16UC1; compressedDepth", b"1" * 40), "is not a PNG, JPEG or TIFF image"),
         ("depth", ROS2.compressed(1, "mono8; png compressed", png(colour_of(0)[..., 0])), "8-bit"),
         ("colour", ROS2.compressed(1, "bgr8; jpeg compressed bgr8", png(colour_of(0))[:-40]), "truncated"),
-        ("colour", ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))), "16-bit depth image where colour"),
+        (
+            "colour",
+            ROS2.compressed(1, "16UC1; png compressed", png(depth_of(0))),
+            "is a 16-bit depth image, expected a colour image",
+        ),
     ],
 )
 def test_invalid_message_is_an_input_error(kind: str, message: Any, error: str) -> None:

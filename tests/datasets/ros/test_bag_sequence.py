@@ -150,7 +150,7 @@ def test_camera_of_the_user_sets_the_depth_scale(tmp_path: Path) -> None:
         ([RGB, DEPTH], {"info_topic": "/x"}, "has no CameraInfo on /x or any other topic; give --camera instead$"),
         ([RGB, DEPTH], {}, f"has no CameraInfo topic for {RGB}; name it with --info-topic, or give --camera$"),
         ([RGB, DEPTH, INFO], {"rgb_topic": DEPTH, "depth_topic": RGB, "info_topic": INFO}, "16UC1 images, not colour"),
-        ([RGB, DEPTH, INFO], {"fps": 30.0}, "is a bag, --fps means nothing to it"),
+        ([RGB, DEPTH, INFO], {"fps": 30.0}, "is a bag, which does not support --fps; remove this option"),
     ],
 )
 def test_missing_or_wrong_topics_are_an_input_error(
@@ -189,7 +189,9 @@ def test_unregistered_depth_is_rejected_unless_name_or_user_confirms_it(tmp_path
 
 
 def test_depth_of_another_size_is_an_input_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"{DEPTH}: has 40x24 pixels, its colour image 32x24; choose depth registered"):
+    with pytest.raises(
+        InputError, match=f"{DEPTH}: has 40x24 pixels, but its colour image has 32x24; choose depth registered"
+    ):
         load_sequence(str(write_with_other_depth(tmp_path, size=(40, HEIGHT))))
 
 
