@@ -114,41 +114,70 @@ OBJECT_WITHOUT_CLOUD = TrackedObject(
 """All of its fields that are NaN are documented as such, except the cloud."""
 
 
-def test_behind_its_door_a_stage_is_reached_and_changed(demo: RGBDSequence) -> None:
+def test_state_of_a_checked_system_is_loaded_into_its_stages(demo: RGBDSequence) -> None:
     first, second = islice(demo, 2)
-    slam, other = (CheckedSLAM(demo.camera, config=NO_NETWORK) for _ in range(2))
+    slam, loaded = (CheckedSLAM(demo.camera, config=NO_NETWORK) for _ in range(2))
     slam(first)
-    put_back(other, gather(slam, OF_SLAM))
-    refresh(other)
-    assert len(other.mapper.map.keyframes) == 1
-    assert other(second).status is TrackingStatus.TRACKED
+    loaded.load_state_dict(slam.state_dict())
+    assert len(loaded.map.keyframes) == 1
+    assert loaded(second).status is TrackingStatus.TRACKED
 
 
 @pytest.mark.parametrize(
-    ("stage", "spoil", "named"),
+    ("stage", "corrupt", "field"),
     [
-        ("smooth", spoilt, "smooth"),
-        ("detect", lambda given: replace(given, uv=with_nan(given.uv)), "detect.uv"),
-        ("lift", lambda given: replace(given, points=torch.full((1, 1, 3), math.nan)), "lift.points"),
-        ("move", lambda given: replace(given, T_ba=with_nan(given.T_ba)), "move.T_ba"),
-        ("judge", lambda given: replace(given, objects=[NOWHERE]), "judge.objects[0].cloud"),
-        ("localise", lambda given: replace(given, T_cw=with_nan(given.T_cw)), "localise.T_cw"),
+        ("smooth_depth", with_nan, "smooth_depth"),
+        ("detect_features", lambda result: replace(result, uv=with_nan(result.uv)), "detect_features.uv"),
+        (
+            "back_project_instances",
+            lambda result: replace(result, points=torch.full((1, 1, 3), math.nan)),
+            "back_project_instances.points",
+        ),
+        ("odometry", lambda result: replace(result, T_cp=with_nan(result.T_cp)), "odometry.T_cp"),
+        (
+            "classify_motion",
+            lambda result: replace(result, objects=[OBJECT_WITHOUT_CLOUD]),
+            "classify_motion.objects[0].cloud",
+        ),
+        ("track_camera", lambda result: replace(result, T_cw=with_nan(result.T_cw)), "track_camera.T_cw"),
     ],
 )
-def test_a_stage_put_in_the_place_of_one_is_named_with_field_and_frame(
-    demo: RGBDSequence, stage: str, spoil: Callable[[Any], Any], field: str
+def test_replaced_stage_that_returns_nan_is_named_with_field_and_frame(
+    demo: RGBDSequence, stage: str, corrupt: Callable[[Any], Any], field: str
 ) -> None:
     slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
     for index in range(3):
         slam(demo[index])
-    before, replaced = slam.poses.T_cw, getattr(slam, stage)
-    setattr(slam, stage, lambda *args, **kwargs: spoil(replaced(*args, **kwargs)))
-    with pytest.raises(NumericsError, match=rf"^frame 3: {re.escape(named)} is NaN"):
+    T_cw, replaced = slam.poses.T_cw, getattr(slam, stage)
+    setattr(slam, stage, lambda *args, **kwargs: corrupt(replaced(*args, **kwargs)))
+    with pytest.raises(NumericsError, match=rf"^frame 3: {re.escape(field)} is NaN"):
         slam(demo[3])
-    assert torch.equal(slam.poses.T_cw, before)
+    assert torch.equal(slam.poses.T_cw, T_cw)
 
 
-def test_instances_that_are_not_finite_are_the_segmentations(demo: RGBDSequence) -> None:
+@pytest.mark.parametrize(
+    ("stage", "corrupt", "field"),
+    [
+        ("register", lambda result: replace(result, T_ba=with_nan(result.T_ba)), "register.T_ba"),
+        ("track_map", lambda result: replace(result, T_cw=with_nan(result.T_cw)), "track_map.T_cw"),
+    ],
+)
+def test_stage_used_by_other_stages_that_returns_nan_is_named(
+    demo: RGBDSequence, stage: str, corrupt: Callable[[Any], Any], field: str
+) -> None:
+    """The stages that use it hold the same wrapper."""
+    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
+    for index in range(3):
+        slam(demo[index])
+    T_cw, wrapper = slam.poses.T_cw, getattr(slam, stage)
+    original = wrapper._stage
+    wrapper._stage = lambda *args, **kwargs: corrupt(original(*args, **kwargs))
+    with pytest.raises(NumericsError, match=rf"^frame 3: {re.escape(field)} is NaN"):
+        slam(demo[3])
+    assert torch.equal(slam.poses.T_cw, T_cw)
+
+
+def test_infinite_box_is_attributed_to_the_segmenter(demo: RGBDSequence) -> None:
     def segment(frame: RGBDFrame) -> Instances:
         return replace(Instances.empty(480, 640), boxes=torch.full((1, 4), math.inf))
 

@@ -1,0 +1,163 @@
+"""Refinement of the previous frame with the velocity that is known from both of its sides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.sparse_maps import CAMERA, EYE, features
+from torch import Tensor
+
+from v3d_torch.config import Config
+from v3d_torch.features.features import Features
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
+from v3d_torch.odometry.rolling_shutter import Readout
+from v3d_torch.odometry.time_compensation import TimeCompensation
+from v3d_torch.tracking.map_tracker import MapTracker
+from v3d_torch.tracking.pose_history import PoseHistory
+from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
+from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
+
+COUNT = 400
+READOUT = 0.03
+VELOCITY = torch.tensor([0.4, -0.2, 0.1, 0.1, 0.3, -0.2], dtype=torch.float64)
+"""Twist of the camera around the previous frame, m/s and rad/s."""
+MOTION = se3_exp(torch.tensor([0.03, -0.02, 0.01, 0.01, -0.02, 0.02], dtype=torch.float64))
+"""True pose ``T_cw`` of the previous frame."""
+NO_PAIRS = torch.zeros(0, 2, dtype=torch.int64)
+
+
+class Scene:
+    """Map of one keyframe at the origin, and a later frame of a moving rolling-shutter camera that is tracked in it."""
+
+    def __init__(self) -> None:
+        self.config = Config()
+        self.map = SparseMap(self.config.mapping, self.config.features, CAMERA)
+        self.map.readout = replace(self.map.readout, seconds=READOUT)
+        self.compensate = TimeCompensation(self.config, CAMERA)
+        first = self.map.insert_keyframe(0, 0.0, EYE, features(COUNT), torch.full((COUNT,), -1))
+        in_camera = self.map.landmarks["point"][first.landmarks] @ MOTION[:3, :3].T + MOTION[:3, 3]
+        uv, z = CAMERA.project(in_camera), in_camera[:, 2]
+        inside = ((uv >= 1) & (uv < torch.tensor([639, 479]))).all(dim=1)
+        self.ids = first.landmarks[inside]
+        descriptors = first.features.descriptors[inside]
+        octave = first.features.octave[inside]
+        true = Features(uv[inside], uv[inside].round().long(), z[inside], octave, descriptors)
+        # The compensation with the true velocity moves the observed features to the true ones.
+        depth = torch.ones(1, 480, 640)
+        shifted = self.compensate(true, depth, 0.0, VELOCITY, self.map.readout)
+        observed = replace(true, uv=2 * true.uv - shifted.uv)
+        frame = RGBDFrame(1, 0.1, torch.zeros(3, 480, 640, dtype=torch.uint8), depth)
+        self.previous = TrackedFrame(frame, depth, observed, torch.ones(480, 640).bool(), self.ids)
+        self.true = true
+        motion = CameraMotion(EYE, VELOCITY, NO_PAIRS, is_measured=True)
+        self.poses = PoseHistory()
+        self.poses.append(0.0, FramePose(TrackingStatus.TRACKED, EYE, first.landmarks), motion, first, None)
+        self.poses.append(0.1, FramePose(TrackingStatus.TRACKED, self.pose_of(observed), self.ids), motion, first, None)
+
+    def track_map(self) -> MapTracker:
+        return MapTracker(self.config.tracking, self.config.features, CAMERA)
+
+    def pose_of(self, observed: Features) -> Tensor:
+        """Pose refined from observed features, without compensation."""
+        refined = self.track_map().refine(EYE, self.map.landmarks["point"][self.ids], observed, rounds=4)
+        assert refined is not None
+        return refined.T_cw
+
+    def refine(
+        self, previous: TrackedFrame | None, velocity: Tensor | None = VELOCITY, *, refine_pose: bool = True
+    ) -> None:
+        refine = PreviousFrameRefinement(self.compensate, self.track_map(), self.map, refine_pose=refine_pose)
+        refine(previous, velocity, self.poses)
+
+    def pose_error(self) -> float:
+        """Error of the last pose, metres and radians."""
+        return float(se3_log(self.poses.T_cw @ invert(MOTION)).norm())
+
+
+def test_pose_is_refined_with_the_velocity_of_both_sides() -> None:
+    scene = Scene()
+    before, first_pose = scene.pose_error(), scene.poses.trajectory().T_wc[0]
+    scene.refine(scene.previous)
+    assert before > 2e-3
+    assert scene.pose_error() < 0.1 * before
+    assert torch.equal(scene.poses.trajectory().T_wc[0], first_pose)  # only the last frame is changed
+    assert scene.poses.statuses == 2 * [TrackingStatus.TRACKED]
+
+
+def test_refinement_tolerates_some_wrong_landmarks() -> None:
+    scene = Scene()
+    before, ids = scene.pose_error(), scene.ids.clone()
+    ids[:40] = ids[:40].flip(0)
+    scene.refine(replace(scene.previous, landmark_ids=ids))
+    assert scene.pose_error() < 0.3 * before
+
+
+def test_features_without_an_active_landmark_are_not_used() -> None:
+    scene = Scene()
+    ids, wrong = scene.ids.clone(), scene.ids[:150]
+    scene.map.landmarks["active"][wrong[:75]] = False
+    scene.map.landmarks["point"][wrong] += 5.0
+    ids[75:150] = -1
+    before = scene.pose_error()
+    scene.refine(replace(scene.previous, landmark_ids=ids))
+    assert scene.pose_error() < 0.1 * before
+
+
+def test_features_of_the_newest_keyframe_are_compensated_again_in_the_map() -> None:
+    scene = Scene()
+    T_cw = scene.poses.T_cw
+    keyframe = scene.map.insert_keyframe(1, 0.1, T_cw, scene.previous.features, scene.ids)
+    motion = CameraMotion(EYE, VELOCITY, NO_PAIRS, is_measured=True)
+    scene.poses.append(0.1, FramePose(TrackingStatus.TRACKED, T_cw, scene.ids), motion, keyframe, keyframe)
+    scene.refine(scene.previous)
+    torch.testing.assert_close(keyframe.features.uv, scene.true.uv, rtol=0, atol=0.05)
+    assert (keyframe.features.uv - scene.previous.features.uv).norm(dim=1).median() > 1
+    rows = scene.map.observations["keyframe"] == keyframe.index
+    observed = scene.map.observations["uv"][rows]
+    assert torch.equal(observed, keyframe.features.uv[scene.map.observations["feature"][rows]])
+    assert torch.equal(keyframe.T_cw, T_cw) and torch.equal(scene.poses.T_cw, T_cw)  # left to the bundle adjustment
+
+
+def test_pose_stays_without_refinement_of_poses() -> None:
+    scene = Scene()
+    T_cw = scene.poses.T_cw
+    scene.refine(scene.previous, refine_pose=False)
+    assert torch.equal(scene.poses.T_cw, T_cw)
+
+
+def test_pose_stays_with_too_few_landmarks() -> None:
+    scene = Scene()
+    T_cw, ids = scene.poses.T_cw, scene.ids.clone()
+    ids[scene.config.tracking.min_inliers - 1 :] = -1
+    scene.refine(replace(scene.previous, landmark_ids=ids))
+    assert torch.equal(scene.poses.T_cw, T_cw)
+
+
+@pytest.mark.parametrize("unknown", ["previous frame", "landmarks", "velocity", "map"])
+def test_nothing_changes_while_anything_is_unknown(unknown: str) -> None:
+    scene = Scene()
+    T_wc, uv = scene.poses.trajectory().T_wc, scene.map.observations["uv"].clone()
+    previous: TrackedFrame | None = scene.previous
+    if unknown == "previous frame":
+        previous = None
+    elif unknown == "landmarks":
+        previous = replace(scene.previous, landmark_ids=None)
+    elif unknown == "map":
+        scene.map = SparseMap(scene.config.mapping, scene.config.features, CAMERA)
+    scene.refine(previous, None if unknown == "velocity" else VELOCITY)
+    assert torch.equal(scene.poses.trajectory().T_wc, T_wc)
+    assert unknown == "map" or torch.equal(scene.map.observations["uv"], uv)
+
+
+def test_readout_of_zero_leaves_features_as_observed() -> None:
+    scene = Scene()
+    scene.map.readout = Readout(0.0, scene.map.readout.information)
+    points = scene.map.landmarks["point"][scene.ids]
+    expected = scene.track_map().refine(scene.poses.T_cw, points, scene.previous.features, rounds=1)
+    scene.refine(scene.previous)
+    assert expected is not None
+    torch.testing.assert_close(scene.poses.T_cw, expected.T_cw, rtol=0, atol=1e-12)
