@@ -65,7 +65,7 @@ def main(
         Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run that wrote its results there.")
     ] = None,
 ) -> None:
-    """Track an RGB-D camera in a dynamic scene, and map the static part."""
+    """Track an RGB-D camera, and map the static part of the scene."""
     from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
     from v3d_torch.runs.console import exit_on_error
     from v3d_torch.runs.request import RunRequest
