@@ -240,8 +240,8 @@ def test_ground_truth_from_other_file_is_used(copy: Path, tmp_path: Path) -> Non
 def test_missing_results_and_unusable_ground_truth_are_one_line_each(copy: Path, tmp_path: Path) -> None:
     write_text(tmp_path / "late.txt", "9000.0 0 0 0 0 0 0 1\n9000.1 0 0 0 0 0 0 1\n")
     for arguments, words in (
-        ([tmp_path / "nowhere"], "nowhere: holds no results of a run"),
-        ([tmp_path / (300 * "x")], "cannot be used (File name too long); check the path"),
+        ([tmp_path / "nowhere"], "nowhere: has no results of a run"),
+        ([tmp_path / (300 * "x")], "cannot be used (File name too long); check path and permissions"),
         ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 poses"),
     ):
         done = call_here(*arguments)
@@ -266,7 +266,7 @@ def test_folder_above_runs_is_an_error_that_suggests_the_newest(tmp_path: Path) 
         write_text(tmp_path / name / "metrics.json", "{}")
         os.utime(tmp_path / name / "metrics.json", ns=(0, 10**9 * (10 - age)))
     for parent, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
-        with pytest.raises(InputError, match=re.escape(f"; give the newest of the runs in it, {tmp_path / newest}")):
+        with pytest.raises(InputError, match=re.escape(f"; give the newest run in it, {tmp_path / newest}")):
             read_run(tmp_path / parent)
     (tmp_path / "demo/latest").symlink_to("2026-01-01")
     with pytest.raises(InputError, match=r"in it, .*latest$"):
@@ -274,23 +274,23 @@ def test_folder_above_runs_is_an_error_that_suggests_the_newest(tmp_path: Path) 
 
 
 def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
-    with pytest.raises(InputError, match=re.escape(f"; give the folder that map.ply is in, {copy}")):
+    with pytest.raises(InputError, match=re.escape(f"; give its folder, {copy}")):
         read_run(copy / "map.ply")
 
 
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [
-        ("metrics.json", halve, r"metrics\.json: is no JSON"),
+        ("metrics.json", halve, r"metrics\.json: is not JSON"),
         ("metrics.json", lambda path: without(path, "status"), r"metrics\.json: status: field required"),
-        ("metrics.json", lambda path: path.write_text("[]"), r"metrics\.json: the whole: input should be"),
+        ("metrics.json", lambda path: path.write_text("[]"), r"metrics\.json: the document: input should be"),
         ("trajectory.txt", lambda path: path.write_text("1 2 3\n"), r"trajectory\.txt: line 1"),
-        ("trajectory.txt", lambda path: path.write_text("1 0 0 0 0 0 0 1\n"), "not of the same run"),
-        ("dynamics.parquet", halve, r"dynamics\.parquet: is no parquet table"),
+        ("trajectory.txt", lambda path: path.write_text("1 0 0 0 0 0 0 1\n"), "belong to different runs"),
+        ("dynamics.parquet", halve, r"dynamics\.parquet: is not a parquet table"),
         (
             "frames.parquet",
             lambda path: pq.write_table(pq.read_table(path).drop(["stamp"]), path),
-            "lacks the columns stamp",
+            "has no columns stamp",
         ),
         ("figures/masks.png", halve, r"masks\.png: is truncated or not an image"),
         ("masks/0.100000.png", lambda path: path.write_bytes(b"x"), r"0\.100000\.png: is truncated or not an image"),
