@@ -64,10 +64,10 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
 
 
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:
-    """Remove inactive, unreferenced landmarks from the table, once the table is mostly unused.
+    """Remove inactive, unreferenced landmarks from the table, if most of its rows are unused.
 
-    Memory and time are then bounded by the current size of the map. The other landmarks get new IDs in the order of
-    the old ones; nothing else changes.
+    Memory and time then depend on the current size of the map, not on its history. The other landmarks get new IDs in
+    the order of the old ones; nothing else changes.
 
     Args:
         tables: Data of the map.
