@@ -65,7 +65,9 @@ def cull_keyframes(tables: MapTables, references: Mapping[int, int]) -> None:
 
 
 def cull_redundant_keyframes(tables: MapTables, newest: Keyframe, config: MappingConfig) -> None:
-    """Cull redundant neighbours of a new keyframe, in place; the first keyframe always stays, it fixes the world frame.
+    """Cull redundant neighbours of a new keyframe, in place.
+
+    The first keyframe stays, because it defines the world frame.
 
     Args:
         tables: Data of the map.
