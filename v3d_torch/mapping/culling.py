@@ -21,16 +21,16 @@ _MIN_FOUND_RATIO = 0.25
 """Minimum ratio of frames that matched a landmark to frames that should have matched it (ORB-SLAM2)."""
 
 _CONFIRMATION_KEYFRAMES = 3
-"""Keyframes after its own within which a landmark must be observed again, as in ORB-SLAM2."""
+"""Number of later keyframes within which a second keyframe must observe a landmark (ORB-SLAM2)."""
 
 _MIN_OBSERVATIONS = 2
-"""Observations that confirm a landmark: its own keyframe and another one."""
+"""Observations that confirm a landmark: by the keyframe that created it and by another one."""
 
 
 def cull_landmarks(tables: MapTables) -> None:
     """Cull landmarks with a low found ratio, and landmarks that no second keyframe has observed, in place.
 
-    A landmark is first checked when the keyframe after its own is complete.
+    The found ratio of a landmark is checked once a later keyframe exists.
 
     Args:
         tables: Data of the map.
@@ -65,7 +65,9 @@ def cull_keyframes(tables: MapTables, references: Mapping[int, int]) -> None:
 
 
 def cull_redundant_keyframes(tables: MapTables, newest: Keyframe, config: MappingConfig) -> None:
-    """Cull redundant neighbours of a new keyframe, in place; the first keyframe always stays, it fixes the world frame.
+    """Cull redundant neighbours of a new keyframe, in place.
+
+    The first keyframe stays, because it defines the world frame.
 
     Args:
         tables: Data of the map.

@@ -10,19 +10,20 @@ from torch import Tensor
 from v3d_torch.mapping.map_tables import MapTables
 
 _MAX_LANDMARKS_PER_OBSERVATION = 2
-"""Compaction starts above this ratio of table rows. Below, most rows are in use and compaction saves little."""
+"""Ratio of landmarks to observations above which the table is compacted. Every active landmark has at least one
+observation, so that more than half of the landmarks are inactive then."""
 
 
 def contains(ids: Tensor, queries: Tensor, count: int) -> Tensor:
     """Check which landmark IDs are in a set, by a lookup table because `torch.isin` sorts.
 
     Args:
-        ids: IDs in the set, int64, shape :math:`(L,)`; -1 for none.
-        queries: IDs to check, int64, shape :math:`(N,)`; -1 for none.
+        ids: IDs in the set, without -1, int64, shape :math:`(L,)`.
+        queries: IDs to check, -1 for none, int64, shape :math:`(N,)`.
         count: Number of landmarks in the map.
 
     Returns:
-        Bool, shape :math:`(N,)`.
+        True for queries in the set, False for -1, bool, shape :math:`(N,)`.
     """
     table = torch.zeros(count + 1, dtype=torch.bool)  # index -1 is the last entry
     return table.index_fill_(0, ids, True)[queries]
@@ -64,10 +65,10 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
 
 
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:
-    """Remove inactive, unreferenced landmarks from the table, once the table is mostly unused.
+    """Remove inactive, unreferenced landmarks from the table, if most of its rows are unused.
 
-    Memory and time are then bounded by the current size of the map. The other landmarks get new IDs in the order of
-    the old ones; nothing else changes.
+    Memory and time then depend on the current size of the map, not on its history. The other landmarks get new IDs in
+    the order of the old ones; nothing else changes.
 
     Args:
         tables: Data of the map.

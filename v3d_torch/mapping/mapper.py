@@ -79,8 +79,8 @@ class Mapper:
     def _needs_untracked_keyframe(self, stamp: float, features: Features, status: TrackingStatus) -> bool:
         """Decide whether to continue the map from a pose that was not tracked in the map.
 
-        This takes some time without tracking, during which the camera had enough features. A map of an earlier run
-        is only continued after relocalisation in that map.
+        This requires that tracking has failed for some time although the image had enough features. A map of an
+        earlier run is only continued after relocalisation in that map.
         """
         config = self._config.mapping
         if status is TrackingStatus.LOST and self.map.keyframes and self.map.keyframes[-1].is_from_earlier_run:
