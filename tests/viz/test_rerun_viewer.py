@@ -32,8 +32,7 @@ from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.frame_objects import MotionState
-from v3d_torch.pipeline import Pipeline
-from v3d_torch.pipeline import NULL_VIEWER
+from v3d_torch.pipeline import NULL_VIEWER, Pipeline
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
