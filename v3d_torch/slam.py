@@ -48,8 +48,8 @@ from v3d_torch.types import (
 )
 
 PREFETCHED_FRAMES = 4
-"""Number of frames that are preprocessed ahead: a frame that becomes a keyframe takes twice as long to track as others, and
-preprocessing continues meanwhile."""
+"""Number of frames that are preprocessed ahead: a frame that becomes a keyframe takes twice as long to track as others,
+and preprocessing continues meanwhile."""
 
 
 class V3DSLAM:
@@ -134,8 +134,8 @@ class V3DSLAM:
 
         Args:
             frame: Next frame.
-            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of the
-                camera; None if the pose is not known.
+            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
+                the camera; None if the pose is not known.
 
         Raises:
             InputError: If the frame is not valid or of another camera.

@@ -288,8 +288,8 @@ class Trajectory:
                 ) from error
             if value.shape[1:] != shape or value.ndim != 1 + len(shape) or len(value) != len(self.stamps):
                 raise InputError(
-                    f"{name} of a trajectory have shape {tuple(value.shape)}; give stamps of shape (N,) and poses T_wc of"
-                    " shape (N, 4, 4)"
+                    f"{name} of a trajectory have shape {tuple(value.shape)}; give stamps of shape (N,) and poses T_wc"
+                    " of shape (N, 4, 4)"
                 )
             object.__setattr__(self, name, value.to(torch.float64))
 

@@ -1,7 +1,7 @@
 """Typed configuration: one section per stage, each value with its unit and its reason.
 
-`v3d_torch.config.loading` reads it from YAML files and the command line; each run writes the resolved configuration beside
-its results. Values that only an expert of one file would change are named constants of that file.
+`v3d_torch.config.loading` reads it from YAML files and the command line; each run writes the resolved configuration
+beside its results. Values that only an expert of one file would change are named constants of that file.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class SegmentationConfig(Section):
     model: Literal["yolov8n-seg", "yolo11n-seg", "yolo26n-seg"] = "yolov8n-seg"
     """Network. The paper names YOLOv8; its nano model is small enough for a CPU that also tracks the camera."""
     height: int = Field(320, gt=0, multiple_of=32)
-    """Rows of the network input, pixels. Two thirds of a 640x480 image halve the time; a person at 6 m is still about 100
-    pixels high, and the depth completes the outlines."""
+    """Rows of the network input, pixels. Two thirds of a 640x480 image halve the time; a person at 6 m is still about
+    100 pixels high, and the depth completes the outlines."""
     width: int = Field(416, gt=0, multiple_of=32)
     """Columns of the network input, pixels."""
     precision: Literal["int8", "float32"] = "int8"
@@ -35,7 +35,8 @@ class SegmentationConfig(Section):
     score_threshold: float = Field(0.25, ge=0, le=1)
     """Minimum class score; 0.25 is the default of YOLOv8's authors. A missed person costs more than a false one."""
     iou_threshold: float = Field(0.7, ge=0, le=1)
-    """Boxes of one class with a larger intersection over union are the same instance (non-maximum suppression; YOLOv8)."""
+    """Boxes of one class with a larger intersection over union are the same instance (non-maximum suppression;
+    YOLOv8)."""
     duplicate_overlap: float = Field(0.7, gt=0, le=1)
     """An instance is a duplicate if a larger fraction of it lies within a better one of its class."""
     upright: bool = True
@@ -61,10 +62,11 @@ class CloudConfig(Section):
     """Instance clouds and their outlier rejection (paper, Sec. III-B.2)."""
 
     stride: int = Field(4, gt=0, le=100)
-    """Every n-th pixel of a mask becomes a point: the network predicts masks in cells of 4 pixels. Up to 4 m the points of
-    a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN."""
+    """Every n-th pixel of a mask becomes a point: the network predicts masks in cells of 4 pixels. Up to 4 m the points
+    of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN."""
     max_depth: float = Field(6.0, gt=0)
-    """Maximum depth of points, metres: the depth error of a Kinect reaches 0.1 m there, as large as the motion to detect."""
+    """Maximum depth of points, metres: the depth error of a Kinect reaches 0.1 m there, as large as the motion to
+    detect."""
     voxel_size: float = Field(0.02, gt=0)
     """Side of a voxel, metres (authors' code)."""
     eps: float = Field(0.08, gt=0)
@@ -103,8 +105,8 @@ class VotingConfig(Section):
     """T_v, votes that make an object dynamic (authors' code: more than one)."""
     baselines: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
     """Distances are compared with those of so many seconds ago; 0 is the previous frame (the paper's rule). At 1 m/s a
-    person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections are
-    stored for 1 s."""
+    person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections
+    are stored for 1 s."""
 
 
 class FreeSpaceConfig(Section):
@@ -117,8 +119,8 @@ class FreeSpaceConfig(Section):
     enabled: bool = True
     """False for the paper's literal rules."""
     baselines: tuple[float, ...] = (0.3, 0.9)
-    """The present depth is compared with that of so many seconds ago: a walking person moves 0.3 m in the first, a slow one
-    in the second."""
+    """The present depth is compared with that of so many seconds ago: a walking person moves 0.3 m in the first, a slow
+    one in the second."""
     min_unlabelled_area: float = Field(0.02, gt=0)
     """Minimum area of an unlabelled moving region, square metres: a hand with its forearm. Infinite in the ablation."""
     max_depth: float = Field(6.0, gt=0)
@@ -128,8 +130,8 @@ class FreeSpaceConfig(Section):
     min_tolerance: float = Field(0.04, gt=0)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
     depth_sync_error: float = Field(0.02, ge=0, le=1)
-    """Time between colour and depth of a frame, seconds: TUM associates up to this difference, and reading half an image
-    takes as long. A turning camera observes them as many pixels apart as it turns meanwhile."""
+    """Time between colour and depth of a frame, seconds: TUM associates up to this difference, and reading half an
+    image takes as long. A turning camera observes them as many pixels apart as it turns meanwhile."""
     min_depth: float = Field(0.3, gt=0)
     """Minimum depth of points that are checked, metres: below the range of the cameras."""
     min_points: int = Field(30, gt=0)
@@ -143,11 +145,11 @@ class ChamferConfig(Section):
     """False in the ablation."""
     distance_threshold: float = Field(0.025, gt=0)
     """Root-mean-square nearest-neighbour distance above which an object deforms, metres: sqrt(D / 2), where D is the
-    paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a Kinect
-    at 3 m adds as much."""
+    paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a
+    Kinect at 3 m adds as much."""
     baseline: float = Field(0.3, ge=0, le=1)
-    """The cloud is compared with that of so many seconds ago; 0 is the previous frame (the paper's rule). Detections are
-    stored for 1 s."""
+    """The cloud is compared with that of so many seconds ago; 0 is the previous frame (the paper's rule). Detections
+    are stored for 1 s."""
     keep_deforming_features: bool = False
     """True to track features on deforming objects. The paper's text says both; its code masks them."""
 
@@ -156,24 +158,26 @@ class StaticMaskConfig(Section):
     """Mask of the static pixels, on which the camera is tracked."""
 
     confirm_static_time: float = Field(1.0, ge=0)
-    """A person is masked until observed static for so long, seconds (the paper masks persons until they are classified)."""
+    """A person is masked until observed static for so long, seconds (the paper masks persons until they are
+    classified)."""
     hold_dynamic_time: float = Field(1.0, ge=0)
-    """An object stays dynamic or deforming for so long after the last evidence, seconds: a walking person pauses between
-    steps. A thing that is observed at rest is released at once."""
+    """An object stays dynamic or deforming for so long after the last evidence, seconds: a walking person pauses
+    between steps. A thing that is observed at rest is released at once."""
     confirm_dynamic_frames: int = Field(2, gt=0)
     """Frames with evidence before a dynamic state is held: one can be depth noise."""
     dilation: int = Field(2, ge=0, le=100)
     """Dilation of masks regardless of depth, pixels: the alignment error of colour and depth."""
     depth_margin: int = Field(8, ge=0, le=100)
-    """Dilation of masks over pixels with the depth of the object or without depth, pixels: a network mask at a quarter of
-    the resolution is off by about two of its pixels."""
+    """Dilation of masks over pixels with the depth of the object or without depth, pixels: a network mask at a quarter
+    of the resolution is off by about two of its pixels."""
     surface_margin: int = Field(32, ge=0, le=1000)
-    """Dilation of masks along a continuous surface, pixels: a hand at 3 m. Larger values also mask more of a table that a
-    person touches. 0 turns it off."""
+    """Dilation of masks along a continuous surface, pixels: a hand at 3 m. Larger values also mask more of a table that
+    a person touches. 0 turns it off."""
     edge_ratio: float = Field(0.04, gt=0)
     """Relative depth difference over four pixels that is an edge: a surface seen at 80 degrees differs by 0.03."""
     min_surface_fraction: float = Field(0.4, ge=0, le=1)
-    """A mask does not grow along a surface of which the object would be a smaller fraction, such as a floor or table."""
+    """A mask does not grow along a surface of which the object would be a smaller fraction, such as a floor or
+    table."""
     depth_tolerance: float = Field(0.05, gt=0)
     """Maximum depth difference between a pixel and the points of the object around it, metres, in addition to the depth
     noise."""
@@ -202,15 +206,16 @@ class FeaturesConfig(Section):
     cell: int = Field(32, gt=0)
     """Side of the grid cells over which selected features are spread, pixels."""
     max_depth: float = Field(8.0, gt=0)
-    """Maximum depth of features, metres: the depth error of a Kinect exceeds 0.2 m there. Beyond it a feature has no depth."""
+    """Maximum depth of features, metres: the depth error of a Kinect exceeds 0.2 m there. Beyond it a feature has no
+    depth."""
 
 
 class OdometryConfig(Section):
     """Camera motion between two frames from features (paper, Sec. III-E)."""
 
     max_features: int = Field(500, gt=0)
-    """Features of a frame that are matched with all features of the next one, spread over the image. More take longer and
-    do not improve the pose, which the map refines. Relocalisation matches all features."""
+    """Features of a frame that are matched with all features of the next one, spread over the image. More take longer
+    and do not improve the pose, which the map refines. Relocalisation matches all features."""
     max_ratio: float = Field(0.8, gt=0, le=1)
     """Lowe's ratio between the best and the second Hamming distance."""
     max_hamming: int = Field(64, gt=0, le=256)
@@ -227,8 +232,8 @@ class DenseOdometryConfig(Section):
     """Camera motion between two frames from all pixels, used when features fail."""
 
     halvings: tuple[int, ...] = (4, 2, 1)
-    """Number of halvings of the image at each pyramid level, coarse to fine. A shift of 60 pixels between frames is 4 at the
-    coarsest level."""
+    """Number of halvings of the image at each pyramid level, coarse to fine. A shift of 60 pixels between frames is 4
+    at the coarsest level."""
     max_points: int = Field(5000, gt=0)
     """Approximate number of pixels used at a level, one per grid cell; it bounds the time."""
     iterations: int = Field(10, gt=0)
@@ -240,12 +245,13 @@ class DenseOdometryConfig(Section):
     degrees_of_freedom: float = Field(5.0, gt=0)
     """Degrees of freedom of the t-distribution of the residuals (Kerl et al., ICRA 2013)."""
     inverse_depth_sigma: float = Field(0.003, gt=0)
-    """Minimum standard deviation of inverse depth, 1/m: twice that of the sensor (Khoshelham and Elberink, Sensors 2012)."""
+    """Minimum standard deviation of inverse depth, 1/m: twice that of the sensor (Khoshelham and Elberink, Sensors
+    2012)."""
     min_overlap: float = Field(0.3, gt=0, le=1)
     """Minimum fraction of the reference points that are visible in the current frame."""
     min_observability: float = Field(1e-3, gt=0, le=1)
-    """Minimum ratio of the smallest to the largest eigenvalue of the information matrix, with translation measured in median
-    depths. Below it, some motion is not observable, as in front of a wall without texture."""
+    """Minimum ratio of the smallest to the largest eigenvalue of the information matrix, with translation measured in
+    median depths. Below it, some motion is not observable, as in front of a wall without texture."""
 
 
 class TrackingConfig(Section):
@@ -256,9 +262,10 @@ class TrackingConfig(Section):
     max_ratio: float = Field(0.9, gt=0, le=1)
     """Lowe's ratio among the candidates within the search radius."""
     inverse_depth_sigma: float = Field(0.025, gt=0)
-    """Standard deviation of inverse depth, 1/m; that of depth is this times the squared depth. A static plane gives 0.0014
-    (Khoshelham and Elberink, Sensors 2012), but corners lie on depth edges, and colour and depth are neither simultaneous nor
-    perfectly registered. It equals ORB-SLAM2's setting: a pixel of disparity at a baseline of 40 pixel metres."""
+    """Standard deviation of inverse depth, 1/m; that of depth is this times the squared depth. A static plane gives
+    0.0014 (Khoshelham and Elberink, Sensors 2012), but corners lie on depth edges, and colour and depth are neither
+    simultaneous nor perfectly registered. It equals ORB-SLAM2's setting: a pixel of disparity at a baseline of 40 pixel
+    metres."""
     pixel_sigma: float = Field(1.0, gt=0)
     """Standard deviation of the position of a feature at level 0, pixels."""
     min_inliers: int = Field(20, gt=0)
@@ -273,11 +280,12 @@ class RollingShutterConfig(Section):
     enabled: bool = True
     """False to treat all rows of both images as simultaneous."""
     readout: float = Field(0.02, ge=-0.05, le=0.05)
-    """Expected time from the first row to the last, seconds, until the map has calibrated it; not used if the camera states
-    its readout. The colour cameras of Kinect, Xtion, D415 and D435 have a rolling shutter of 0.02 to 0.03 s; that of the D455
-    is global."""
+    """Expected time from the first row to the last, seconds, until the map has calibrated it; not used if the camera
+    states its readout. The colour cameras of Kinect, Xtion, D415 and D435 have a rolling shutter of 0.02 to 0.03 s;
+    that of the D455 is global."""
     readout_sigma: float = Field(0.015, gt=0)
-    """Standard deviation of the expected readout, seconds: a global shutter and the slowest one are both within 2 of it."""
+    """Standard deviation of the expected readout, seconds: a global shutter and the slowest one are both within 2 of
+    it."""
     calibration_keyframes: int = Field(20, ge=0)
     """Number of first keyframes that update the readout; after them every tenth does."""
 
@@ -290,13 +298,13 @@ class MappingConfig(Section):
     max_keyframe_interval: int = Field(20, gt=0)
     """Maximum number of frames between keyframes."""
     min_tracked_ratio: float = Field(0.75, gt=0, le=1)
-    """A frame becomes a keyframe if it finds a smaller fraction of the landmarks that the best frame since the last keyframe
-    found (ORB-SLAM2 for RGB-D)."""
+    """A frame becomes a keyframe if it finds a smaller fraction of the landmarks that the best frame since the last
+    keyframe found (ORB-SLAM2 for RGB-D)."""
     min_tracked: int = Field(100, gt=0)
     """A frame becomes a keyframe if it finds fewer landmarks."""
     map_by_odometry_after: float = Field(0.5, ge=0)
-    """Time without the map after which a camera with known motion extends the map by odometry, seconds. Odometry drifts;
-    mostly the map is found again earlier."""
+    """Time without the map after which a camera with known motion extends the map by odometry, seconds. Odometry
+    drifts; mostly the map is found again earlier."""
     restart_after: float = Field(1.0, gt=0)
     """Time after which a lost camera that observes enough features starts a disconnected part of the map, seconds."""
     landmarks_per_keyframe: int = Field(1000, gt=0)
@@ -304,7 +312,8 @@ class MappingConfig(Section):
     fusion_keyframes: int = Field(10, ge=0)
     """Number of neighbours in which the landmarks of a new keyframe are searched and fused (ORB-SLAM2 for RGB-D)."""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
-    """A keyframe is culled if a larger fraction of its landmarks is observed well by others (ORB-SLAM2). 1 culls none."""
+    """A keyframe is culled if a larger fraction of its landmarks is observed well by others (ORB-SLAM2). 1 culls
+    none."""
     redundant_views: int = Field(3, gt=0)
     """Number of other keyframes that must observe such a landmark (ORB-SLAM2)."""
     bundle_keyframes: int = Field(15, ge=0)
@@ -323,8 +332,8 @@ class LoopConfig(Section):
     min_inliers: int = Field(40, gt=0)
     """Minimum number of inliers of the geometric verification."""
     min_inlier_ratio: float = Field(0.15, ge=0, le=1)
-    """Minimum fraction of the visible landmarks that are inliers: with fewer the pose is less accurate than the drift that it
-    would correct. Relocalisation of a lost camera does not need it."""
+    """Minimum fraction of the visible landmarks that are inliers: with fewer the pose is less accurate than the drift
+    that it would correct. Relocalisation of a lost camera does not need it."""
 
 
 class MeshConfig(Section):
@@ -335,7 +344,8 @@ class MeshConfig(Section):
     voxel_size: float = Field(0.02, gt=0)
     """Side of a voxel, metres: the pixels used lie 1.5 cm apart at 4 m, where the depth error is 2 cm."""
     truncation: float = Field(0.08, gt=0)
-    """Truncation distance of the signed distance function, metres: three times the error of depth at 4 m and of poses."""
+    """Truncation distance of the signed distance function, metres: three times the error of depth at 4 m and of
+    poses."""
 
 
 class DenseMapConfig(Section):
@@ -367,11 +377,11 @@ class Config(Section):
     threads: int = Field(1, gt=0, le=256)
     """Threads of torch and OpenCV: the tensors of a frame are small, and more threads mostly wait for each other."""
     prefetch: bool = True
-    """True to preprocess the next frames in another thread or process while one is tracked, and to run the back end in a
-    thread. The results are the same."""
+    """True to preprocess the next frames in another thread or process while one is tracked, and to run the back end in
+    a thread. The results are the same."""
     check_numerics: bool = False
-    """True to check everything that a stage returns for NaN and infinity; the first stage that returns one is named. The
-    results are the same. In Python: `v3d_torch.runs.numerics_check.CheckedSLAM`."""
+    """True to check everything that a stage returns for NaN and infinity; the first stage that returns one is named.
+    The results are the same. In Python: `v3d_torch.runs.numerics_check.CheckedSLAM`."""
     segmentation: SegmentationConfig = SegmentationConfig()
     depth: DepthConfig = DepthConfig()
     objects: ObjectsConfig = ObjectsConfig()

@@ -74,8 +74,8 @@ def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Pat
         indices = associate(list(colour_by_stamp), list(depth_by_stamp), MAX_STAMP_DIFFERENCE)
         if not indices:
             raise InputError(
-                f"{folder}: no colour image is within {MAX_STAMP_DIFFERENCE} s of a depth image; check that both belong to"
-                " the same recording"
+                f"{folder}: no colour image is within {MAX_STAMP_DIFFERENCE} s of a depth image; check that both belong"
+                " to the same recording"
             )
         return [(list(colour_by_stamp.values())[i], list(depth_by_stamp.values())[j]) for i, j in indices]
     depth_by_name = {_without_kind(path): path for path in depth}

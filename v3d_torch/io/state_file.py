@@ -77,8 +77,8 @@ def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any
             metadata = json.loads(file.readline())
             if metadata["v3d-torch"] != version("v3d-torch"):
                 raise InputError(
-                    f"{path}: was written by v3d-torch {metadata['v3d-torch']}, this is {version('v3d-torch')}; continue"
-                    " with that version, or start a new run"
+                    f"{path}: was written by v3d-torch {metadata['v3d-torch']}, this is {version('v3d-torch')}; "
+                    "continue with that version, or start a new run"
                 )
             with torch.serialization.safe_globals(list(classes)):
                 return metadata, torch.load(file, weights_only=True)

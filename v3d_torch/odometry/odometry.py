@@ -43,7 +43,8 @@ class CameraMotion:
     Attributes:
         T_cp: Maps points from the previous camera to the current one, float64, shape :math:`(4, 4)`.
         velocity: Mean twist per second, ``[m/s, rad/s]``, float64, shape :math:`(6,)`.
-        pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape :math:`(K, 2)`;
+        pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape :math:`(K,
+            2)`;
             K = 0 for a motion found by dense alignment, and for a prediction.
         is_measured: True if the frames were registered, False if the motion is only predicted.
     """

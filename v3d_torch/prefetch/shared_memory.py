@@ -20,8 +20,8 @@ from torch import Tensor
 _NUMBER = struct.Struct("!Q")
 
 SLOT_BYTES = 1 << 26
-"""Size of the shared memory for one value in transit, bytes. Only the pages in use take memory: about 5 MB for a frame of
-640x480 pixels."""
+"""Size of the shared memory for one value in transit, bytes. Only the pages in use take memory: about 5 MB for a frame
+of 640x480 pixels."""
 
 _SMALL = 1 << 14
 """Values up to this size, bytes, are sent through the socket, which buffers them."""

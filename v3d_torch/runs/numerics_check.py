@@ -1,7 +1,7 @@
 """Debug mode: everything that a stage returns is checked for NaN and infinity, and the first such stage is named.
 
-A NaN spreads before it becomes visible, from a pose to a keyframe to the map. `CheckedSLAM` stops at the stage that returned it.
-Its results are byte-identical to those of `V3DSLAM`.
+A NaN spreads before it becomes visible, from a pose to a keyframe to the map. `CheckedSLAM` stops at the stage that
+returned it. Its results are byte-identical to those of `V3DSLAM`.
 """
 
 from __future__ import annotations

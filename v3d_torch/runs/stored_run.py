@@ -186,7 +186,8 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> pa.Table | None:
         raise InputError(f"{path}: is not a parquet table ({reason}); run the sequence again") from error
     if missing:
         raise InputError(
-            f"{path}: has no columns {', '.join(sorted(missing))}; the file is from another version, run the sequence again"
+            f"{path}: has no columns {', '.join(sorted(missing))}; the file is from another version, run the sequence"
+            " again"
         )
     return table
 

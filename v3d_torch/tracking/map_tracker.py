@@ -14,8 +14,8 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
 
 _SEARCH_RADIUS = 10.0
-"""Radius around the projection of a landmark in which it is matched, pixels at level 0; it grows with the level. The error of
-a predicted pose is some pixels."""
+"""Radius around the projection of a landmark in which it is matched, pixels at level 0; it grows with the level. The
+error of a predicted pose is some pixels."""
 
 _REFINED_SEARCH_RATIO = 0.5
 """The second search starts from a refined pose and uses this fraction of the radius."""

@@ -15,8 +15,8 @@ from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
 
 MAX_EXTRAPOLATION = 0.2
-"""Longest time over which a velocity is extrapolated, seconds: a hand changes its motion within that time. A camera that is
-lost for longer is predicted to stand still."""
+"""Longest time over which a velocity is extrapolated, seconds: a hand changes its motion within that time. A camera
+that is lost for longer is predicted to stand still."""
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,7 @@ def _relative(T_cw: Tensor, keyframe: Keyframe | None) -> Tensor:
 
 
 def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:
-    """Interpolate poses along the geodesic between the nearest found ones; those before and after all found ones stay."""
+    """Interpolate lost poses along the geodesic between the nearest found ones; those at the ends stay."""
     known = torch.nonzero(found)[:, 0]
     if known.shape[0] == 0:
         return T
