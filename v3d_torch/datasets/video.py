@@ -66,8 +66,8 @@ class VideoSequence(StoredSequence):
         self._pairs = associate(stamps, depth_stamps, MAX_STAMP_DIFFERENCE)
         if not self._pairs:
             raise InputError(
-                f"{colour_path}: no frame is within {MAX_STAMP_DIFFERENCE} s of a frame in {depth_path.name}; check that"
-                " both videos belong to the same recording"
+                f"{colour_path}: no frame is within {MAX_STAMP_DIFFERENCE} s of a frame in {depth_path.name}; check"
+                " that both videos belong to the same recording"
             )
         super().__init__(path.resolve().stem, [stamps[i] for i, _ in self._pairs], chosen)
         self._colour_frames = Cursor(lambda: _open_frames(colour_path))
