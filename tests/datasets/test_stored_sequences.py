@@ -193,7 +193,7 @@ def swap_lists(folder: Path) -> None:
         (lambda f: (f / "rgb.txt").write_text("10 rgb/0.png\nnow rgb/1.png"), "line 2 has 'now', expected a timestamp"),
         (lambda f: (f / "rgb.txt").write_text("nan rgb/1.png"), "line 1 has 'nan', expected a timestamp"),
         (lambda f: (f / "rgb.txt").write_text("rgb/1.png"), "line 1 is 'rgb/1.png', expected a timestamp and a file"),
-        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe1\x000"), "not a text file"),
+        (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe1\x000"), "is not a UTF-8 text file"),
         (lambda f: (f / "associations.txt").write_text("10 rgb/0.png depth/0.png"), "timestamp, file, timestamp, file"),
         (lambda f: (f / "depth.txt").write_text("10.5 depth/0.png"), "no timestamp in rgb.txt is within 0.02 s"),
         (lambda f: (f / "rgb" / "0.png").unlink(), "rgb/0.png: is listed but does not exist .1 missing"),

@@ -160,4 +160,4 @@ def test_labelled_and_unlabelled_instances_are_concatenated_in_order() -> None:
 def test_class_names_include_unlabelled() -> None:
     assert [class_name(label) for label in range(80)] == list(COCO_NAMES)
     assert class_name(PERSON) == "person"
-    assert class_name(UNLABELLED) == "unnamed" and "unnamed" not in COCO_NAMES
+    assert class_name(UNLABELLED) == "unlabelled" and "unlabelled" not in COCO_NAMES

@@ -124,7 +124,7 @@ def test_sequence_exercises_all_state(uninterrupted: Pipeline) -> None:
     }
     assert slam.loop_closer.loop_count > 0 and len(slam.map.keyframes) > 10
     assert not slam.map.landmarks["active"].all()
-    assert {"person", "unnamed"} <= {str(row["class"]) for row in rows}
+    assert {"person", "unlabelled"} <= {str(row["class"]) for row in rows}
     assert {"dynamic", "static"} <= {str(row["motion_state"]) for row in rows}
     assert any(row["missed"] for row in rows) and any(row["votes"] for row in rows)
     state = segmenter_state_of(slam.segment)

@@ -31,4 +31,4 @@ set, because an unlabelled object can be a person."""
 
 def class_name(label: int) -> str:
     """Name of a class index or of `UNLABELLED`."""
-    return "unnamed" if label == UNLABELLED else COCO_NAMES[label]
+    return "unlabelled" if label == UNLABELLED else COCO_NAMES[label]
