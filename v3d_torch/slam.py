@@ -55,8 +55,9 @@ and preprocessing continues meanwhile."""
 class V3DSLAM:
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
-    Every stage is an attribute and can be replaced by a callable with the same signature. `preprocess` uses the stages
-    that need the frame alone, and can run ahead of `track`, which uses the others.
+    Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
+    signature. `compensate`, `register`, `track_map` and `loop_closer` are also used inside other stages, which keep
+    their own references. `preprocess` uses the stages that need the frame alone, and can run ahead of `track`.
 
     Args:
         camera: Camera of all frames.

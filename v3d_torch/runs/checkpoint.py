@@ -121,14 +121,14 @@ def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
     """
     if not isinstance(sequence, RGBDSequence):
         return "it is a live stream"
-    then, now = checkpoint.sequence, _fingerprint(sequence)
+    stored, current = checkpoint.sequence, _fingerprint(sequence)
     changes = {
-        "frames": f"{now['frames']} frames instead of {then['frames']}",
+        "frames": f"{current['frames']} frames instead of {stored['frames']}",
         "timestamps": "other timestamps",
         "camera": "another camera",
     }
     for key, change in changes.items():
-        if then[key] != now[key]:
+        if stored[key] != current[key]:
             return change
     last = checkpoint.state["slam"]["previous"].frame
     again = sequence[last.index]

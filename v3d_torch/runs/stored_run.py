@@ -97,9 +97,8 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     config_text = read_text(config_path, "it is a configuration in YAML") if config_path.is_file() else ""
     metrics, trajectory = read_metrics(folder / _METRICS), _read_poses(folder / "trajectory.txt")
     frames = len(metrics.status)
-    if (
-        trajectory is not None and metrics.failure is not None
-    ):  # killed between the two files: the trajectory has more poses
+    if trajectory is not None and metrics.failure is not None:
+        # If the run was killed between the two files, the trajectory has more poses.
         trajectory = Trajectory(trajectory.stamps[:frames], trajectory.T_wc[:frames])
     if trajectory is not None and len(trajectory) != frames:
         raise InputError(
