@@ -18,7 +18,12 @@ SLOWEST = ("test_real_sequences.py", "cli/test_run.py", "test_corpus.py", "cli/t
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the slowest files first; tests within a file keep their order."""
-    items.sort(key=lambda item: SLOWEST.index(item.path.name) if item.path.name in SLOWEST else len(SLOWEST))
+
+    def order(item: pytest.Item) -> int:
+        path = item.path.relative_to(Path(__file__).parent).as_posix()
+        return SLOWEST.index(path) if path in SLOWEST else len(SLOWEST)
+
+    items.sort(key=order)
 
 
 collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
