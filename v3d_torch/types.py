@@ -259,7 +259,7 @@ class FramePose:
     @property
     def count(self) -> int:
         """Number of landmarks found."""
-        return int((self.landmarks >= 0).sum())
+        return len(self.landmark_ids)
 
 
 @dataclass(frozen=True)

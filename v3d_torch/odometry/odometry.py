@@ -70,10 +70,9 @@ class CameraMotion:
         Returns:
             Landmark id of each feature, int64, shape ``(count,)``; -1 = none.
         """
-        landmarks = torch.full((count,), -1, dtype=torch.int64)
-        if previous is not None and previous.landmark_ids is not None:
-            landmarks[self.pairs[:, 1]] = previous.landmark_ids[self.pairs[:, 0]]
-        return landmarks
+        if previous is None or previous.landmark_ids is None:
+            return torch.full((count,), -1, dtype=torch.int64)
+        return RelativeMotion(self.T_cp, self.pairs).propagate_landmarks(previous.landmark_ids, count)
 
 
 class Odometry:

@@ -46,7 +46,7 @@ class MapTracking:
     @property
     def count(self) -> int:
         """Number of landmarks that were found."""
-        return int((self.landmarks >= 0).sum())
+        return len(self.found)
 
 
 class MapTracker:
