@@ -211,7 +211,7 @@ class V3DSLAM:
         self.timer.add(result.seconds)
         with self.timer("mapping"):
             self._apply_world_correction(self.back_end.apply(result))
-            previous = None if self._previous is None else self._previous.landmark_ids
+            previous = None if self._previous is None else self._previous.landmarks
             self.map.compact([self.poses.landmark_ids] if previous is None else [self.poses.landmark_ids, previous])
 
     def advance_predictions(self) -> PosePrediction | None:

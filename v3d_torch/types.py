@@ -244,7 +244,7 @@ class FramePose:
     Attributes:
         status: Source of the pose.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-        landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
+        landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
     """
 
     status: TrackingStatus
@@ -253,7 +253,7 @@ class FramePose:
 
     @property
     def landmark_ids(self) -> Tensor:
-        """Ids of the landmarks found, int64, shape :math:`(F,)`."""
+        """IDs of the landmarks found, int64, shape :math:`(F,)`."""
         return self.landmarks[self.landmarks >= 0]
 
     @property

@@ -180,7 +180,7 @@ def test_loop_correction_fuses_the_landmarks_of_both_laps(closed: Camera, drifte
 
     def shared(camera: Camera) -> int:
         landmarks = camera.map.keyframes[first + 1].landmarks
-        return int(camera.map.count_shared(landmarks[landmarks >= 0])[: LAP // 2].sum())
+        return int(camera.map.count_shared_landmarks(landmarks[landmarks >= 0])[: LAP // 2].sum())
 
     assert shared(drifted) == 0
     assert shared(closed) > 100

@@ -107,9 +107,9 @@ def test_culling_a_keyframe_removes_its_observations_and_its_own_landmarks_only(
     insert(sparse_map, dict.fromkeys(range(1, LANDMARKS), 0), new=1)
     for _ in range(3):
         insert(sparse_map, dict.fromkeys(range(LANDMARKS), 0))
-    before = sparse_map.count_shared(torch.arange(LANDMARKS + 1))
+    before = sparse_map.count_shared_landmarks(torch.arange(LANDMARKS + 1))
     sparse_map.cull_keyframes({1: 2})
-    culled, after = sparse_map.keyframes[1], sparse_map.count_shared(torch.arange(LANDMARKS + 1))
+    culled, after = sparse_map.keyframes[1], sparse_map.count_shared_landmarks(torch.arange(LANDMARKS + 1))
     assert len(culled.features) == len(culled.landmarks) == after[1] == 0
     assert torch.equal(after[[0, 2, 3, 4]], before[[0, 2, 3, 4]])
     assert torch.nonzero(~sparse_map.landmarks["active"]).tolist() == [[LANDMARKS]]

@@ -86,7 +86,7 @@ def test_landmarks_of_one_point_are_merged_into_the_oldest() -> None:
     oldest = [min(room.landmarks_of(point)) for point in doubled]
     room.fuse()
     assert [room.landmarks_of(point) for point in doubled] == [{landmark} for landmark in oldest]
-    assert room.map.count_shared(torch.tensor(oldest)).tolist() == 3 * [len(doubled)]
+    assert room.map.count_shared_landmarks(torch.tensor(oldest)).tolist() == 3 * [len(doubled)]
 
 
 def test_match_counters_of_merged_landmarks_are_added() -> None:

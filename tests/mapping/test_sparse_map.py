@@ -99,7 +99,7 @@ def test_covisibility_equals_plain_counting(observed_sets: tuple[SparseMap, list
     sparse_map, sets = observed_sets
     wanted = {1, 5, 8, 13, 21, 34}
     counts = [len(wanted & observed) for observed in sets]
-    assert sparse_map.count_shared(torch.tensor(sorted(wanted))).tolist() == counts
+    assert sparse_map.count_shared_landmarks(torch.tensor(sorted(wanted))).tolist() == counts
     newest_of_equals_first = sorted((k for k in range(12) if counts[k]), key=lambda k: (-counts[k], -k))
     assert sparse_map.covisible_keyframes(torch.tensor(sorted(wanted)), 5).tolist() == newest_of_equals_first[:5]
     pairs = [[i, j] for i in range(12) for j in range(i + 1, 12) if len(sets[i] & sets[j]) >= 7 or j == i + 1]
@@ -128,10 +128,10 @@ def test_removed_observations_do_not_count(observed_sets: tuple[SparseMap, list[
     rows = torch.nonzero((table["keyframe"] == 4) & (table["landmark"] % 2 == 0))[:, 0]
     removed = table["landmark"][rows]
     kept = sparse_map.keyframes[4].landmarks[sparse_map.keyframes[4].landmarks % 2 == 1]
-    assert sparse_map.count_shared(removed)[4] == len(removed) > 0
+    assert sparse_map.count_shared_landmarks(removed)[4] == len(removed) > 0
     sparse_map.remove_observations(rows)
-    assert sparse_map.count_shared(removed)[4] == 0
-    assert sparse_map.count_shared(kept)[4] == len(kept)
+    assert sparse_map.count_shared_landmarks(removed)[4] == 0
+    assert sparse_map.count_shared_landmarks(kept)[4] == len(kept)
     assert sparse_map.keyframes[4].landmarks[sparse_map.keyframes[4].landmarks >= 0].tolist() == kept.tolist()
 
 
@@ -144,7 +144,7 @@ def test_fused_landmarks_become_the_older_landmark(observed_sets: tuple[SparseMa
     assert newest.landmarks.tolist() == [4, 41, 7, 43, 44, 30]
     assert not sparse_map.landmarks["active"][duplicates].any()
     assert not torch.isin(sparse_map.observations["landmark"], torch.tensor(duplicates)).any()
-    counts = sparse_map.count_shared(torch.tensor([4, 7, 30])).tolist()
+    counts = sparse_map.count_shared_landmarks(torch.tensor([4, 7, 30])).tolist()
     assert counts == [len({4, 7, 30} & observed) for observed in sets] + [3]
 
 

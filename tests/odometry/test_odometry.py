@@ -119,9 +119,9 @@ def test_inlier_mask_selects_the_matched_features_of_the_current_frame() -> None
 
 def test_landmarks_are_propagated_by_the_inlier_matches(demo: RGBDSequence) -> None:
     motion = CameraMotion(PREDICTED_T_CP, PREDICTED_VELOCITY, PAIRS, is_measured=True)
-    previous = replace(two_frames(demo, 0, 1).previous, landmark_ids=torch.tensor([10, 11, -1, 13, 14]))
+    previous = replace(two_frames(demo, 0, 1).previous, landmarks=torch.tensor([10, 11, -1, 13, 14]))
     assert motion.propagate_landmarks(previous, 7).tolist() == [14, -1, -1, -1, -1, 10, -1]
-    assert motion.propagate_landmarks(replace(previous, landmark_ids=None), 7).tolist() == 7 * [-1]
+    assert motion.propagate_landmarks(replace(previous, landmarks=None), 7).tolist() == 7 * [-1]
     assert motion.propagate_landmarks(None, 7).tolist() == 7 * [-1]
 
 

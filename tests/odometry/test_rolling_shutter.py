@@ -192,7 +192,7 @@ def test_pose_of_the_previous_frame_is_refined_with_a_better_velocity() -> None:
     )
     observed = observe_rolling(points_in_view() @ T_cw[:3, :3].T + T_cw[:3, 3], VELOCITY, KINECT.seconds)
     image, depth = torch.zeros(3, 480, 640, dtype=torch.uint8), torch.zeros(1, 480, 640)
-    previous = TrackedFrame(RGBDFrame(1, 0.1, image, depth), depth, observed, landmark_ids=first.landmarks)
+    previous = TrackedFrame(RGBDFrame(1, 0.1, image, depth), depth, observed, landmarks=first.landmarks)
     refine = PreviousFrameRefinement(
         TimeCompensation(config, CAMERA),
         MapTracker(config.tracking, config.features, CAMERA),
@@ -213,7 +213,7 @@ def test_pose_of_the_previous_frame_is_refined_with_a_better_velocity() -> None:
 
     few = torch.where(torch.arange(200) < config.tracking.min_inliers - 1, first.landmarks, -1)
     before = poses.T_cw
-    refine(replace(previous, landmark_ids=few), AT_REST, poses)
+    refine(replace(previous, landmarks=few), AT_REST, poses)
     refine(previous, None, poses)
     assert torch.equal(poses.T_cw, before)
 

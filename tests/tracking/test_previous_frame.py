@@ -92,7 +92,7 @@ def test_refinement_tolerates_some_wrong_landmarks() -> None:
     scene = Scene()
     before, ids = scene.pose_error(), scene.ids.clone()
     ids[:40] = ids[:40].flip(0)
-    scene.refine(replace(scene.previous, landmark_ids=ids))
+    scene.refine(replace(scene.previous, landmarks=ids))
     assert scene.pose_error() < 0.3 * before
 
 
@@ -103,7 +103,7 @@ def test_features_without_an_active_landmark_are_not_used() -> None:
     scene.map.landmarks["point"][wrong] += 5.0
     ids[75:150] = -1
     before = scene.pose_error()
-    scene.refine(replace(scene.previous, landmark_ids=ids))
+    scene.refine(replace(scene.previous, landmarks=ids))
     assert scene.pose_error() < 0.1 * before
 
 
@@ -133,7 +133,7 @@ def test_pose_stays_with_too_few_landmarks() -> None:
     scene = Scene()
     T_cw, ids = scene.poses.T_cw, scene.ids.clone()
     ids[scene.config.tracking.min_inliers - 1 :] = -1
-    scene.refine(replace(scene.previous, landmark_ids=ids))
+    scene.refine(replace(scene.previous, landmarks=ids))
     assert torch.equal(scene.poses.T_cw, T_cw)
 
 
@@ -145,7 +145,7 @@ def test_nothing_changes_while_anything_is_unknown(unknown: str) -> None:
     if unknown == "previous frame":
         previous = None
     elif unknown == "landmarks":
-        previous = replace(scene.previous, landmark_ids=None)
+        previous = replace(scene.previous, landmarks=None)
     elif unknown == "map":
         scene.map = SparseMap(scene.config.mapping, scene.config.features, CAMERA)
     scene.refine(previous, None if unknown == "velocity" else VELOCITY)

@@ -85,7 +85,7 @@ class SparseMap(MapTables):
             self.landmarks["found"][found] += 1
             self.landmarks["visible"][visible] += 1
 
-    def count_shared(self, landmarks: Tensor) -> Tensor:
+    def count_shared_landmarks(self, landmarks: Tensor) -> Tensor:
         """Count the given landmarks that each keyframe observes.
 
         Args:

@@ -26,14 +26,14 @@ class TrackedFrame:
         depth: Re-estimated depth, metres, shape :math:`(1, H, W)`.
         features: Features on static pixels; all features while the static pixels are unknown.
         static_mask: Mask of the static pixels, bool, shape :math:`(H, W)`; None while unknown.
-        landmark_ids: Landmark id of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
+        landmarks: Landmark ID of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
     """
 
     frame: RGBDFrame
     depth: Tensor
     features: Features
     static_mask: Tensor | None = None
-    landmark_ids: Tensor | None = None
+    landmarks: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,8 @@ class CameraMotion:
     Attributes:
         T_cp: Maps points from the previous camera to the current one, float64, shape :math:`(4, 4)`.
         velocity: Mean twist per second, ``[m/s, rad/s]``, float64, shape :math:`(6,)`.
-        pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape :math:`(K,
-            2)`;
-            K = 0 for a motion found by dense alignment, and for a prediction.
+        pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape
+            :math:`(K, 2)`; K = 0 for a motion found by dense alignment, and for a prediction.
         is_measured: True if the frames were registered, False if the motion is only predicted.
     """
 
@@ -61,18 +60,18 @@ class CameraMotion:
         return mask
 
     def propagate_landmarks(self, previous: TrackedFrame | None, count: int) -> Tensor:
-        """Landmark ids of the features of the current frame, propagated by the inlier matches.
+        """Landmark IDs of the features of the current frame, propagated by the inlier matches.
 
         Args:
             previous: Previous frame; None if there is none.
             count: Number of features of the current frame.
 
         Returns:
-            Landmark id of each feature, int64, shape ``(count,)``; -1 = none.
+            Landmark ID of each feature, int64, shape ``(count,)``; -1 = none.
         """
-        if previous is None or previous.landmark_ids is None:
+        if previous is None or previous.landmarks is None:
             return torch.full((count,), -1, dtype=torch.int64)
-        return RelativeMotion(self.T_cp, self.pairs).propagate_landmarks(previous.landmark_ids, count)
+        return RelativeMotion(self.T_cp, self.pairs).propagate_landmarks(previous.landmarks, count)
 
 
 class Odometry:

@@ -40,14 +40,14 @@ class PreviousFrameRefinement:
             velocity: Mean twist per second around that frame, float64, shape :math:`(6,)`; None if it is not known.
             poses: Poses of all frames so far.
         """
-        if previous is None or previous.landmark_ids is None or velocity is None or not self._map.keyframes:
+        if previous is None or previous.landmarks is None or velocity is None or not self._map.keyframes:
             return
         newest, depth, delay = self._map.keyframes[-1], previous.depth, previous.frame.depth_delay
         if newest.frame == previous.frame.index:
             features = self._compensate(newest.features, depth, delay, velocity, self._map.readout)
             self._map.update_features(newest, features)
         elif self._refine_pose:
-            matched, points = self._map.landmark_positions(previous.landmark_ids)
+            matched, points = self._map.landmark_positions(previous.landmarks)
             features = self._compensate(previous.features[matched], depth, delay, velocity, self._map.readout)
             refined = self._track_map.refine(poses.T_cw, points, features, rounds=1)
             if refined is not None:
