@@ -16,7 +16,19 @@ import v3d_torch
 ROOT = Path(v3d_torch.__file__).parent
 
 LAYERS = (
-    *("errors", "io", "config", "geometry", "types", "runtime", "optim", "features", "datasets", "segmentation"),
+    *(
+        "errors",
+        "io",
+        "kernels",
+        "config",
+        "geometry",
+        "types",
+        "runtime",
+        "optim",
+        "features",
+        "datasets",
+        "segmentation",
+    ),
     *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "evaluation", "frame_result"),
     *("slam", "prefetch", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
 )

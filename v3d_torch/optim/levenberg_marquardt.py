@@ -21,6 +21,9 @@ _INITIAL_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-9, 1e9
 _DAMPING_FACTOR = 10
 """Change of the damping after each step."""
 
+DAMPING_SCHEDULE = (_INITIAL_DAMPING, _MIN_DAMPING, _MAX_DAMPING, float(_DAMPING_FACTOR))
+"""The values above, for kernels."""
+
 _SCALE_ITERATIONS = 10
 """Fixed-point iterations for the scale of a t-distribution; each one reduces the error by a constant factor."""
 

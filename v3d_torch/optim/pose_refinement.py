@@ -17,8 +17,10 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
-from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
-from v3d_torch.optim.reprojection import Measurements, chi_square, perspective, perspective_jacobian, whiten
+from v3d_torch.kernels import pose_refinement as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
+from v3d_torch.optim.reprojection import MIN_DEPTH, Measurements, chi_square, perspective, perspective_jacobian, whiten
 
 _TOLERANCE = 1e-3
 """Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
@@ -52,15 +54,39 @@ class PoseRefinement:
     T_cw: Tensor
     inliers: Tensor
     chi2: Tensor
-    _normal_equations: Callable[[], tuple[Tensor, Tensor]]
+    _information: Callable[[], Tensor]
 
     @property
     def information(self) -> Tensor:
         """Information matrix (inverse covariance) of the pose's left perturbation, float64, shape :math:`(6, 6)`."""
-        return self._normal_equations()[0]
+        return self._information()
+
+
+def _refine_pose_compiled(
+    T_cw: Tensor, points: Tensor, measured: Measurements, camera: PinholeCamera, *, rounds: int = 4, iterations: int = 5
+) -> PoseRefinement:
+    if T_cw.dtype != torch.float64 or points.dtype != torch.float64 or points.shape[1:] != (3,):
+        return NotImplemented
+    target = whiten(measured, camera)
+    refined = kernels.refine_pose(
+        to_array(T_cw),
+        to_array(points),
+        to_array(target.scale),
+        to_array(target.offset),
+        to_array(measured.chi2_threshold),
+        rounds,
+        iterations,
+        _TOLERANCE,
+        _REGULARISATION,
+        MIN_DEPTH,
+        DAMPING_SCHEDULE,
+    )
+    T, inliers, chi2, H = map(torch.from_numpy, refined)
+    return PoseRefinement(orthonormalise(T), inliers, chi2, lambda: H)
 
 
 @torch.no_grad()
+@compiled_by(_refine_pose_compiled)
 def refine_pose(
     T_cw: Tensor,
     points: Tensor,
@@ -117,4 +143,4 @@ def refine_pose(
         inliers = chi2 <= thresholds
         if not robust and torch.equal(inliers, previous):
             break
-    return PoseRefinement(orthonormalise(at.T_cw), inliers, chi2, partial(normal_equations, at, result.system))
+    return PoseRefinement(orthonormalise(at.T_cw), inliers, chi2, lambda: normal_equations(at, result.system)[0])

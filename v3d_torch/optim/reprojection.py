@@ -26,7 +26,7 @@ CHI2_THRESHOLD_2D = 5.991
 _CHI2_THRESHOLD_3D = 7.815
 """95 % quantile of the chi-square distribution with 3 degrees of freedom: inlier threshold for (u, v, 1/z)."""
 
-_MIN_DEPTH = 0.05
+MIN_DEPTH = 0.05
 """Smallest depth of a projected point, metres, below the range of any RGB-D camera. Keeps 1/z finite for points that an
 optimisation step moves behind the camera."""
 
@@ -101,7 +101,7 @@ def perspective(points: Tensor) -> Tensor:
     Returns:
         Shape :math:`(3, M)`.
     """
-    w = 1 / points[2:].clamp(min=_MIN_DEPTH)
+    w = 1 / points[2:].clamp(min=MIN_DEPTH)
     return torch.cat([points[:2] * w, w])
 
 
@@ -171,4 +171,4 @@ def chi_square(points: Tensor, residuals: Tensor) -> Tensor:
     Returns:
         Shape :math:`(M,)`.
     """
-    return torch.where(points[:, 2] > _MIN_DEPTH, (residuals * residuals).sum(dim=-1), torch.inf)
+    return torch.where(points[:, 2] > MIN_DEPTH, (residuals * residuals).sum(dim=-1), torch.inf)

@@ -1,0 +1,158 @@
+"""Compilation of kernels with numba, and the choice between a kernel and its torch twin."""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+import importlib.util
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import cache, wraps
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from v3d_torch.io.download import cache_dir
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+ENABLED = os.environ.get("V3D_KERNELS") != "torch" and importlib.util.find_spec("numba") is not None
+"""False if numba is not installed or ``V3D_KERNELS=torch`` is set: the torch twins run."""
+
+
+class Twin(NamedTuple):
+    """Two implementations of a function, with the same arguments and results."""
+
+    torch: Callable[..., Any]
+    compiled: Callable[..., Any]
+
+
+TWINS: dict[str, Twin] = {}
+"""All functions with two implementations, by qualified name."""
+
+_KERNELS: list[tuple[Any, str]] = []
+
+
+def kernel(signature: str) -> Callable[[_F], _F]:
+    """Compile a function of arrays and numbers.
+
+    The code is kept in the user's cache. It releases the GIL while it runs. Floating-point operations are not
+    reordered, so that the results are the same on each call; division by 0 gives infinity, as in NumPy.
+
+    Args:
+        signature: Types of the arguments in numba's notation, for example ``(f8[:,::1], i8)``.
+    """
+
+    def decorate(function: _F) -> _F:
+        if not ENABLED:
+            return function
+        import numba
+
+        settings = vars(numba.config)
+        before, settings["CACHE_DIR"] = settings["CACHE_DIR"], str(_code_folder())
+        try:
+            compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        finally:
+            settings["CACHE_DIR"] = before
+        _KERNELS.append((compiled, signature))
+        return cast("_F", compiled)
+
+    return decorate
+
+
+def device(function: _F) -> _F:
+    """Compile a small function that is part of kernels, such as the projection of one point."""
+    if not ENABLED:
+        return function
+    import numba
+
+    return cast("_F", numba.njit(nogil=True, error_model="numpy")(function))
+
+
+def compile_kernels() -> Iterator[tuple[int, int]]:
+    """Load all kernels of the imported modules from the cache, or compile those that are not in it.
+
+    Yields:
+        Number of kernels that had to be compiled, and that still have to be loaded or compiled, after each kernel.
+    """
+    compiled = 0
+    for position, (each, signature) in enumerate(_KERNELS, start=1):
+        each.compile(signature)
+        compiled += sum(each.stats.cache_misses.values())
+        yield compiled, len(_KERNELS) - position
+
+
+def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Decorate a torch function with its compiled twin.
+
+    The twin runs if all tensors among the arguments are on the CPU and need no gradient. It returns NotImplemented for
+    arguments that it does not support, such as another dtype; the torch function then runs.
+
+    Args:
+        compiled: Function with the same arguments and results that calls a kernel.
+    """
+
+    def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
+        name = f"{function.__module__}.{function.__qualname__}"
+        TWINS[name] = Twin(function, compiled)
+
+        @wraps(function)
+        def either(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+            if ENABLED and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
+                result = TWINS[name].compiled(*args, **kwargs)
+                if result is not NotImplemented:
+                    return result
+            return function(*args, **kwargs)
+
+        return either
+
+    return decorate
+
+
+def to_array(tensor: Tensor) -> NDArray[Any]:
+    """Return a tensor as an array in row-major order; the memory is shared if the tensor already has that order."""
+    return np.ascontiguousarray(tensor.detach().numpy())
+
+
+def _is_plain(argument: object) -> bool:
+    """Check whether an argument is no tensor, or one on the CPU without gradients."""
+    if not isinstance(argument, Tensor):
+        return True
+    return type(argument) is Tensor and argument.device.type == "cpu" and not argument.requires_grad
+
+
+@cache
+def _code_folder() -> Path:
+    """Folder of the compiled code of this version of the kernels; only this user can write it.
+
+    numba recompiles a kernel when its own file changes, but not when a function of another file changes that it calls.
+    The folder's name therefore depends on all files.
+    """
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    version = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
+    # Without a cache folder, as in a container with a read-only home, the system's temporary folder has to do.
+    for parent in (cache_dir(), Path(tempfile.gettempdir()) / f"v3d_torch-{getpass.getuser()}"):
+        folder = parent / "kernels" / version
+        if _make_private(folder):
+            return folder
+    return Path(tempfile.mkdtemp(prefix="v3d_torch-"))
+
+
+def _make_private(folder: Path) -> bool:
+    """Make a folder that only this user can write; False if it cannot be made or belongs to somebody else.
+
+    Whoever can write compiled code into the folder can run it as this user.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        status = folder.stat()
+    except OSError:
+        return False
+    is_own = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
+    return is_own and os.access(folder, os.W_OK)

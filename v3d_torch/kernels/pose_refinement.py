@@ -1,0 +1,111 @@
+"""Kernel of the pose refinement; see `v3d_torch.optim.pose_refinement`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.reprojection import (
+    Array,
+    huber,
+    multiply,
+    perspective_jacobian,
+    se3_exp,
+    solve_symmetric,
+    transform,
+)
+
+Mask = NDArray[np.bool_]
+
+
+@device
+def _linearise(
+    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, active: Mask, min_depth: float,
+    H: Array, g: Array, chi2: Array,
+) -> float:  # fmt: skip
+    """Robust cost of the active measurements; writes the normal equations and the squared errors of all."""
+    H[:], g[:] = 0.0, 0.0
+    J, cost = np.empty((3, 6)), 0.0
+    for i in range(len(points)):
+        x, y, z = transform(T_cw, points[i, 0], points[i, 1], points[i, 2])
+        w = 1 / max(z, min_depth)
+        a, b = x * w, y * w
+        r0, r1, r2 = scale[0, i] * a + offset[0, i], scale[1, i] * b + offset[1, i], scale[2, i] * w + offset[2, i]
+        squared = r0 * r0 + r1 * r1 + r2 * r2
+        chi2[i] = squared if z > min_depth else np.inf
+        if not active[i]:
+            continue
+        robust, weight = huber(squared, thresholds[i])
+        cost += robust
+        perspective_jacobian(a, b, w, J)
+        for k in range(6):
+            j0, j1, j2 = scale[0, i] * J[0, k], scale[1, i] * J[1, k], scale[2, i] * J[2, k]
+            g[k] += weight * (j0 * r0 + j1 * r1 + j2 * r2)
+            j0, j1, j2 = weight * scale[0, i] * j0, weight * scale[1, i] * j1, weight * scale[2, i] * j2
+            for m in range(k + 1):
+                H[k, m] += j0 * J[0, m] + j1 * J[1, m] + j2 * J[2, m]
+    for k in range(6):
+        for m in range(k):
+            H[m, k] = H[k, m]
+    return cost
+
+
+@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8, i8, f8, f8, f8, UniTuple(f8, 4))")
+def refine_pose(
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, rounds: int, iterations: int,
+    tolerance: float, regularisation: float, min_depth: float, damping_schedule: tuple[float, float, float, float],
+) -> tuple[Array, Mask, Array, Array]:  # fmt: skip
+    """Refine a pose in rounds of Levenberg-Marquardt.
+
+    Args:
+        T_cw: Initial pose, (4, 4).
+        points: Landmarks, world frame, (N, 3).
+        scale: Scale of the whitened residuals, (3, N).
+        offset: Offset of the whitened residuals, (3, N).
+        chi2_thresholds: Squared residual up to which a measurement is an inlier, (N,).
+        rounds: Maximum number of rounds; the first half of them is robust.
+        iterations: Maximum number of steps in a round.
+        tolerance: Relative change of the cost at convergence.
+        regularisation: Added to the diagonal of the normal equations.
+        min_depth: Smallest depth of a projected point, metres.
+        damping_schedule: First, smallest and largest damping, and the factor between two steps.
+
+    Returns:
+        Pose (4, 4), inliers (N,), squared residuals (N,), information matrix (6, 6).
+    """
+    first_damping, min_damping, max_damping, factor = damping_schedule
+    count = len(points)
+    inliers, thresholds = np.ones(count, np.bool_), chi2_thresholds.copy()
+    H, g, chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
+    new_H, new_g, new_chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
+    for index in range(rounds):
+        robust = 2 * index < rounds
+        if not robust:
+            thresholds[:] = np.inf
+        cost = _linearise(T_cw, points, scale, offset, thresholds, inliers, min_depth, H, g, chi2)
+        damping, converged, iteration = first_damping, False, 0
+        while iteration < iterations and not converged:
+            damped = H.copy()
+            for k in range(6):
+                damped[k, k] = damped[k, k] * (1 + damping) + regularisation
+            candidate = multiply(se3_exp(-solve_symmetric(damped, g)), T_cw)
+            new_cost = _linearise(
+                candidate, points, scale, offset, thresholds, inliers, min_depth, new_H, new_g, new_chi2
+            )
+            iteration += 1
+            converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
+            if new_cost < cost:
+                T_cw, cost = candidate, new_cost
+                H, new_H, g, new_g, chi2, new_chi2 = new_H, H, new_g, g, new_chi2, chi2
+                damping = max(damping / factor, min_damping)
+            else:
+                damping = min(damping * factor, max_damping)
+        unchanged = True
+        for i in range(count):
+            is_inlier = chi2[i] <= chi2_thresholds[i]
+            unchanged &= is_inlier == inliers[i]
+            inliers[i] = is_inlier
+        if not robust and unchanged:
+            break
+    return T_cw, inliers, chi2, H
