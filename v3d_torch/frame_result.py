@@ -18,7 +18,7 @@ class PreprocessedFrame:
 
     Attributes:
         frame: Frame.
-        instances: Instances of the segmentation.
+        instances: Instances of the segmentation; None if it leaves this frame out.
         depth: Re-estimated depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
         features: Features of the whole image.
         seconds: Time that each stage took, seconds.
@@ -26,7 +26,7 @@ class PreprocessedFrame:
     """
 
     frame: RGBDFrame
-    instances: Instances
+    instances: Instances | None
     depth: Tensor
     features: Features
     seconds: dict[str, float]

@@ -145,9 +145,11 @@ class V3DSLAM:
         check_frame(frame, self.camera)
         timer = StageTimer()
         with timer("segmentation"):  # III-A: instances; people are masked until they are classified
-            T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
-            instances = segment_frame(self.segment, frame, T_cw)
-            check_instances(instances, frame)
+            instances = None
+            if frame.index % self.config.segmentation.interval == 0:
+                T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
+                instances = segment_frame(self.segment, frame, T_cw)
+                check_instances(instances, frame)
         with timer("depth"):  # III-B.1: depth re-estimation
             depth = self.smooth_depth(frame.depth[None])[0]
         with timer("features"):  # III-A: ORB
@@ -172,6 +174,8 @@ class V3DSLAM:
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
             view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)
+            if instances is None:
+                instances = self.classify_motion.propagate_instances(view)
             if self.config.segmentation.source != "none":
                 instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers

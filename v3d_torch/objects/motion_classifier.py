@@ -16,6 +16,7 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedOb
 from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
+from v3d_torch.objects.mask_propagation import propagate_instances
 from v3d_torch.objects.motion_evidence import (
     DetectionPairs,
     chamfer_evidence,
@@ -119,6 +120,14 @@ class MotionClassifier:
         people = [track for track in tracks if track.label == PERSON]
         masks = static_masks(excluded, people, view, newly_occupied, config, self._camera)
         return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
+
+    def propagate_instances(self, view: DepthView) -> Instances:
+        """Redraw the objects of the previous frame in a frame without segmentation; see `mask_propagation`.
+
+        Args:
+            view: Depth and pose of the frame.
+        """
+        return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds.voxel_size)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state between frames: timestamp of the last frame and state of the tracker."""
