@@ -30,7 +30,7 @@ from v3d_torch.runs.checkpoint import CHECKPOINT
 from v3d_torch.runs.stored_run import read_run
 
 FRAMES = 20
-CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_share=1")
+CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_fraction=1")
 RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply", "mesh.ply")
 
 

@@ -1,4 +1,4 @@
-"""Execution of one job, in whatever process or machine it was sent to."""
+"""Execution of one job, in the process and on the machine to which it was sent."""
 
 from __future__ import annotations
 

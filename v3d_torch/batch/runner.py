@@ -61,9 +61,9 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
 
     Args:
         record: Outcomes of the batch so far.
-        executor: Runs the jobs.
-        console: Shows the progress, and the tables at the end.
-        resume: Whether the folder may contain complete runs.
+        executor: Executor of the jobs.
+        console: Console for the progress, and for the tables at the end.
+        resume: True if the folder can contain complete runs; they are not run again.
 
     Raises:
         V3DError: If the folder contains runs or is not writable, if the user interrupted the batch, or if a run failed.

@@ -44,8 +44,8 @@ def save_state(path: StrPath, slam: V3DSLAM) -> None:
         OutputError: If the file cannot be written.
         ConfigError: If a stage was replaced by one without state_dict.
     """
-    about = {"config": slam.config.model_dump(mode="json"), "camera": asdict(slam.camera)}
-    write_state(Path(path), about, slam.state_dict())
+    metadata = {"config": slam.config.model_dump(mode="json"), "camera": asdict(slam.camera)}
+    write_state(Path(path), metadata, slam.state_dict())
 
 
 def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
@@ -59,10 +59,10 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
         InputError: If the file is missing, damaged, not a saved state, or from another version.
         WeightsError: If the weights of the network are not available.
     """
-    about, state = read_state(Path(path), STATE_CLASSES)
+    metadata, state = read_state(Path(path), STATE_CLASSES)
     try:
-        config = Config.model_validate(about["config"])
-        camera = PinholeCamera(**{**about["camera"], "distortion": tuple(about["camera"]["distortion"])})
+        config = Config.model_validate(metadata["config"])
+        camera = PinholeCamera(**{**metadata["camera"], "distortion": tuple(metadata["camera"]["distortion"])})
         slam = V3DSLAM(camera, segment, config)
         slam.load_state_dict(state)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:

@@ -55,7 +55,7 @@ class StoredRun:
 
     Attributes:
         folder: Folder of the files.
-        metrics: Figures of the whole run.
+        metrics: Content of ``metrics.json``.
         trajectory: Pose of each processed frame; None if the file is missing or the run has no frames.
         keyframes: Poses of the keyframes; None if there are none.
         groundtruth: True poses; None if there are none.

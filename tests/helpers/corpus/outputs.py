@@ -211,7 +211,7 @@ CASES = [
     Case(
         "list without read permission",
         make_unreadable("rgb.txt"),
-        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and that you may read it"),
+        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file, and its permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
@@ -239,9 +239,7 @@ CASES = [
     Case(
         "camera without read permission",
         make_unreadable("camera.yaml"),
-        Fails(
-            "{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and that you may read it"
-        ),
+        Fails("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file, and its permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
