@@ -94,7 +94,7 @@ class Snapshot:
 
 @dataclass
 class RunRecord:
-    """Records of a run beside the trajectory.
+    """Records of a run in addition to the trajectory.
 
     Attributes:
         frames: One row per frame: index, timestamp and seconds of each stage.

@@ -271,18 +271,18 @@ def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:
 
 def test_missing_checkpoint_is_rejected_with_a_suggestion(tmp_path: Path) -> None:
     assert_error_line(
-        call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; give the folder of a run that ended early"
+        call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; pass the folder of a run that ended early"
     )
     assert_error_line(
         call("--resume", tmp_path / "no"),
-        f"{tmp_path / 'no'}: is not a folder; give the folder of a run that ended early",
+        f"{tmp_path / 'no'}: is not a folder; pass the folder of a run that ended early",
     )
     newest = tmp_path / "seq" / "2026-01-01"
     newest.mkdir(parents=True)
     (newest / CHECKPOINT).touch()
-    assert_error_line(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; give the newest run in it, {newest}")
+    assert_error_line(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; pass the newest run in it, {newest}")
     assert_error_line(
-        call("--resume", newest / CHECKPOINT), f"{newest / CHECKPOINT}: is not a folder; give its folder, {newest}"
+        call("--resume", newest / CHECKPOINT), f"{newest / CHECKPOINT}: is not a folder; pass its folder, {newest}"
     )
     done = call()
     assert done.exit_code == 2 and "--resume" in done.stderr

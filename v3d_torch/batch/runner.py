@@ -53,7 +53,7 @@ def run_batch(
 def check_resume(resume: bool, out: Path | None) -> None:
     """Raise `InputError` if a batch is to be resumed and its folder is not given."""
     if resume and out is None:
-        raise InputError("--resume: no folder to resume; give the folder of the batch with --out")
+        raise InputError("--resume: no folder to resume; pass the folder of the batch with --out")
 
 
 def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, *, resume: bool) -> None:

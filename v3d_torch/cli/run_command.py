@@ -59,7 +59,7 @@ class ConfigChoice:
 
 @dataclass(frozen=True)
 class Display:
-    """Output of a run beside its files and its summary.
+    """Output of a run in addition to its files and its summary.
 
     Attributes:
         viz: Viewer that shows the run live: ``rerun``; None for none.
@@ -84,7 +84,7 @@ def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
         V3DError: If an input is not valid, or the run ended early; its results so far are written.
     """
     if request.load_map is None and not request.config.mapping.enabled:
-        raise ConfigError("mapping.enabled=false: there is no map to localise in; give one with --load-map")
+        raise ConfigError("mapping.enabled=false: there is no map to localise in; pass one with --load-map")
     _run(request, out, None, display)
 
 
@@ -93,8 +93,8 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
 
     Args:
         folder: Folder of its results.
-        given: Options given beside ``--resume``: the sequence, if it was moved. Other options must not differ.
-        choice: Configuration given beside ``--resume``.
+        given: Options given with ``--resume``. Only the location of the sequence can differ from the run.
+        choice: Configuration given with ``--resume``.
         out: The same folder, or None.
         display: Output on the screen.
 
@@ -194,7 +194,7 @@ def _print_summary(
         raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
         raise InputError(
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; give a map of the same place, or"
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
             f" run without --load-map (the results are in {folder})"
         )
     if (problem := diagnose(pipeline, evaluation)) is not None:

@@ -1,7 +1,7 @@
 """Typed configuration: one section per stage, each value with its unit and its reason.
 
 `v3d_torch.config.loading` reads it from YAML files and the command line; each run writes the resolved configuration
-beside its results. Values that only an expert of one file would change are named constants of that file.
+to the folder of its results. Values that only an expert of one file would change are named constants of that file.
 """
 
 from __future__ import annotations
@@ -105,9 +105,9 @@ class VotingConfig(Section):
     vote_threshold: int = Field(2, gt=0)
     """T_v, votes that make an object dynamic (authors' code: more than one)."""
     baselines: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
-    """Times before the present at which distances are compared with the present ones, seconds; 0 is the previous frame
-    (the paper's rule). At 1 m/s a person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid,
-    and 30 cm in 0.3 s. Detections are stored for 1 s."""
+    """Times over which changes of distances are measured, seconds; 0 is the previous frame (the paper's rule). At 1 m/s
+    a person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections
+    are stored for 1 s."""
 
 
 class FreeSpaceConfig(Section):
@@ -120,8 +120,8 @@ class FreeSpaceConfig(Section):
     enabled: bool = True
     """False for the paper's literal rules."""
     baselines: tuple[float, ...] = (0.3, 0.9)
-    """Times before the present at which the depth is compared with the present one, seconds: a walking person moves
-    0.3 m in the first, a slow one in the second."""
+    """Times between the depth images that are compared, seconds: a walking person moves 0.3 m in the first, a slow one
+    in the second."""
     min_unlabelled_area: float = Field(0.02, gt=0)
     """Minimum area of an unlabelled moving region, square metres: a hand with its forearm. Infinite in the ablation."""
     max_depth: float = Field(6.0, gt=0)
@@ -150,8 +150,8 @@ class ChamferConfig(Section):
     paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a
     Kinect at 3 m adds as much."""
     baseline: float = Field(0.3, ge=0, le=1)
-    """Time before the present at which the cloud is compared with the present one, seconds; 0 is the previous frame
-    (the paper's rule). Detections are stored for 1 s."""
+    """Time between the two clouds that are compared, seconds; 0 is the previous frame (the paper's rule). Detections are
+    stored for 1 s."""
     keep_deforming_features: bool = False
     """True to track features on deforming objects. The paper's text describes both; its code masks them."""
 

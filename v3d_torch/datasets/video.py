@@ -118,7 +118,7 @@ def _find_pair(path: Path) -> tuple[Path, Path]:
         found = ", ".join(file.name for file in colour + depth)
         raise InputError(
             f"{path}: expected one colour and one depth video, found {found}; name them like take.mp4 and"
-            " take_depth.mkv and give the first"
+            " take_depth.mkv and pass the first"
         )
     return colour[0], depth[0]
 

@@ -33,7 +33,7 @@ _ALLOWED = {
     ("numpy.core.numeric", "_frombuffer"),  # before NumPy 2
     ("pathlib", "PosixPath"),
 }
-"""Globals that can be unpickled beside those of this package."""
+"""Globals that can be unpickled in addition to those of this package."""
 
 
 def new_shared_memory(values: int) -> int | None:

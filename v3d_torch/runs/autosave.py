@@ -24,7 +24,7 @@ class Autosave:
     Args:
         folder: Folder of the results.
         pipeline: Pipeline that runs.
-        request: Request of the run, stored in the checkpoints; None saves no checkpoints.
+        request: Request of the run, stored in the checkpoints; None to save no checkpoints.
     """
 
     def __init__(self, folder: Path, pipeline: Pipeline, request: RunRequest | None) -> None:

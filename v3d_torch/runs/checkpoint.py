@@ -95,7 +95,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if not path.is_file():
         cause = "has no checkpoint" if folder.is_dir() else "is not a folder"
         fix = suggest_folder(folder, CHECKPOINT) or (
-            "give the folder of a run that ended early, or run the sequence again"
+            "pass the folder of a run that ended early, or run the sequence again"
         )
         raise InputError(f"{folder}: {cause}; {fix}")
     metadata, state = read_state(path, _CLASSES)

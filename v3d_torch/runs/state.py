@@ -1,4 +1,4 @@
-"""Saved state of a system: another process can continue with the next frame."""
+"""Saving and loading of the state of a system, so that another process can continue with the next frame."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
 
     Args:
         path: File.
-        segment: Segmenter; None takes that of the configuration.
+        segment: Segmenter; None for that of the configuration.
 
     Raises:
         InputError: If the file is missing, damaged, not a saved state, or from another version.
@@ -66,5 +66,5 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
         slam = V3DSLAM(camera, segment, config)
         slam.load_state_dict(state)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: is not the state of a system; give a file that save_state wrote") from error
+        raise InputError(f"{path}: is not the state of a system; pass a file that save_state wrote") from error
     return slam

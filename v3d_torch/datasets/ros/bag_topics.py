@@ -54,15 +54,15 @@ def choose_topics(
     Args:
         bag: Path of the bag, for error messages.
         types: Message type of each topic.
-        rgb: Colour topic given by the user; None prefers raw images to rectified and compressed ones.
-        depth: Depth topic given by the user; None prefers depth registered to colour, then depth of the same camera.
-        info: CameraInfo topic given by the user; None for the one next to the colour topic.
+        rgb: Colour topic chosen by the user; None to prefer raw images to rectified and compressed ones.
+        depth: Depth topic chosen by the user; None to prefer depth registered to colour, then depth of the same camera.
+        info: CameraInfo topic chosen by the user; None for the one next to the colour topic.
 
     Returns:
         Chosen topics.
 
     Raises:
-        InputError: If a given topic is missing or has another type, no topic fits, or the choice is ambiguous.
+        InputError: If a chosen topic is missing or has another type, no topic fits, or the choice is ambiguous.
     """
     images = {topic: kind for topic, kind in types.items() if kind in (IMAGE, COMPRESSED)}
     if not images:
