@@ -150,8 +150,8 @@ class ChamferConfig(Section):
     paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a
     Kinect at 3 m adds as much."""
     baseline: float = Field(0.3, ge=0, le=1)
-    """Time between the two clouds that are compared, seconds; 0 is the previous frame (the paper's rule). Detections are
-    stored for 1 s."""
+    """Time between the two clouds that are compared, seconds; 0 is the previous frame (the paper's rule). Detections
+    are stored for 1 s."""
     keep_deforming_features: bool = False
     """True to track features on deforming objects. The paper's text describes both; its code masks them."""
 
