@@ -246,8 +246,8 @@ CASES = [
         "ground truth without read permission",
         make_unreadable("groundtruth.txt"),
         Fails(
-            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and that you"
-            " may read it (the results are in {out})",
+            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file, and its"
+            " permissions (the results are in {out})",
             saved_poses=8,
         ),
         lambda place: without_root_rights(),
