@@ -94,14 +94,14 @@ class Snapshot:
 
 @dataclass
 class RunRecord:
-    """Records of a run beside the trajectory.
+    """Records of a run in addition to the trajectory.
 
     Attributes:
         frames: One row per frame: index, timestamp and seconds of each stage.
         dynamics: One row per frame and object, as in the table of the results.
         snapshots: Frames for the figure of masks.
         most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
-        mask_evaluation: Evaluation of the masks against true masks.
+        mask_evaluation: Comparison of the masks with true masks.
         seconds: Wall time of all frames, seconds.
         failure: Reason why the run ended before the sequence; None if it did not.
         interrupted: True if the user interrupted the run.
@@ -127,10 +127,10 @@ class Pipeline:
     Args:
         sequence: Frames, stored or live.
         slam: System; frames of a stored sequence that it has processed already are skipped.
-        masks: Folder for an image of the masked pixels per frame; None writes none.
+        masks: Folder for an image of the masked pixels per frame; None for no images.
         viewer: Viewer that is shown each frame.
-        views: Views of the keyframes of a known map; None starts without views.
-        evaluate_masks: False to not compare the masks with true masks.
+        views: Views of the keyframes of a known map; None to start without views.
+        evaluate_masks: True to compare the masks with true masks, if the sequence has any.
 
     Attributes:
         record: Records of the run.
@@ -159,7 +159,7 @@ class Pipeline:
         self._prefetcher: FramePrefetcher | None = None
 
     @property
-    def frames(self) -> int:
+    def frame_count(self) -> int:
         """Number of frames of the sequence; of a live stream, the number processed so far."""
         return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses.statuses)
 
@@ -170,10 +170,13 @@ class Pipeline:
 
         Args:
             on_frame: Called after each frame.
+
+        Returns:
+            The records of the run, including those of frames before it was resumed.
         """
         record = self.record
         record.failure, record.interrupted = None, False
-        before, start = record.seconds, time.perf_counter()
+        previous_seconds, start = record.seconds, time.perf_counter()
         try:
             with torch.inference_mode(), closing(self.start_prefetching()) as prefetcher:
                 start = time.perf_counter()
@@ -182,9 +185,9 @@ class Pipeline:
                     frame, result = preprocessed.frame, self.slam.track(preprocessed)
                     seconds = self.slam.timer.lap()
                     record.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
-                    self._record(frame, result)
+                    self._record_frame(frame, result)
                     self._viewer.show(frame, result, self.slam, seconds)
-                    record.seconds, self.between_frames = before + time.perf_counter() - start, True
+                    record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
                     if len(record.frames) % _TRIM_INTERVAL == 0:
@@ -200,18 +203,21 @@ class Pipeline:
             if isinstance(self.sequence, Sized):
                 done, total = len(self.slam.poses.statuses), len(self.sequence)
                 record.failure = f"interrupted after {done} of {total} frames"
-        record.seconds, self._prefetcher = before + time.perf_counter() - start, None
+        record.seconds, self._prefetcher = previous_seconds + time.perf_counter() - start, None
         return record
 
     def start_prefetching(self) -> FramePrefetcher:
-        """Return the prefetcher of the frames; its start can take seconds, and a call of the pipeline does it first."""
+        """Start the prefetcher, unless it is running, and return it.
+
+        The start can take seconds. Calling the pipeline does it, too.
+        """
         if self._prefetcher is None:
             self._prefetcher = FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
         return self._prefetcher
 
     @torch.inference_mode()
     def flush(self) -> None:
-        """After the last frame: apply the pending result of the back end, and show the final state in the viewer."""
+        """Apply the pending result of the back end and show the final state; call this after the last frame."""
         self.slam.flush()
         try:
             self._viewer.finish(self.slam)
@@ -234,7 +240,7 @@ class Pipeline:
             return self.sequence.frames_from(done)
         return islice(iter(self.sequence), done, None)
 
-    def _record(self, frame: RGBDFrame, result: FrameResult) -> None:
+    def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.dynamics.extend(_dynamics_row(frame, each) for each in result.objects)
         self._evaluate_masks(frame, result)
         if self._masks is not None:
@@ -246,7 +252,7 @@ class Pipeline:
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep frames at equal distances; the distance grows with a live stream. And keep the most dynamic one."""
+        """Keep the most dynamic frame, and frames at equal intervals, which grow with the length of a live stream."""
         best = self.record.most_dynamic_snapshot
         if best is None or _dynamic_votes(snapshot.result) > _dynamic_votes(best.result):
             self.record.most_dynamic_snapshot = snapshot

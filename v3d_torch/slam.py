@@ -61,9 +61,9 @@ class V3DSLAM:
 
     Args:
         camera: Camera of all frames.
-        segment: Segmenter; None takes that of the configuration.
-        config: Configuration of all stages; None takes the default.
-        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None starts a new map.
+        segment: Segmenter; None for that of the configuration.
+        config: Configuration of all stages; None for the default.
+        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map.
 
     Attributes:
         map: Keyframes and landmarks.

@@ -23,5 +23,5 @@ class ReadableDocstrings(griffe.Extension):
 
 def readable(text: str) -> str:
     """Return a docstring in Markdown."""
-    text = _DISPLAYED.sub(lambda found: indent(f"\n$$\n{dedent(found[2]).strip()}\n$$\n\n", found[1]), text)
-    return _ROLE.sub(lambda found: rf"\({found[2]}\)" if found[1] == "math" else f"`{found[2]}`", text)
+    text = _DISPLAYED.sub(lambda match: indent(f"\n$$\n{dedent(match[2]).strip()}\n$$\n\n", match[1]), text)
+    return _ROLE.sub(lambda match: rf"\({match[2]}\)" if match[1] == "math" else f"`{match[2]}`", text)

@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 
 LICENCES_BY_HAND = {
-    "apsw": "Zlib",  # its metadata say "any-OSI", its LICENSE file Zlib
+    "apsw": "Zlib",  # its metadata states "any-OSI", its LICENSE file Zlib
     "atheris": "Apache-2.0",  # not in its metadata
 }
 """Licences of packages without a licence name in their metadata."""
@@ -86,7 +86,7 @@ def dependencies(requirements: Iterable[str]) -> set[str]:
             continue
         found.add(name)
         for more in package.requires or () if package is not None else ():
-            pending += [(Requirement(more), asked) for asked in (wanted.extras or {""})]
+            pending += [(Requirement(more), name_of_extra) for name_of_extra in (wanted.extras or {""})]
     return found
 
 
@@ -104,10 +104,10 @@ def licence_of(package: Distribution) -> str:
     name = canonicalize_name(metadata["Name"])
     classifiers = [line.rpartition(" :: ")[2] for line in metadata.get_all("Classifier") or [] if "License ::" in line]
     short = [CLASSIFIERS[line] for line in classifiers if line in CLASSIFIERS]
-    said = (metadata.get("License") or "").strip()
-    stated = metadata.get("License-Expression") or LICENCES_BY_HAND.get(name) or " and ".join(short) or said
+    field = (metadata.get("License") or "").strip()
+    stated = metadata.get("License-Expression") or LICENCES_BY_HAND.get(name) or " and ".join(short) or field
     if not stated or re.search(r"\n|UNKNOWN", stated):
-        raise SystemExit(f"{name}: states no licence; look it up and add it to LICENCES_BY_HAND")
+        raise SystemExit(f"{name}: states no licence; find it and add it to LICENCES_BY_HAND")
     return str(stated)
 
 

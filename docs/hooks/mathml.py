@@ -12,8 +12,8 @@ _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>'
 
 
 def on_page_content(content: str, **_: Any) -> str:
-    """Convert the formulas of a page; MkDocs calls this with its HTML."""
+    """Convert the formulas of a page; MkDocs calls this with the HTML of the page."""
     return _FORMULA.sub(
-        lambda found: convert(html.unescape(found[2]).strip(), display="block" if found[1] == "div" else "inline"),
+        lambda match: convert(html.unescape(match[2]).strip(), display="block" if match[1] == "div" else "inline"),
         content,
     )

@@ -9,15 +9,15 @@ from typing import Any
 
 from typer.main import get_command
 
-_WANTED = re.compile(r"^\{\{ options of (\w+) \}\}$", re.MULTILINE)
+_PLACEHOLDER = re.compile(r"^\{\{ options of (\w+) \}\}$", re.MULTILINE)
 
 _SPECIAL = re.compile(r"[\[\]|*_]")
 """Characters that are markup in a table cell."""
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Insert the tables of a page; MkDocs calls this with its text."""
-    return _WANTED.sub(lambda found: table(found[1]), markdown)
+    """Insert the tables of a page; MkDocs calls this with the text of the page."""
+    return _PLACEHOLDER.sub(lambda match: table(match[1]), markdown)
 
 
 def table(name: str) -> str:

@@ -266,7 +266,7 @@ def test_folder_above_runs_is_an_error_that_suggests_the_newest(tmp_path: Path) 
         write_text(tmp_path / name / "metrics.json", "{}")
         os.utime(tmp_path / name / "metrics.json", ns=(0, 10**9 * (10 - age)))
     for parent, newest in (("", "demo/2026-01-01"), ("demo", "demo/2026-01-01"), ("study", "study/desk/full/seed0")):
-        with pytest.raises(InputError, match=re.escape(f"; give the newest run in it, {tmp_path / newest}")):
+        with pytest.raises(InputError, match=re.escape(f"; pass the newest run in it, {tmp_path / newest}")):
             read_run(tmp_path / parent)
     (tmp_path / "demo/latest").symlink_to("2026-01-01")
     with pytest.raises(InputError, match=r"in it, .*latest$"):
@@ -274,7 +274,7 @@ def test_folder_above_runs_is_an_error_that_suggests_the_newest(tmp_path: Path) 
 
 
 def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
-    with pytest.raises(InputError, match=re.escape(f"; give its folder, {copy}")):
+    with pytest.raises(InputError, match=re.escape(f"; pass its folder, {copy}")):
         read_run(copy / "map.ply")
 
 

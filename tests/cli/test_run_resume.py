@@ -30,7 +30,7 @@ from v3d_torch.runs.checkpoint import CHECKPOINT
 from v3d_torch.runs.stored_run import read_run
 
 FRAMES = 20
-CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_share=1")
+CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_fraction=1")
 RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply", "mesh.ply")
 
 
@@ -271,18 +271,18 @@ def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:
 
 def test_missing_checkpoint_is_rejected_with_a_suggestion(tmp_path: Path) -> None:
     assert_error_line(
-        call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; give the folder of a run that ended early"
+        call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; pass the folder of a run that ended early"
     )
     assert_error_line(
         call("--resume", tmp_path / "no"),
-        f"{tmp_path / 'no'}: is not a folder; give the folder of a run that ended early",
+        f"{tmp_path / 'no'}: is not a folder; pass the folder of a run that ended early",
     )
     newest = tmp_path / "seq" / "2026-01-01"
     newest.mkdir(parents=True)
     (newest / CHECKPOINT).touch()
-    assert_error_line(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; give the newest run in it, {newest}")
+    assert_error_line(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; pass the newest run in it, {newest}")
     assert_error_line(
-        call("--resume", newest / CHECKPOINT), f"{newest / CHECKPOINT}: is not a folder; give its folder, {newest}"
+        call("--resume", newest / CHECKPOINT), f"{newest / CHECKPOINT}: is not a folder; pass its folder, {newest}"
     )
     done = call()
     assert done.exit_code == 2 and "--resume" in done.stderr

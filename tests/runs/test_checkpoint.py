@@ -347,7 +347,7 @@ def test_state_of_another_version_or_content_is_rejected(tmp_path: Path, monkeyp
     with pytest.raises(InputError, match=r"/s: was written by v3d-torch 9\.9, this is"):
         read_state(tmp_path / "s", [])
     with pytest.raises(
-        InputError, match=r"slam\.state: is not the state of a system; give a file that save_state wrote"
+        InputError, match=r"slam\.state: is not the state of a system; pass a file that save_state wrote"
     ):
         write_value(tmp_path / "slam.state")
         load_state(tmp_path / "slam.state")

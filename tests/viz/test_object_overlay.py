@@ -63,7 +63,7 @@ def test_at_most_six_frames_in_rows_of_three(tmp_path: Path, number: int, column
 
 def test_objects_out_of_view_have_no_label_and_missing_arguments_are_errors(tmp_path: Path) -> None:
     images, masks = frames(2)
-    save_mask_figure(images, [[(torch.zeros_like(masks[0]), "person 1", "predicted")], []], tmp_path / "masks.svg")
+    save_mask_figure(images, [[(torch.zeros_like(masks[0]), "person 1", "dynamic")], []], tmp_path / "masks.svg")
     assert "person 1" not in (tmp_path / "masks.svg").read_text()
     with pytest.raises(ValueError, match="at least one image"):
         save_mask_figure([], [], tmp_path / "masks.png")

@@ -19,7 +19,7 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
 
     Args:
         names: Names or files, as `find_config` takes them. Duplicates are loaded once.
-        one_thread: Whether to limit each run to one thread, for runs that share a machine.
+        one_thread: True to limit each run to one thread, for runs that share a machine.
 
     Returns:
         Configurations by their name in tables, which is the file name without suffix.

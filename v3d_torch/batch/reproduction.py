@@ -83,7 +83,7 @@ class ReproductionRecord(BatchRecord):
         folder: Folder of the results.
         table_configs: Names of the configurations in the paper's tables; the others appear in the study only.
         absent: Sequences of the paper that are not available; they keep their row in the tables.
-        study: Whether there is an ablation study.
+        study: True to include the ablation study.
 
     Raises:
         InputError: If a complete run in the folder has another configuration.
@@ -138,17 +138,17 @@ class ReproductionRecord(BatchRecord):
 
 
 def describe_missing(missing: Sequence[str], folder: Path, reason: str | None) -> str:
-    """Return a message that names the missing sequences and says how to download them by hand.
+    """Return a message with the missing sequences and how to download them by hand.
 
     Args:
         missing: Full names of the missing sequences, at least one.
         folder: Folder of named sequences.
-        reason: Why the download failed; None if no download was tried.
+        reason: Reason why the download failed; None if no download was tried.
     """
     server = download_url(missing[0]).rpartition("/")[0]
-    why = f" ({reason})" if reason is not None else ""
+    cause = f" ({reason})" if reason is not None else ""
     return (
-        f"missing sequences: {', '.join(missing)}{why}; download the .tgz of each from {server}/, unpack it and move"
+        f"missing sequences: {', '.join(missing)}{cause}; download the .tgz of each from {server}/, unpack it and move"
         f" the folder to {folder}"
     )
 
@@ -159,7 +159,8 @@ def _open_paper_sequences(
     """Open the paper's sequences that are available.
 
     Returns:
-        Opened sequences by short name, full names of the missing ones, and why the first download failed, if it did.
+        Opened sequences by short name; full names of the missing ones; reason of the first failed download, None if no
+        download failed.
 
     Raises:
         InputError: If a sequence is damaged.

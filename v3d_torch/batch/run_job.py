@@ -1,4 +1,4 @@
-"""Execution of one job, in whatever process or machine it was sent to."""
+"""Execution of one job, in the process and on the machine to which it was sent."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _make_request(job: Job) -> RunRequest:
 
 
 def _matching_checkpoint(job: Job) -> Checkpoint | None:
-    """Return the checkpoint of the same run; None if there is no readable one, so that the run starts anew."""
+    """Return the checkpoint of the same run; None if there is no readable one, so that the run starts again."""
     try:
         checkpoint = read_checkpoint(job.folder)
     except InputError:

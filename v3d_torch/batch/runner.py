@@ -53,7 +53,7 @@ def run_batch(
 def check_resume(resume: bool, out: Path | None) -> None:
     """Raise `InputError` if a batch is to be resumed and its folder is not given."""
     if resume and out is None:
-        raise InputError("--resume: no folder to resume; give the folder of the batch with --out")
+        raise InputError("--resume: no folder to resume; pass the folder of the batch with --out")
 
 
 def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, *, resume: bool) -> None:
@@ -61,9 +61,9 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
 
     Args:
         record: Outcomes of the batch so far.
-        executor: Runs the jobs.
-        console: Shows the progress, and the tables at the end.
-        resume: Whether the folder may contain complete runs.
+        executor: Executor of the jobs.
+        console: Console for the progress, and for the tables at the end.
+        resume: True if the folder can contain complete runs; they are not run again.
 
     Raises:
         V3DError: If the folder contains runs or is not writable, if the user interrupted the batch, or if a run failed.

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.options import DataRoot, make_app
 from v3d_torch.io.paths import expand_user_paths
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = make_app()
 
 
 @app.command()
@@ -19,10 +20,7 @@ def main(
         list[str],
         typer.Option(help="Sequence to run: demo, a TUM RGB-D sequence or a folder. Repeat the option for several."),
     ],
-    data_root: Annotated[
-        Path | None,
-        typer.Option(envvar="V3D_DATA", help="Folder of named sequences; missing ones are downloaded to it."),
-    ] = None,
+    data_root: DataRoot = None,
     variants: Annotated[
         str, typer.Option(help="Variants to run, separated by commas.")
     ] = "baseline,no_voting,no_chamfer,no_prediction,no_unlabelled,not_upright,global_shutter,paper,full",

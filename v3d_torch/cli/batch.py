@@ -3,32 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperCommand
 
+from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-
-
-class MultiValueCommand(TyperCommand):
-    """Command whose repeatable options also accept several values at once: ``--configs paper full``."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line after inserting the name of the option before each further value."""
-        repeatable = {name for option in self.params if getattr(option, "multiple", False) for name in option.opts}
-        expanded: list[str] = []
-        option = None
-        for argument in args:
-            if argument.startswith("-"):
-                name = argument.partition("=")[0]
-                option = name if name in repeatable else None
-            elif option is not None and expanded[-1] != option:
-                expanded.append(option)
-            expanded.append(argument)
-        return super().parse_args(ctx, expanded)
+app = make_app()
 
 
 @app.command(cls=MultiValueCommand)
@@ -48,30 +30,16 @@ def main(
             " values and can be repeated. [full]"
         ),
     ] = None,
-    seeds: Annotated[
-        int, typer.Option(min=1, help="Number of runs of each sequence and configuration, with seeds from 0.")
-    ] = 1,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Number of runs at a time. With more than one, each run has one thread, which changes run times but"
-            " not results. [1; with --ray the number of cores of the cluster]",
-        ),
-    ] = None,
+    seeds: Seeds = 1,
+    workers: Annotated[int | None, workers_option("1; with --ray the number of cores of the cluster")] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             help="Folder of the results; with --ray, a folder that all machines share. [results/batch/<time>]"
         ),
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue the batch in --out: run only what is missing or has failed.")
-    ] = False,
-    data_root: Annotated[
-        Path | None,
-        typer.Option(envvar="V3D_DATA", help="Folder of named sequences; missing ones are downloaded to it."),
-    ] = None,
+    resume: Resume = False,
+    data_root: DataRoot = None,
     ray: Annotated[
         str | None,
         typer.Option(

@@ -1,4 +1,4 @@
-"""``python -m v3d_torch evaluate GROUNDTRUTH ESTIMATE``: errors of a trajectory, compared with the paper's tables."""
+"""Command ``v3d-torch evaluate``: errors of a trajectory, compared with the paper's tables."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
     from v3d_torch.evaluation import Evaluation
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = make_app()
 
 
 @app.command()
@@ -31,7 +32,7 @@ def main(
         int | None, typer.Option(min=1, help="Number of colour-depth pairs of the sequence, to print the coverage.")
     ] = None,
     sequence: Annotated[
-        str | None, typer.Option(help="Sequence of the paper's tables, such as fr3/w/xyz [guessed from the paths].")
+        str | None, typer.Option(help="Sequence of the paper's tables, such as fr3/w/xyz [detected from the paths].")
     ] = None,
 ) -> None:
     """Evaluate a trajectory by ATE and RPE, as the TUM benchmark does.

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
 from v3d_torch.io.paths import expand_user_paths
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = make_app()
 
 
 @app.command()
@@ -20,23 +21,12 @@ def main(
         str,
         typer.Option(help="Source to save: a live camera (realsense:, realsense:SERIAL), or a sequence, bag or video."),
     ] = "realsense:",
-    data_root: Annotated[
-        Path | None,
-        typer.Option(envvar="V3D_DATA", help="Folder of named sequences; missing ones are downloaded to it."),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(help="Camera, if the source does not describe it: camera.yaml, K.txt or a preset (tum_fr3)."),
-    ] = None,
-    rgb_topic: Annotated[str | None, typer.Option(help="Topic of the colour images in a bag [detected].")] = None,
-    depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images in a bag [detected].")] = None,
-    info_topic: Annotated[
-        str | None, typer.Option(help="Topic of the camera info of the colour images in a bag [detected].")
-    ] = None,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Frame rate in Hz, for a live camera or a source without timestamps."),
-    ] = None,
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    rgb_topic: RgbTopic = None,
+    depth_topic: DepthTopic = None,
+    info_topic: InfoTopic = None,
+    fps: Fps = None,
 ) -> None:
     """Save a live camera or any other source in TUM layout.
 

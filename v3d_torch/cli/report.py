@@ -1,4 +1,4 @@
-"""``python -m v3d_torch report DIR``: HTML report of a run."""
+"""Command ``v3d-torch report``: HTML report of a run."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = make_app()
 
 
 @app.command()

@@ -7,18 +7,16 @@ from typing import Annotated
 
 import typer
 
-from v3d_torch.cli.batch import MultiValueCommand
+from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = make_app()
 
 
 @app.command(cls=MultiValueCommand)
 @expand_user_paths
 def main(
-    data_root: Annotated[
-        Path | None, typer.Option(envvar="V3D_DATA", help="Folder of the sequences; missing ones are downloaded to it.")
-    ] = None,
+    data_root: DataRoot = None,
     download: Annotated[
         bool, typer.Option("--download/--no-download", help="Download missing sequences (gigabytes).")
     ] = True,
@@ -31,21 +29,10 @@ def main(
     ablation: Annotated[
         bool, typer.Option("--ablation", help="Also run the variants of the ablation study and fill its table.")
     ] = False,
-    seeds: Annotated[
-        int, typer.Option(min=1, help="Number of runs of each sequence and configuration, with seeds from 0.")
-    ] = 1,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Number of runs at a time. With more than one, each run has one thread, which changes run times but"
-            " not results. [1]",
-        ),
-    ] = None,
+    seeds: Seeds = 1,
+    workers: Annotated[int | None, workers_option("1")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/reproduce/<time>].")] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Continue in --out: run only what is missing or has failed.")
-    ] = False,
+    resume: Resume = False,
 ) -> None:
     """Fill the tables of the paper with results of this machine.
 

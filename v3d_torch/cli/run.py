@@ -1,4 +1,4 @@
-"""``v3d-torch run``: tracks a sequence or a camera, and writes trajectory, map and scores."""
+"""Command ``v3d-torch run``: track a sequence or a camera, and write trajectory, map and scores."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
 from v3d_torch.io.paths import expand_user_paths
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = make_app()
 
 
 @app.command()
@@ -23,16 +24,12 @@ def main(
             " (realsense:)."
         ),
     ] = None,
-    data_root: Annotated[
-        Path | None, typer.Option(envvar="V3D_DATA", help="Folder of named sequences; downloads go there, too.")
-    ] = None,
-    camera: Annotated[
-        str | None, typer.Option(help="camera.yaml, K.txt or a preset (tum_fr3), if the sequence has no camera.")
-    ] = None,
-    rgb_topic: Annotated[str | None, typer.Option(help="Topic of the colour images of a bag [guessed].")] = None,
-    depth_topic: Annotated[str | None, typer.Option(help="Topic of the depth images of a bag [guessed].")] = None,
-    info_topic: Annotated[str | None, typer.Option(help="Topic of the colour camera's info [guessed].")] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second of images or videos without timestamps.")] = None,
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    rgb_topic: RgbTopic = None,
+    depth_topic: DepthTopic = None,
+    info_topic: InfoTopic = None,
+    fps: Fps = None,
     config: Annotated[
         str | None,
         typer.Option(help="Name of a configuration (full, paper, baseline ...) or a YAML file [full]."),

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from v3d_torch.config import Config
-from v3d_torch.config.loading import FULL, changed, find_config, load_config
+from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDStream, open_source
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
@@ -32,10 +32,10 @@ from v3d_torch.viz.viewer import make_viewer
 
 @dataclass(frozen=True)
 class ConfigChoice:
-    """Configuration as it is given on the command line.
+    """Configuration as given on the command line.
 
     Attributes:
-        name: Name or file of a configuration; None takes the default.
+        name: Name or file of a configuration; None for the default.
         overrides: Values to set, such as ``objects.voting.distance_threshold=0.05``.
     """
 
@@ -54,12 +54,12 @@ class ConfigChoice:
         """Return the first option that would change a configuration; None if there is none."""
         if self.name is not None and self.load() != config:
             return f"--config {self.name}"
-        return next((override for override in self.overrides if changed(config, [override]) != config), None)
+        return next((override for override in self.overrides if override_config(config, [override]) != config), None)
 
 
 @dataclass(frozen=True)
 class Display:
-    """Output of a run beside its files and its summary.
+    """Output of a run in addition to its files and its summary.
 
     Attributes:
         viz: Viewer that shows the run live: ``rerun``; None for none.
@@ -77,14 +77,14 @@ def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
 
     Args:
         request: Inputs, outputs and configuration.
-        out: Folder of the results; None makes a new one.
+        out: Folder of the results; None to make a new one.
         display: Output on the screen.
 
     Raises:
         V3DError: If an input is not valid, or the run ended early; its results so far are written.
     """
     if request.load_map is None and not request.config.mapping.enabled:
-        raise ConfigError("mapping.enabled=false: there is no map to localise in; give one with --load-map")
+        raise ConfigError("mapping.enabled=false: there is no map to localise in; pass one with --load-map")
     _run(request, out, None, display)
 
 
@@ -93,8 +93,8 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
 
     Args:
         folder: Folder of its results.
-        given: Options given beside ``--resume``: the sequence, if it was moved. Other options must not differ.
-        choice: Configuration given beside ``--resume``.
+        given: Options given with ``--resume``. Only the location of the sequence can differ from the run.
+        choice: Configuration given with ``--resume``.
         out: The same folder, or None.
         display: Output on the screen.
 
@@ -129,7 +129,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
             " or start a new run"
         )
     known_map = None
-    if request.load_map is not None and checkpoint is None:  # a checkpoint has what became of the map
+    if request.load_map is not None and checkpoint is None:  # a checkpoint contains the map
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
     segment = make_segmenter(request.config.segmentation, weights=_path(request.weights), masks_dir=masks)
     viewer = make_viewer(display.viz, display.rerun_file, sequence)
@@ -194,7 +194,7 @@ def _print_summary(
         raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
         raise InputError(
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; give a map of the same place, or"
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
             f" run without --load-map (the results are in {folder})"
         )
     if (problem := diagnose(pipeline, evaluation)) is not None:
@@ -206,7 +206,7 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     statuses = Counter(slam.poses.statuses)
     motion_states = Counter(str(row["motion_state"]) for row in record.dynamics)
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
-    table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frames}")
+    table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frame_count}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     active = slam.map.active_keyframes
     known = sum(keyframe.is_from_earlier_run for keyframe in active)
@@ -223,6 +223,6 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
         fractions = {"moving": masks.moving_masked, "static": masks.static_masked}
         texts = [f"{value:.1%} of the {name} pixels" for name, value in fractions.items() if value is not None]
         table.add_row("masked", ", ".join(texts))
-        if (changes := masks.id_switches_per_60_frames) is not None:
-            table.add_row("id switches", f"{changes:.1f} per 60 frames ({masks.people_found:.0%} found)")
+        if (id_switches := masks.id_switches_per_60_frames) is not None:
+            table.add_row("id switches", f"{id_switches:.1f} per 60 frames ({masks.people_found:.0%} found)")
     return table

@@ -58,25 +58,25 @@ def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> C
     Args:
         name: Key of `CONFIGS`, such as ``paper``, or path of a YAML file with any part of the values; None for the
             defaults.
-        overrides: One or several texts such as ``objects.voting.distance_threshold=0.05``; values are parsed as YAML.
+        overrides: One text or several such as ``objects.voting.distance_threshold=0.05``; values are parsed as YAML.
 
     Raises:
         ConfigError: If the file cannot be read, a key is unknown (the message names the nearest one) or a value is not
             valid.
     """
     tree = {} if name is None else _read_yaml(find_config(name))
-    return _overridden(tree, _validated(tree, f"{name}"), overrides)
+    return _apply_overrides(tree, _validate(tree, f"{name}"), overrides)
 
 
-def changed(config: Config, overrides: Iterable[str]) -> Config:
-    """Return a configuration with overrides, which are parsed and checked as in `load_config`."""
-    return _overridden(config.model_dump(), config, overrides)
+def override_config(config: Config, overrides: Iterable[str]) -> Config:
+    """Return a copy of a configuration with overrides, which are parsed and checked as in `load_config`."""
+    return _apply_overrides(config.model_dump(), config, overrides)
 
 
-def _overridden(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
+def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
     for override in [overrides] if isinstance(overrides, str) else overrides:  # a string is an iterable, too
         _apply_override(tree, override)
-        config = _validated(tree, "--set")
+        config = _validate(tree, "--set")
     return config
 
 
@@ -85,7 +85,7 @@ def dump_config(config: Config) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
-def _validated(tree: Mapping[str, Any], source: str) -> Config:
+def _validate(tree: Mapping[str, Any], source: str) -> Config:
     _reject_unknown_keys(tree, Config, source)
     try:
         config = Config.model_validate(tree)

@@ -1,7 +1,7 @@
 """Typed configuration: one section per stage, each value with its unit and its reason.
 
 `v3d_torch.config.loading` reads it from YAML files and the command line; each run writes the resolved configuration
-beside its results. Values that only an expert of one file would change are named constants of that file.
+to the folder of its results. Values that only an expert of one file would change are named constants of that file.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class SegmentationConfig(Section):
     duplicate_overlap: float = Field(0.7, gt=0, le=1)
     """An instance is a duplicate if a larger fraction of it lies within a better one of its class."""
     upright: bool = True
-    """True to rotate the images of a rolled camera upright before the network sees them (false in the paper)."""
+    """True to rotate the images of a rolled camera upright before segmentation (false in the paper)."""
     max_instances: int = Field(32, gt=0)
     """Maximum number of instances in an image, by score. It bounds memory and is far above the number in a room."""
     interval: int = Field(1, gt=0)
@@ -87,7 +87,8 @@ class TrackerConfig(Section):
     max_speed: float = Field(3.0, gt=0)
     """Maximum speed of an object, m/s: a person who runs. Matches beyond it are rejected."""
     max_jump: float = Field(0.5, gt=0)
-    """Maximum jump of a centroid at any time, metres: it moves when an object is cut off or occluded."""
+    """Maximum jump of a centroid, metres, in addition to its motion: the centroid also moves when an object is cut off
+    or occluded."""
     acceleration_noise: float = Field(2.0, gt=0)
     """Standard deviation of the change of velocity in one second, m/s^2: a person can stop or turn within a second."""
     min_overlap: float = Field(0.4, ge=0, le=1)
@@ -107,8 +108,8 @@ class VotingConfig(Section):
     vote_threshold: int = Field(2, gt=0)
     """T_v, votes that make an object dynamic (authors' code: more than one)."""
     baselines: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
-    """Distances are compared with those of so many seconds ago; 0 is the previous frame (the paper's rule). At 1 m/s a
-    person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections
+    """Times over which changes of distances are measured, seconds; 0 is the previous frame (the paper's rule). At 1 m/s
+    a person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections
     are stored for 1 s."""
 
 
@@ -122,8 +123,8 @@ class FreeSpaceConfig(Section):
     enabled: bool = True
     """False for the paper's literal rules."""
     baselines: tuple[float, ...] = (0.3, 0.9)
-    """The present depth is compared with that of so many seconds ago: a walking person moves 0.3 m in the first, a slow
-    one in the second."""
+    """Times between the depth images that are compared, seconds: a walking person moves 0.3 m in the first, a slow one
+    in the second."""
     min_unlabelled_area: float = Field(0.02, gt=0)
     """Minimum area of an unlabelled moving region, square metres: a hand with its forearm. Infinite in the ablation."""
     max_depth: float = Field(6.0, gt=0)
@@ -133,8 +134,9 @@ class FreeSpaceConfig(Section):
     min_tolerance: float = Field(0.04, gt=0)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
     depth_sync_error: float = Field(0.02, ge=0, le=1)
-    """Time between colour and depth of a frame, seconds: TUM associates up to this difference, and reading half an
-    image takes as long. A turning camera observes them as many pixels apart as it turns meanwhile."""
+    """Maximum time between colour and depth of a frame, seconds: TUM associates up to this difference, and reading half
+    an image takes as long. If the camera turns, colour and depth are shifted by the pixels that it turns in this
+    time."""
     min_depth: float = Field(0.3, gt=0)
     """Minimum depth of points that are checked, metres: below the range of the cameras."""
     min_points: int = Field(30, gt=0)
@@ -151,23 +153,23 @@ class ChamferConfig(Section):
     paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a
     Kinect at 3 m adds as much."""
     baseline: float = Field(0.3, ge=0, le=1)
-    """The cloud is compared with that of so many seconds ago; 0 is the previous frame (the paper's rule). Detections
+    """Time between the two clouds that are compared, seconds; 0 is the previous frame (the paper's rule). Detections
     are stored for 1 s."""
     keep_deforming_features: bool = False
-    """True to track features on deforming objects. The paper's text says both; its code masks them."""
+    """True to track features on deforming objects. The paper's text describes both; its code masks them."""
 
 
 class StaticMaskConfig(Section):
     """Mask of the static pixels, on which the camera is tracked."""
 
     confirm_static_time: float = Field(1.0, ge=0)
-    """A person is masked until observed static for so long, seconds (the paper masks persons until they are
-    classified)."""
+    """Time after the first detection for which a person is masked, unless observed at rest, seconds (the paper masks
+    persons until they are classified)."""
     hold_dynamic_time: float = Field(1.0, ge=0)
-    """An object stays dynamic or deforming for so long after the last evidence, seconds: a walking person pauses
-    between steps. A thing that is observed at rest is released at once."""
+    """Time for which an object stays dynamic or deforming after the last evidence, seconds: a walking person pauses
+    between steps. A thing that is observed at rest becomes static at once."""
     confirm_dynamic_frames: int = Field(2, gt=0)
-    """Frames with evidence before a dynamic state is held: one can be depth noise."""
+    """Number of frames with evidence before a dynamic state is held: evidence in a single frame can be depth noise."""
     dilation: int = Field(2, ge=0, le=100)
     """Dilation of masks regardless of depth, pixels: the alignment error of colour and depth."""
     depth_margin: int = Field(8, ge=0, le=100)
@@ -177,7 +179,7 @@ class StaticMaskConfig(Section):
     """Dilation of masks along a continuous surface, pixels: a hand at 3 m. Larger values also mask more of a table that
     a person touches. 0 turns it off."""
     edge_ratio: float = Field(0.04, gt=0)
-    """Relative depth difference over four pixels that is an edge: a surface seen at 80 degrees differs by 0.03."""
+    """Relative depth difference over four pixels that is an edge: a surface viewed at 80 degrees differs by 0.03."""
     min_surface_fraction: float = Field(0.4, ge=0, le=1)
     """A mask does not grow along a surface of which the object would be a smaller fraction, such as a floor or
     table."""
@@ -368,8 +370,8 @@ class CheckpointConfig(Section):
 
     interval: float = Field(30.0, ge=0)
     """Minimum time between checkpoints, seconds. 0 saves after every frame, infinity never."""
-    max_time_share: float = Field(0.02, gt=0, le=1)
-    """Maximum share of the run time spent on checkpoints: they grow with the run, and are then saved less often."""
+    max_time_fraction: float = Field(0.02, gt=0, le=1)
+    """Maximum fraction of the run time spent on checkpoints: they grow with the run, and are then saved less often."""
 
 
 class Config(Section):

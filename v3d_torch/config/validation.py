@@ -1,4 +1,4 @@
-"""Validation of values given by users: conversion to numbers, and pydantic errors in words."""
+"""Conversion of values given by users to numbers, and description of pydantic errors."""
 
 from __future__ import annotations
 

@@ -86,29 +86,19 @@ def load_sequence(
 ) -> RGBDSequence:
     """Open a sequence with a fixed number of frames that can be indexed.
 
-    Args:
-        name: Name or path of the sequence, see `open_source`.
-        data_root: Folder with the user's sequences; None for ``$V3D_DATA``, or else the cache (``$V3D_CACHE``).
-        camera: A camera, the name of a preset or a camera file; None for the camera of the sequence.
-        options: Options for sequences that do not describe themselves completely; None for the defaults.
-        download: True if a TUM sequence that is not on disk is downloaded.
-        progress: Callback for the number of downloaded bytes, or of rendered frames of the demo; None for no reports.
+    Arguments, errors and warnings are those of `open_source`.
 
     Returns:
         The sequence; ``sequence[i]`` is an `RGBDFrame`.
 
     Raises:
-        InputError: If there is no such sequence, its content is invalid, or the source is a stream.
-        DownloadError: If the sequence is not on disk and cannot be downloaded.
-
-    Warns:
-        GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
+        InputError: Also if the source is a stream, such as a live camera.
     """
     source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
     if not isinstance(source, RGBDSequence):
         raise InputError(
             f"{name}: is a stream, whose frames cannot be indexed; record it first with"
-            f" python -m v3d_torch record --seq {name} --out FOLDER"
+            f" v3d-torch record --seq {name} --out FOLDER"
         )
     _warn_about_groundtruth(source)
     return source
@@ -149,7 +139,7 @@ def _open_by_name(
         reject_options(name, "the demo", options, frozenset())
         return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
     if name.partition(":")[0] == "realsense":
-        reject_options(name, "a live camera", options, frozenset({"fps"}))
+        reject_options(name.removesuffix(":"), "a live camera", options, frozenset({"fps"}))
         return open_realsense_camera(name, camera, fps=options.fps)
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)
     source = open_path(path, camera, options, progress)

@@ -41,7 +41,7 @@ class BonnSequence(TUMSequence):
 
     ``groundtruth.txt`` contains the poses of the markers, 2 cm from the camera. The published transforms convert them
     to camera poses. Most published results are computed from the unconverted file, and so are those of
-    ``python -m v3d_torch evaluate``.
+    ``v3d-torch evaluate``.
 
     Args:
         folder: Folder of the sequence.
@@ -60,7 +60,7 @@ class BonnSequence(TUMSequence):
 def is_bonn(path: Path) -> bool:
     """Check whether a folder is an original sequence of the dataset, by its name and content.
 
-    A folder with ``camera.yaml`` was written by ``python -m v3d_torch record``: its ground truth is already converted.
+    A folder with ``camera.yaml`` was written by ``v3d-torch record``: its ground truth is already converted.
     """
     return "rgbd_bonn" in path.resolve().name.lower() and is_tum(path) and not (path / "camera.yaml").is_file()
 

@@ -11,8 +11,10 @@ from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import parse_timestamp
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
+"""Suffixes of image files, in lower case."""
 
 _PARTS = re.compile(r"(\D*)(\d*)")
+"""Text and number parts of a name, for sorting."""
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -21,7 +21,7 @@ _T = TypeVar("_T")
 _EXPECTED = "a list has a timestamp and a file name on each line"
 
 _MAX_GAP = 10.0
-"""Maximum median time between images, seconds. No trackable sequence has so few images; timestamps in milliseconds at
+"""Maximum median time between images, seconds. Images farther apart cannot be tracked; timestamps in milliseconds at
 30 Hz exceed this limit."""
 
 MAX_STAMP_DIFFERENCE = 0.02

@@ -81,7 +81,7 @@ def _find(root: Path, name: str, full_name: str | None) -> Path | None:
 
 def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
     folder, archive = root / full_name, root / f"{full_name}.tgz"
-    # The lock is in the cache, because the file system of the data can be without locks.
+    # The lock is in the cache, because the file system of the data may not support locks.
     with file_lock(cache_dir() / full_name):
         if not folder.is_dir():
             fetch(download_url(full_name), archive, progress=progress)

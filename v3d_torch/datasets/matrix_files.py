@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE
 from v3d_torch.errors import InputError
 from v3d_torch.io.safe_yaml import parse_yaml
 from v3d_torch.io.text import numbered_lines, read_text
@@ -18,9 +19,6 @@ from v3d_torch.types import Trajectory
 
 _ROTATION_TOLERANCE = 0.01
 """Maximum deviation of an element of R R^T from the identity: files with few digits round their rotations."""
-
-_MAX_DISTANCE = 1e7
-"""Maximum coordinate of a position, metres: the order of the earth's radius, for poses in a geocentric frame."""
 
 _OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
 """First line and matrix tag of OpenCV's files. Neither is valid YAML, so both are removed before parsing."""
@@ -69,7 +67,7 @@ def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
             continue
         R = T_wc[:3, :3]
         if (
-            np.abs(T_wc).max() > _MAX_DISTANCE
+            np.abs(T_wc).max() > MAX_DISTANCE
             or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE
             or np.linalg.det(R) < 0
         ):

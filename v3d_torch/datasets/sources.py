@@ -26,7 +26,7 @@ from v3d_torch.io.download import Progress
 class SourceOptions:
     """Options for sources that do not describe themselves completely.
 
-    Args:
+    Attributes:
         rgb_topic: Topic of a bag's colour images; None for automatic selection.
         depth_topic: Topic of a bag's depth images; None for automatic selection.
         info_topic: Topic of a bag's camera info; None for automatic selection.
@@ -44,7 +44,7 @@ class SourceOptions:
 class Source:
     """A kind of source.
 
-    Args:
+    Attributes:
         description: Description with an article, for messages.
         matches: Function that checks whether a path is a source of this kind.
         open: Function that opens a path with the camera chosen by the user, the options and a progress callback.

@@ -16,7 +16,7 @@ from v3d_torch.io.text import numbered_lines
 from v3d_torch.io.timestamps import parse_timestamp
 from v3d_torch.types import Trajectory
 
-_MAX_DISTANCE = 1e7
+MAX_DISTANCE = 1e7
 """Maximum coordinate of a position, metres: the order of the earth's radius, for poses in a geocentric frame."""
 
 _MAX_QUATERNION_NORM = 1e3
@@ -47,7 +47,7 @@ def read_trajectory(path: StrPath) -> Trajectory:
         norms = np.linalg.norm(poses[:, 4:], axis=1)
     for invalid, cause in (
         (~np.isfinite(poses).all(axis=1), "a number that is not finite"),
-        ((np.abs(poses[:, 1:4]) > _MAX_DISTANCE).any(axis=1), f"a position more than {_MAX_DISTANCE:g} m away"),
+        ((np.abs(poses[:, 1:4]) > MAX_DISTANCE).any(axis=1), f"a position more than {MAX_DISTANCE:g} m away"),
         (
             ~((norms > 1 / _MAX_QUATERNION_NORM) & (norms < _MAX_QUATERNION_NORM)),
             "a quaternion that is zero or far from unit length",

@@ -42,8 +42,8 @@ class VideoSequence(StoredSequence):
 
     Args:
         path: Folder with a colour video and a video called ``depth``, or the colour video of such a pair.
-        camera: Camera given by the user; None reads the ``camera.yaml`` or ``K.txt`` next to the videos.
-        fps: Frame rate of both videos, Hz; None takes the timestamps in the videos.
+        camera: Camera chosen by the user; None for the ``camera.yaml`` or ``K.txt`` next to the videos.
+        fps: Frame rate of both videos, Hz; None for the timestamps in the videos.
         progress: Called with the number of colour frames read so far and their total.
 
     Raises:
@@ -118,7 +118,7 @@ def _find_pair(path: Path) -> tuple[Path, Path]:
         found = ", ".join(file.name for file in colour + depth)
         raise InputError(
             f"{path}: expected one colour and one depth video, found {found}; name them like take.mp4 and"
-            " take_depth.mkv and give the first"
+            " take_depth.mkv and pass the first"
         )
     return colour[0], depth[0]
 
@@ -144,7 +144,7 @@ def _read_stamps(
     if not stamps:
         raise InputError(f"{path}: cannot be decoded as a video; copy it again, or convert it with ffmpeg")
     if any(later <= earlier for earlier, later in pairwise(stamps)):
-        raise InputError(f"{path}: its timestamps do not increase; set the frame rate with --fps")
+        raise InputError(f"{path}: its timestamps do not increase; pass the frame rate with --fps")
     if position < _MIN_DECODED_FRACTION * duration:
         return stamps, f"{path}: is truncated at {position:.1f} of {duration:.1f} s; copy it again"
     return stamps, None

@@ -15,7 +15,7 @@ MAX_BYTES = 20 * 2**30
 """Largest total size of the files in an archive, bytes: three times the largest TUM sequence."""
 
 _MAX_MEMBERS = 1_000_000
-"""Largest number of members: also empty files fill up a file system, and no sequence has so many."""
+"""Largest number of members: empty files fill up a file system, too, and no sequence has a million files."""
 
 _MAX_HEADER_BYTES = 1 << 20
 """Largest extension header of a member, bytes: tarfile reads it into memory whole, and it only holds a name."""

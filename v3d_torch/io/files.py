@@ -53,7 +53,7 @@ def check_writable(path: Path) -> None:
         with TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}); give another file") from error
+        raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another file") from error
 
 
 def write_text(path: Path, text: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import yaml
 
 _MAX_LENGTH = 100_000
-"""Largest YAML text, characters: more than any file that is read here, and little enough for a slow parser."""
+"""Largest YAML text, characters: more than any valid file has, and few enough for a slow parser."""
 
 
 def parse_yaml(text: str) -> Any:

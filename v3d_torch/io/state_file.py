@@ -36,7 +36,7 @@ _DAMAGE_ERRORS = (
 
 
 def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:
-    """Write a state file atomically and durably: after a power failure the old or the new state is there.
+    """Write a state file atomically and durably: after a power failure the file contains the old or the new state.
 
     Args:
         path: File to write.
@@ -83,7 +83,7 @@ def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any
             with torch.serialization.safe_globals(list(classes)):
                 return metadata, torch.load(file, weights_only=True)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check that you may read it") from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     except _DAMAGE_ERRORS as error:
         raise _damage_error(path) from error
 

@@ -31,7 +31,7 @@ def read_text(path: Path, expected: str) -> str:
             text = file.read(_MAX_LENGTH + 1)
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check that it is a file and that you may read it"
+            f"{path}: cannot be read ({error.strerror}); check that it is a file, and its permissions"
         ) from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not a UTF-8 text file; convert it to UTF-8 ({expected})") from error

@@ -96,7 +96,7 @@ class FramePrefetcher:
     def _receive(
         self, worker: PreprocessWorker, frames: FrameIterator, preprocess_here: PendingFrame
     ) -> PreprocessedFrame | None:
-        """Return the result of the second process; preprocess the frame here if that has failed."""
+        """Return the result of the second process; if it has failed, preprocess the frame in this process."""
         preprocessed = worker.result()
         if preprocessed is None:
             return preprocess_here()

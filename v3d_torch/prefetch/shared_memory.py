@@ -33,7 +33,7 @@ _ALLOWED = {
     ("numpy.core.numeric", "_frombuffer"),  # before NumPy 2
     ("pathlib", "PosixPath"),
 }
-"""Globals that can be unpickled beside those of this package."""
+"""Globals that can be unpickled in addition to those of this package."""
 
 
 def new_shared_memory(values: int) -> int | None:
@@ -99,14 +99,14 @@ class Channel:
             pickle.UnpicklingError: If the value has a class or function that is neither of this package nor in
                 `_ALLOWED`.
         """
-        (count,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
-        sizes = [size for (size,) in _NUMBER.iter_unpack(self._exactly(count * _NUMBER.size))]
+        (count,) = _NUMBER.unpack(self._receive_exactly(_NUMBER.size))
+        sizes = [size for (size,) in _NUMBER.iter_unpack(self._receive_exactly(count * _NUMBER.size))]
         if self._memory is not None and _SMALL < sum(sizes) <= SLOT_BYTES:
-            (slot,) = _NUMBER.unpack(self._exactly(_NUMBER.size))
+            (slot,) = _NUMBER.unpack(self._receive_exactly(_NUMBER.size))
             ends = pairwise(accumulate(sizes, initial=slot))
             parts = [_writable(memoryview(self._memory)[begin:end]) for begin, end in ends]
         else:
-            parts = [self._exactly(size) for size in sizes]
+            parts = [self._receive_exactly(size) for size in sizes]
         stream, *buffers = parts
         return _Unpickler(BytesIO(stream), buffers=buffers).load()
 
@@ -114,7 +114,7 @@ class Channel:
         """Close the connection."""
         self.connection.close()
 
-    def _exactly(self, size: int) -> memoryview:
+    def _receive_exactly(self, size: int) -> memoryview:
         """Receive a number of bytes in writable memory."""
         content = np.empty(size, np.uint8).data  # not initialised, unlike a bytearray
         received = 0

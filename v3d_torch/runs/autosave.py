@@ -17,14 +17,14 @@ _LOG = logging.getLogger(__name__)
 
 
 class Autosave:
-    """Saves results and checkpoints as often as the configuration says.
+    """Saves results and checkpoints at the intervals of the configuration.
 
     If they cannot be written, the run continues and ``record.save_error`` holds the reason.
 
     Args:
         folder: Folder of the results.
         pipeline: Pipeline that runs.
-        request: Request of the run, stored in the checkpoints; None saves no checkpoints.
+        request: Request of the run, stored in the checkpoints; None to save no checkpoints.
     """
 
     def __init__(self, folder: Path, pipeline: Pipeline, request: RunRequest | None) -> None:
@@ -35,7 +35,7 @@ class Autosave:
         self._due = time.perf_counter() + self._config.interval
 
     def __call__(self) -> None:
-        """Save after a frame, if it is time."""
+        """Save after a frame, if a save is due."""
         start = time.perf_counter()
         if start < self._due:
             return
@@ -45,7 +45,7 @@ class Autosave:
         except OutputError as error:
             self._report(error)
         end = time.perf_counter()
-        self._due = end + max(self._config.interval, (end - start) * (1 / self._config.max_time_share - 1))
+        self._due = end + max(self._config.interval, (end - start) * (1 / self._config.max_time_fraction - 1))
 
     def end(self) -> None:
         """Save a last checkpoint if the run ended early between two frames, before the results are written.

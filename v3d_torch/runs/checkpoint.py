@@ -25,7 +25,7 @@ from v3d_torch.runs.state import STATE_CLASSES
 from v3d_torch.runs.stored_run import read_metrics, suggest_folder
 
 CHECKPOINT = "checkpoint.v3d"
-"""Name of the file, which exists from the first checkpoint of a run to its end."""
+"""Name of the checkpoint file. It exists from the first checkpoint of a run to its end."""
 
 _CLASSES = (
     *STATE_CLASSES,
@@ -56,7 +56,7 @@ class Checkpoint:
 def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> None:
     """Write the state of a run to its folder.
 
-    A live stream cannot be resumed, because its frames do not come again; its checkpoint only says so.
+    A live stream cannot be resumed, because its frames do not come again; its checkpoint contains only the request.
 
     Args:
         folder: Folder of the results.
@@ -67,16 +67,16 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> N
         OutputError: If the file cannot be written; the previous checkpoint stays.
     """
     sequence = pipeline.sequence
-    about: dict[str, Any] = {"request": request.absolute().to_dict()}
+    metadata: dict[str, Any] = {"request": request.absolute().to_dict()}
     state: dict[str, Any] = {}
     if isinstance(sequence, RGBDSequence):
-        about |= {"sequence": _fingerprint(sequence), "frames": len(pipeline.slam.poses.statuses)}
+        metadata |= {"sequence": _fingerprint(sequence), "frames": len(pipeline.slam.poses.statuses)}
         state = pipeline.state_dict()
-    write_state(folder / CHECKPOINT, about, state)
+    write_state(folder / CHECKPOINT, metadata, state)
 
 
 def is_finished(folder: Path) -> bool:
-    """True if the run in a folder reached the end of its sequence and wrote its results.
+    """Check whether the run in a folder reached the end of its sequence and wrote its results.
 
     Raises:
         InputError: If its ``metrics.json`` is damaged.
@@ -95,26 +95,27 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     if not path.is_file():
         cause = "has no checkpoint" if folder.is_dir() else "is not a folder"
         fix = suggest_folder(folder, CHECKPOINT) or (
-            "give the folder of a run that ended early, or run the sequence again"
+            "pass the folder of a run that ended early, or run the sequence again"
         )
         raise InputError(f"{folder}: {cause}; {fix}")
-    about, state = read_state(path, _CLASSES)
+    metadata, state = read_state(path, _CLASSES)
     try:
-        request = RunRequest.from_dict(about["request"])
-        if "sequence" not in about:
+        request = RunRequest.from_dict(metadata["request"])
+        if "sequence" not in metadata:
             raise InputError(
                 f"{folder}: the run of a live stream ({request.seq}) cannot be resumed; its results so far are in"
                 " trajectory.txt"
             )
-        return Checkpoint(folder, request, about["sequence"], about["frames"], state)
+        return Checkpoint(folder, request, metadata["sequence"], metadata["frames"], state)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is not the checkpoint of a run; run the sequence again") from error
 
 
 def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
-    """Return how a sequence differs from that of a checkpoint, in words; None if it is the same.
+    """Describe the difference between a sequence and that of a checkpoint; None if they are the same.
 
-    Only the last processed frame is compared in full, and not the ground truth, which is used at the end only.
+    Of the images, only those of the last processed frame are compared. The ground truth is not compared, because it is
+    used at the end only.
 
     Raises:
         InputError: If that frame cannot be read.
@@ -131,8 +132,8 @@ def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
         if stored[key] != current[key]:
             return change
     last = checkpoint.state["slam"]["previous"].frame
-    again = sequence[last.index]
-    same = torch.equal(again.image, last.image) and torch.equal(again.depth, last.depth)
+    current_frame = sequence[last.index]
+    same = torch.equal(current_frame.image, last.image) and torch.equal(current_frame.depth, last.depth)
     return None if same else f"frame {last.index} shows another image"
 
 

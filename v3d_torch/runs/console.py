@@ -80,19 +80,19 @@ def open_sequences(names: Sequence[str], data_root: Path | None, console: Consol
 
 
 def wide_console() -> Console:
-    """Console for tables, which are not squeezed into 80 columns if the output is a file or pipe."""
+    """Return a console for wide tables: 200 columns if the output is not a terminal, instead of 80."""
     return Console(soft_wrap=True, highlight=False, width=None if sys.stdout.isatty() else 200)
 
 
 def run_with_progress(
     make_run: Callable[[], Run], folder: Path, console: Console, checkpoint: Checkpoint | None = None
 ) -> tuple[Pipeline, Evaluation | None]:
-    """Carry out a run with a progress bar on the console and a log file in its folder.
+    """Execute a run with a progress bar on the console and a log file in its folder.
 
     Args:
-        make_run: Makes the run; called after the files of an earlier run were removed.
+        make_run: Function that creates the run; called after the files of an earlier run were removed.
         folder: Folder of the results.
-        console: Console.
+        console: Console for the progress bar.
         checkpoint: Checkpoint that the run resumes from; None if it starts with the first frame.
 
     Returns:
@@ -115,7 +115,7 @@ def run_with_progress(
 
 
 def progress_bars(console: Console) -> Progress:
-    """Progress bars with counts, remaining time and a note; hidden if the console is not a terminal."""
+    """Return progress bars with counts, remaining time and a note; hidden if the console is not a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -128,7 +128,12 @@ def progress_bars(console: Console) -> Progress:
 
 
 class ProgressBar:
-    """Progress bar of a job that reports (done, total), such as a download."""
+    """Progress bar of a job that reports (done, total), such as a download.
+
+    Args:
+        progress: Progress bars of the console.
+        description: Text to the left of the bar.
+    """
 
     def __init__(self, progress: Progress, description: str) -> None:
         self._progress, self._description = progress, description
@@ -154,7 +159,7 @@ class _TrackingBar:
     def __call__(self, frame: RGBDFrame, result: FrameResult) -> None:
         now, note = time.perf_counter(), f"{result.status.value}  {describe_motion(result)}"
         if self._start is None:
-            self._start = now  # the first frame is not counted, as it waits for the network
+            self._start = now  # the first frame is not counted, because it waits for the network
         else:
             self._frames += 1
             note = f"{self._frames / (now - self._start):.1f} frames/s  {note}"
@@ -173,8 +178,8 @@ def interrupts_between_frames() -> Iterator[Event]:
             raise KeyboardInterrupt
         interrupted.set()
 
-    before = signal.signal(signal.SIGINT, delay)
+    previous = signal.signal(signal.SIGINT, delay)
     try:
         yield interrupted
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)

@@ -47,7 +47,7 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
         indices = np.linspace(0, len(sequence) - 1, min(_SAMPLES, len(sequence))).astype(int)
         frames = [sequence[int(index)] for index in indices]
         if all(float(frame.image.float().std()) < _MAX_PLAIN_SIGMA for frame in frames):
-            return "the colour images are uniform; record it again, with light and an open lens"
+            return "the colour images are uniform; record it again, with light and an uncovered lens"
         if all(float((frame.depth > 0).float().mean()) < _MAX_EMPTY_FRACTION for frame in frames):
             return "the depth images are empty; record or export them again"
         if all(

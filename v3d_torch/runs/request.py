@@ -20,18 +20,18 @@ class RunRequest:
     """Inputs, outputs and configuration of one run. Checkpoints store it, so that the run can be resumed.
 
     Attributes:
-        seq: Sequence, as `open_source` takes it.
+        seq: Name of the source, see `open_source`.
         config: Configuration of the system.
-        data_root: Folder of named sequences; None searches the usual places.
-        camera: Camera file or preset; None takes the camera of the sequence.
-        rgb_topic: Topic of the colour images of a bag; None guesses it, as for the next two.
-        depth_topic: Topic of the depth images of a bag.
-        info_topic: Topic of the camera info of a bag.
-        fps: Frame rate of images or videos without timestamps, Hz.
-        masks: Folder of id images, if instances are read from files.
-        weights: Weights file of the network; None takes the published ones.
-        load_map: Map file in which the camera is localised; None starts a new map.
-        save_map: File to which the map is saved at the end; None saves none.
+        data_root: Folder of named sequences; None for the search order of `open_source`.
+        camera: Camera file or preset; None for the camera of the sequence.
+        rgb_topic: Topic of the colour images of a bag; None for automatic selection.
+        depth_topic: Topic of the depth images of a bag; None for automatic selection.
+        info_topic: Topic of the camera info of a bag; None for automatic selection.
+        fps: Frame rate, Hz, see `SourceOptions`; None for the timestamps of the source.
+        masks: Folder of id images, if instances are read from files; None otherwise.
+        weights: Weights file of the network; None for the published weights.
+        load_map: Map file in which the camera is localised; None to start a new map.
+        save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
     """
 

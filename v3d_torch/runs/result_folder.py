@@ -17,7 +17,7 @@ _RESULTS = (
     *("checkpoint.v3d", "frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png", "masks/*.png"),
 )
-"""Files that a run, or the report of a run, writes beside the log."""
+"""Files that a run, or the report of a run, writes in addition to the log."""
 
 _UNFINISHED = (".*.part*", "figures/.*.part*", "masks/.*.part*")
 """Temporary files of a run that was killed while it wrote."""
@@ -27,7 +27,7 @@ def make_result_folder(out: Path | None, name: str) -> Path:
     """Make the folder of the results of a run.
 
     Args:
-        out: Folder given by the user; None makes ``results/<name>/<time>``, and a link ``latest`` to it.
+        out: Folder given by the user; None to make ``results/<name>/<time>``, and a link ``latest`` to it.
         name: Name of the sequence.
 
     Raises:

@@ -84,8 +84,8 @@ def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
     """
     _, evaluation = _write_tables(folder, pipeline)
     done = len(pipeline.slam.poses.statuses)
-    known = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
-    _write_metrics(folder, pipeline, evaluation, f"killed or still running after {done}{known} frames")
+    total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
+    _write_metrics(folder, pipeline, evaluation, f"killed or still running after {done}{total} frames")
 
 
 def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluation | None]:
@@ -94,15 +94,15 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
     trajectory = slam.poses.trajectory()
     write_trajectory(folder / "trajectory.txt", trajectory)  # first, in case the disk gets full
     write_text(folder / "config.yaml", dump_config(slam.config))
-    own = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
-    stamps = torch.tensor([keyframe.stamp for keyframe in own], dtype=torch.float64)
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(stack_poses(own))))
+    keyframes = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(stack_poses(keyframes))))
     evaluation = None
     if sequence.groundtruth is not None:
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
         with suppress(InputError):  # too few poses for scores
-            evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frames)
-    _write_table(folder / "frames.parquet", *_frames(pipeline))
+            evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frame_count)
+    _write_table(folder / "frames.parquet", *_frame_table(pipeline))
     _write_table(folder / "dynamics.parquet", pipeline.record.dynamics, _DYNAMICS)
     return trajectory, evaluation
 
@@ -111,7 +111,7 @@ def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | No
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation, failure), indent=2) + "\n")
 
 
-def _frames(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
+def _frame_table(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
     """Return the table of frames: status, keyframe, and seconds of each stage, 0 if it did not run."""
     slam, rows = pipeline.slam, pipeline.record.frames
     stages = list(slam.timer.seconds)
@@ -147,7 +147,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
-        "frames": pipeline.frames,
+        "frames": pipeline.frame_count,
         "processed": frames,
         **counts,
         "status": [status.value for status in statuses],

@@ -40,8 +40,8 @@ class Run:
         segment: Segmenter.
         folder: Folder of the results; it exists.
         viewer: Viewer that is shown each frame.
-        known_map: Map of an earlier run in which the camera is localised; None starts a new map.
-        checkpoint: Checkpoint of the same run to resume from; None starts with the first frame.
+        known_map: Map of an earlier run in which the camera is localised; None to start a new map.
+        checkpoint: Checkpoint of the same run to resume from; None to start with the first frame.
         save_checkpoints: False to save no checkpoints.
 
     Attributes:
@@ -90,7 +90,7 @@ class Run:
             on_frame: Called after each frame; a KeyboardInterrupt that it raises ends the run between two frames.
 
         Returns:
-            The scores, if there is ground truth. If the run ended early, ``pipeline.record.failure`` says why.
+            The scores, if there is ground truth. If the run ended early, ``pipeline.record.failure`` is the reason.
 
         Raises:
             OutputError: If the results cannot be written.

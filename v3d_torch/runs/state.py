@@ -1,4 +1,4 @@
-"""Saved state of a system: another process can continue with the next frame."""
+"""Saving and loading of the state of a system, so that another process can continue with the next frame."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def save_state(path: StrPath, slam: V3DSLAM) -> None:
         OutputError: If the file cannot be written.
         ConfigError: If a stage was replaced by one without state_dict.
     """
-    about = {"config": slam.config.model_dump(mode="json"), "camera": asdict(slam.camera)}
-    write_state(Path(path), about, slam.state_dict())
+    metadata = {"config": slam.config.model_dump(mode="json"), "camera": asdict(slam.camera)}
+    write_state(Path(path), metadata, slam.state_dict())
 
 
 def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
@@ -53,18 +53,18 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
 
     Args:
         path: File.
-        segment: Segmenter; None takes that of the configuration.
+        segment: Segmenter; None for that of the configuration.
 
     Raises:
         InputError: If the file is missing, damaged, not a saved state, or from another version.
         WeightsError: If the weights of the network are not available.
     """
-    about, state = read_state(Path(path), STATE_CLASSES)
+    metadata, state = read_state(Path(path), STATE_CLASSES)
     try:
-        config = Config.model_validate(about["config"])
-        camera = PinholeCamera(**{**about["camera"], "distortion": tuple(about["camera"]["distortion"])})
+        config = Config.model_validate(metadata["config"])
+        camera = PinholeCamera(**{**metadata["camera"], "distortion": tuple(metadata["camera"]["distortion"])})
         slam = V3DSLAM(camera, segment, config)
         slam.load_state_dict(state)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: is not the state of a system; give a file that save_state wrote") from error
+        raise InputError(f"{path}: is not the state of a system; pass a file that save_state wrote") from error
     return slam

@@ -27,7 +27,7 @@ _MAX_DEPTH = 3
 
 
 class Metrics(BaseModel):
-    """Content of ``metrics.json`` beside the scores; field names are its keys."""
+    """Content of ``metrics.json`` except the scores; field names are its keys."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -55,7 +55,7 @@ class StoredRun:
 
     Attributes:
         folder: Folder of the files.
-        metrics: Figures of the whole run.
+        metrics: Content of ``metrics.json``.
         trajectory: Pose of each processed frame; None if the file is missing or the run has no frames.
         keyframes: Poses of the keyframes; None if there are none.
         groundtruth: True poses; None if there are none.
@@ -86,12 +86,13 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         groundtruth: File of true poses to use instead of those in the folder.
 
     Raises:
-        InputError: If the folder has no results, a file is damaged, or the given ground truth is of another time.
+        InputError: If the folder has no results, a file is damaged, or the given ground truth has too few timestamps in
+            common with the trajectory.
     """
     if not (folder / _METRICS).is_file():
         raise InputError(
             f"{folder}: has no results of a run ({_METRICS} is missing);"
-            f" {suggest_folder(folder, _METRICS) or 'give the folder that the run printed at its end'}"
+            f" {suggest_folder(folder, _METRICS) or 'pass the folder that the run printed at its end'}"
         )
     config_path = folder / "config.yaml"
     config_text = read_text(config_path, "it is a configuration in YAML") if config_path.is_file() else ""
@@ -141,13 +142,13 @@ def suggest_folder(path: Path, file: str) -> str | None:
         A suggestion in words; None if there is no such folder.
     """
     if path.is_file() and (path.parent / file).is_file():
-        return f"give its folder, {path.parent}"
+        return f"pass its folder, {path.parent}"
     found = [match for depth in range(1, _MAX_DEPTH + 1) for match in path.glob("*/" * depth + file)]
     if not found:
         return None
     # Prefer a link such as ``latest`` to the folder that it points to, because it is easier to type.
     newest = max(found, key=lambda match: (match.stat().st_mtime_ns, match.parent.is_symlink()))
-    return f"give the newest run in it, {newest.parent}"
+    return f"pass the newest run in it, {newest.parent}"
 
 
 def read_metrics(path: Path) -> Metrics:

@@ -33,8 +33,8 @@ class Cluster:
     Attributes:
         label: Label of the object, such as "person 3".
         before: Points of all pixels of the mask, shape :math:`(N, 3)`.
-        inliers: True for the points in the cluster that was kept, bool, shape :math:`(N,)`.
-        after: Voxels of that cluster, shape :math:`(M, 3)`.
+        inliers: True for points that are not outliers, bool, shape :math:`(N,)`.
+        after: Voxel means of the inliers, shape :math:`(M, 3)`.
     """
 
     label: str

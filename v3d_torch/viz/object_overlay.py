@@ -28,7 +28,6 @@ MOTION_STATE_COLOURS = {
     "static": "#2ca02c",
     "dynamic": "#d62728",
     "deforming": "#ff7f0e",
-    "predicted": "#9467bd",
     "unknown": "#7f7f7f",
 }
 """Colour of each motion state. Any other state is drawn as unknown."""

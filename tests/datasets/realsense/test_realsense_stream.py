@@ -233,7 +233,7 @@ def test_recording_yields_all_frames_at_any_speed(recording: Path) -> None:
 
 
 def test_recording_is_a_stream_not_a_sequence(recording: Path) -> None:
-    with pytest.raises(InputError, match=r"take.db3: is a stream, .*python -m v3d_torch record --seq"):
+    with pytest.raises(InputError, match=r"take.db3: is a stream, .*with v3d-torch record --seq"):
         load_sequence(str(recording))
 
 
@@ -269,7 +269,7 @@ def test_convention_distortion_is_that_of_librealsense(model: str) -> None:
 
 def test_unsupported_distortion_model_is_rejected_unless_it_is_zero() -> None:
     with pytest.raises(
-        InputError, match="simulated: has the unsupported distortion model kannala_brandt4; give --camera"
+        InputError, match="simulated: has the unsupported distortion model kannala_brandt4; pass --camera"
     ):
         camera_with(make_intrinsics(COLOUR_K, (0.1, 0, 0, 0, 0), "kannala_brandt4"))
     assert camera_with(make_intrinsics(COLOUR_K, model="kannala_brandt4")).distortion == (0, 0, 0, 0, 0)

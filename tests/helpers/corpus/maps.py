@@ -88,7 +88,7 @@ CASES = [
     Case(
         "--localise without a map",
         add_options("--localise"),
-        Fails("mapping.enabled=false: there is no map to localise in; give one with --load-map"),
+        Fails("mapping.enabled=false: there is no map to localise in; pass one with --load-map"),
     ),
     Case(
         "a missing file",
@@ -141,7 +141,7 @@ CASES = [
         "a map of another room",
         all_of(load_map(), show_another_room),
         Fails(
-            "{seq}/room.map: no frame of {seq} was localised in this map; give a map of the same place, or run without"
+            "{seq}/room.map: no frame of {seq} was localised in this map; pass a map of the same place, or run without"
             " --load-map (the results are in {out})",
             saved_poses=8,
         ),
@@ -149,16 +149,16 @@ CASES = [
     Case(
         "a map saved to a folder",
         save_map("{seq}"),
-        Fails("{seq}: cannot be written (Is a directory); give another file"),
+        Fails("{seq}: cannot be written (Is a directory); choose another file"),
     ),
     Case(
         "a map saved below a file",
         save_map("{seq}/rgb.txt/room.map"),
-        Fails("{seq}/rgb.txt/room.map: cannot be written (File exists); give another file"),
+        Fails("{seq}/rgb.txt/room.map: cannot be written (File exists); choose another file"),
     ),
     Case(
         "a map saved under a name of 5000 letters",
         save_map("{root}/" + 5000 * "x"),
-        Fails("{root}/...: cannot be written (File name too long); give another file"),
+        Fails("{root}/...: cannot be written (File name too long); choose another file"),
     ),
 ]

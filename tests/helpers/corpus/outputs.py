@@ -211,7 +211,7 @@ CASES = [
     Case(
         "list without read permission",
         make_unreadable("rgb.txt"),
-        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file and that you may read it"),
+        Fails("{seq}/rgb.txt: cannot be read (Permission denied); check that it is a file, and its permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
@@ -239,17 +239,15 @@ CASES = [
     Case(
         "camera without read permission",
         make_unreadable("camera.yaml"),
-        Fails(
-            "{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file and that you may read it"
-        ),
+        Fails("{seq}/camera.yaml: cannot be read (Permission denied); check that it is a file, and its permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
         "ground truth without read permission",
         make_unreadable("groundtruth.txt"),
         Fails(
-            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file and that you"
-            " may read it (the results are in {out})",
+            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file, and its"
+            " permissions (the results are in {out})",
             saved_poses=8,
         ),
         lambda place: without_root_rights(),

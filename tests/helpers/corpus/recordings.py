@@ -162,7 +162,7 @@ CASES = [
         bag("mcap", remove_topic(INFO)),
         Fails(
             "{root}/take/take.mcap: has no CameraInfo topic for /camera/color/image_raw; name it"
-            " with --info-topic, or give --camera"
+            " with --info-topic, or pass --camera"
         ),
     ),
     Case(
@@ -275,7 +275,7 @@ CASES = [
         bag("mcap", replace_camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
         Fails(
             "{root}/take/take.mcap: /camera/color/camera_info has the unsupported distortion model"
-            " equidistant; record rectified images, or give --camera with k1, k2, p1, p2, k3"
+            " equidistant; record rectified images, or pass --camera with k1, k2, p1, p2, k3"
         ),
     ),
     Case(

@@ -105,7 +105,7 @@ CASES = [
         replace_video("other.mkv", colour(0)),
         Fails(
             "{root}/take: expected one colour and one depth video, found colour.mkv, other.mkv,"
-            " depth.mkv; name them like take.mp4 and take_depth.mkv and give the first"
+            " depth.mkv; name them like take.mp4 and take_depth.mkv and pass the first"
         ),
     ),
     Case(

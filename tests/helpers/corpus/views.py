@@ -43,7 +43,7 @@ CASES = [
         every(RGB, lambda i: plain(0)),
         Fails(
             "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
-            " again, with light and an open lens (the results are in {out})",
+            " again, with light and an uncovered lens (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -52,7 +52,7 @@ CASES = [
         every(RGB, lambda i: plain(255)),
         Fails(
             "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
-            " again, with light and an open lens (the results are in {out})",
+            " again, with light and an uncovered lens (the results are in {out})",
             saved_poses=8,
         ),
     ),
@@ -79,7 +79,7 @@ CASES = [
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
         Fails(
             "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
-            " again, with light and an open lens (the results are in {out})",
+            " again, with light and an uncovered lens (the results are in {out})",
             saved_poses=8,
         ),
     ),

@@ -25,7 +25,7 @@ The third sine of each is the tremor of the hand.
 """
 
 R_WC_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Camera-to-world rotation of a level camera that looks along +y of the world (x right, y forward, z up)."""
+"""Camera-to-world rotation of a level camera whose optical axis is +y of the world (x right, y forward, z up)."""
 
 
 def camera_pose(t: float) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ _LAYER_RATIO = 0.98
 """Samples of a pixel belong to its nearest surface if their inverse depth is above this fraction of the largest."""
 
 _MIN_PLANE_DISTANCE = 1e-6
-"""Planes nearer to the camera centre are seen edge-on and not drawn, metres; negative distances are back faces."""
+"""Planes nearer to the camera centre are edge-on and not drawn, metres; negative distances are back faces."""
 
 
 @dataclass(frozen=True)

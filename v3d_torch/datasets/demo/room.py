@@ -48,7 +48,7 @@ def build_room(seed: int) -> Scene:
 
 
 def _build_walls(rng: np.random.Generator) -> list[Rectangle]:
-    """Build back wall, side walls, floor and ceiling; the camera never looks at the front wall."""
+    """Build back wall, side walls, floor and ceiling; the front wall is never in view."""
     (x0, y0, z0), (x1, y1, z1) = ROOM_MIN, ROOM_MAX
     width, depth, height = x1 - x0, y1 - y0, z1 - z0
     wall = materials.plaster(rng, depth, height, 250, (0.80, 0.77, 0.68))

@@ -92,12 +92,12 @@ class Figure:
 
     Attributes:
         rgba: Picture with its silhouette, in [0, 1], float32, shape :math:`(H, W, 4)`.
-        foot: World position of the middle of the lower edge of the picture if the motion is zero, metres.
+        foot: World position of the middle of the lower edge of the picture if the shift of the pose is zero, metres.
         height: Height of the picture, metres.
         thickness: Largest displacement towards the viewer, metres.
         yaw: Rotation about the vertical, radians; at 0 the figure faces -y.
         motion: Pose of the figure as a function of time in seconds.
-        mover: Id of the figure in the motion masks; 0 for a static figure.
+        mask_id: Id of the figure in the motion masks; 0 for a static figure.
         pivot: Point that stays in place when the figure leans and twists: fractions of the width from the left and of
             the height from the top.
     """

@@ -16,7 +16,7 @@ def import_librealsense(source: str) -> Any:
         source: Name of the camera or file, for error messages.
 
     Raises:
-        InputError: If the library is missing or cannot be loaded; the message says how to install it.
+        InputError: If the library is missing or cannot be loaded; the message contains the command that installs it.
     """
     try:
         return importlib.import_module("pyrealsense2")
@@ -58,5 +58,5 @@ def _distortion(name: str, intrinsics: Any) -> tuple[float, float, float, float,
     # librealsense undistorts inverse_brown_conrady like brown_conrady, to within a hundredth of a pixel.
     supported = (rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady)
     if any((k1, k2, p1, p2, k3)) and intrinsics.model not in supported:
-        raise InputError(f"{name}: has the unsupported distortion model {intrinsics.model.name}; give --camera")
+        raise InputError(f"{name}: has the unsupported distortion model {intrinsics.model.name}; pass --camera")
     return k1, k2, p1, p2, k3

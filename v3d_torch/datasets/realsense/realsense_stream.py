@@ -36,7 +36,7 @@ class RealSenseStream:
     Args:
         name: Name of the stream, for tables and error messages.
         open_device: Opens the camera or file without starting it.
-        camera: Camera given by the user; None takes the calibration of the device.
+        camera: Camera chosen by the user; None for the calibration of the device.
 
     Raises:
         InputError: If ``open_device`` raises it, or the distortion model is not supported.
@@ -111,8 +111,8 @@ def open_realsense_camera(name: str, camera: CameraChoice = None, *, fps: float 
 
     Args:
         name: ``realsense:`` for any camera, ``realsense:SERIAL`` for one of several.
-        camera: Camera given by the user; None takes the calibration of the device.
-        fps: Frame rate to request, Hz; None takes the default.
+        camera: Camera chosen by the user; None for the calibration of the device.
+        fps: Frame rate to request, Hz; None for the default.
 
     Raises:
         InputError: If the camera cannot be opened, see `open_live_device`.

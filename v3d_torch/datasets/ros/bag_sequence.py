@@ -34,7 +34,7 @@ _REPAIR_COMMANDS = {
     ".db3": "ros2 bag reindex",
     "": "ros2 bag reindex",
 }
-"""Command that repairs a bag, by file suffix; a ROS 2 folder has none."""
+"""Command that repairs a bag, by file suffix; the folder of a ROS 2 bag has no suffix."""
 
 _DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "")
 """Distortion models whose first coefficients are k1, k2, p1, p2, k3; rational_polynomial has further ones."""
@@ -47,8 +47,10 @@ class BagSequence(StoredSequence):
 
     Args:
         path: A ``.bag``, ``.db3`` or ``.mcap`` file, or the folder of a ROS 2 bag.
-        camera: Camera given by the user; None takes the CameraInfo of the colour images.
-        rgb_topic, depth_topic, info_topic: Topics given by the user; None chooses by name (see `choose_topics`).
+        camera: Camera chosen by the user; None for the CameraInfo of the colour images.
+        rgb_topic: Topic of the colour images; None to choose it by name, see `choose_topics`.
+        depth_topic: Topic of the depth images; None to choose it by name.
+        info_topic: Topic of the camera info; None to choose it by name.
         progress: Called with the number of messages read so far.
 
     Raises:
@@ -74,7 +76,7 @@ class BagSequence(StoredSequence):
         if not is_confirmed and depth_frame and colour_frame and depth_frame != colour_frame:
             raise InputError(
                 f"{path}: depth on {topics.depth} is in frame {depth_frame}, colour in frame {colour_frame}; record"
-                " depth that is registered to colour (align_depth), or give --depth-topic if this depth is registered"
+                " depth that is registered to colour (align_depth), or pass --depth-topic if this depth is registered"
             )
         colour_stamps, depth_stamps = (list(stamps[topic]) for topic in (topics.rgb, topics.depth))
         pairs = associate(colour_stamps, depth_stamps, MAX_STAMP_DIFFERENCE)
@@ -183,7 +185,7 @@ def _index_messages(
         counts[topic] += 1
         frame_ids[topic] = frame_ids[topic] or message.header.frame_id.strip("/")
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9 or arrival * 1e-9
-        # Drop images whose stamps are not increasing: the clock was set back.
+        # Drop images whose stamps do not increase: the clock was set back.
         if not topic_indices or stamp > next(reversed(topic_indices)):
             topic_indices[stamp] = index
         if progress is not None:
@@ -195,12 +197,12 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
     """Read the colour camera from the first CameraInfo message."""
     if topics.info is None:
         raise InputError(
-            f"{path}: has no CameraInfo topic for {topics.rgb}; name it with --info-topic, or give --camera"
+            f"{path}: has no CameraInfo topic for {topics.rgb}; name it with --info-topic, or pass --camera"
         )
     info = next((message for _, _, message in _read_messages(path, topics.info)), None)
     if info is None:
         raise InputError(
-            f"{path}: has no messages on {topics.info}; name another topic with --info-topic, or give --camera"
+            f"{path}: has no messages on {topics.info}; name another topic with --info-topic, or pass --camera"
         )
     # ROS 1 has field names in upper case, ROS 2 in lower case.
     K, D, P = (getattr(info, name if hasattr(info, name) else name.lower()) for name in "KDP")
@@ -210,7 +212,7 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
     if any(distortion[5:]) or (any(distortion) and info.distortion_model not in _DISTORTION_MODELS):
         raise InputError(
             f"{path}: {topics.info} has the unsupported distortion model {info.distortion_model}; record rectified"
-            " images, or give --camera with k1, k2, p1, p2, k3"
+            " images, or pass --camera with k1, k2, p1, p2, k3"
         )
     size = {"width": info.width, "height": info.height, "depth_scale": _DEPTH_SCALE}
     fields = intrinsics | size | {"distortion": (distortion + [0.0] * 5)[:5]}

@@ -37,12 +37,12 @@ class BagTopics:
 
     @property
     def is_rectified(self) -> bool:
-        """True if the name of the colour topic says that the images are undistorted."""
+        """True if the name of the colour topic implies that the images are undistorted."""
         return bool(_RECTIFIED.search(self.rgb))
 
     @property
     def is_registered(self) -> bool:
-        """True if the name of the depth topic says that depth is registered to colour, pixel by pixel."""
+        """True if the name of the depth topic implies that depth is registered to colour, pixel by pixel."""
         return bool(_REGISTERED.search(self.depth))
 
 
@@ -54,15 +54,15 @@ def choose_topics(
     Args:
         bag: Path of the bag, for error messages.
         types: Message type of each topic.
-        rgb: Colour topic given by the user; None prefers raw images to rectified and compressed ones.
-        depth: Depth topic given by the user; None prefers depth registered to colour, then depth of the same camera.
-        info: CameraInfo topic given by the user; None takes the one next to the colour topic.
+        rgb: Colour topic chosen by the user; None to prefer raw images to rectified and compressed ones.
+        depth: Depth topic chosen by the user; None to prefer depth registered to colour, then depth of the same camera.
+        info: CameraInfo topic chosen by the user; None for the one next to the colour topic.
 
     Returns:
         Chosen topics.
 
     Raises:
-        InputError: If a given topic is missing or has another type, no topic fits, or the choice is ambiguous.
+        InputError: If a chosen topic is missing or has another type, no topic fits, or the choice is ambiguous.
     """
     images = {topic: kind for topic, kind in types.items() if kind in (IMAGE, COMPRESSED)}
     if not images:
@@ -89,7 +89,7 @@ def choose_topics(
     infos = [topic for topic, kind in types.items() if kind == CAMERA_INFO]
     if info is not None and info not in infos:
         if not infos:
-            raise InputError(f"{bag}: has no CameraInfo on {info} or any other topic; give --camera instead")
+            raise InputError(f"{bag}: has no CameraInfo on {info} or any other topic; pass --camera instead")
         raise InputError(f"{bag}: has no CameraInfo on {info}; set --info-topic to one of {_join(infos)}")
     return BagTopics(rgb, depth, info or next((topic for topic in infos if topic in _info_topics_of(rgb)), None))
 
