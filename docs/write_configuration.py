@@ -25,7 +25,7 @@ segmentation:
 ```
 
 `--config my.yaml` reads it, `--set objects.voting.distance_threshold=0.08` changes a single value. The package has
-named configurations: `full` (the default), `paper`, `baseline`, and the variants of the
+named configurations: `full` (the default), `realtime`, `paper`, `baseline`, and the variants of the
 [ablation study](commands/ablate.md). Unknown keys are rejected, and the message names the nearest one. Each run writes
 its whole configuration to `config.yaml`.
 
