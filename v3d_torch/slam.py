@@ -204,8 +204,8 @@ class V3DSLAM:
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:
                 self.back_end.submit(keyframe)
-        status = self.poses.statuses[-1]
-        return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=invert(self.poses.T_cw), status=status)
+        T_wc = invert(self.poses.T_cw)
+        return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
 
     def flush(self) -> None:
         """Apply the pending result of the back end. `track` does this; call it once after the last frame."""

@@ -189,7 +189,7 @@ def _print_summary(
         console.print(f"note: no checkpoint was saved, {record.save_error}", markup=False)
     console.print(f"results: {folder}", markup=False)  # the name can contain brackets
     if record.failure is not None:
-        frames = len(pipeline.slam.poses.statuses)
+        frames = len(pipeline.slam.poses)
         resume = f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
         raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
@@ -204,9 +204,9 @@ def _print_summary(
 def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     slam, record = pipeline.slam, pipeline.record
     statuses = Counter(slam.poses.statuses)
-    motion_states = Counter(str(row["motion_state"]) for row in record.dynamics)
+    motion_states = record.motion_state_counts
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
-    table.add_row("frames", f"{len(slam.poses.statuses)} of {pipeline.frame_count}")
+    table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     active = slam.map.active_keyframes
     known = sum(keyframe.is_from_earlier_run for keyframe in active)
@@ -214,7 +214,7 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     if known:
         table.add_row("loaded map", f"{known} keyframes")
     table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
-    table.add_row("frames per second", f"{len(slam.poses.statuses) / record.seconds:.1f}" if record.seconds else "-")
+    table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")
         if evaluation.rpe is not None:

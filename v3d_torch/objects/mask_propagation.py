@@ -1,9 +1,9 @@
 """Propagation of object masks to a frame without segmentation.
 
-A network that sees every second frame halves the largest cost of a frame. Between two of its frames each object moves by
+A network that sees every second frame halves the largest cost of a frame. Between two of its frames an object moves by
 a few centimetres, which its track predicts, and the depth of the new frame shows its outline: the pixels near the
-predicted points with the depth of these points. The propagated masks are measured in the same way as those of the
-network, so that centroids, votes and Chamfer distances use the new depth and not a prediction.
+predicted points with the depth of these points. The objects of propagated masks are measured like those of the network,
+so that centroids, votes and Chamfer distances use the new depth and not a prediction.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ _DEPTH_TOLERANCE = 0.2
 """Tolerance of the depth around the predicted points, metres: arms and legs swing by this much between two frames."""
 
 
-def propagate_instances(
-    tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, spacing: float
-) -> Instances:
+def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, spacing: float) -> Instances:
     """Redraw the objects that were detected in the previous frame.
 
     Unlabelled objects are left out, because they are found anew in the depth of each frame.
@@ -39,9 +37,7 @@ def propagate_instances(
     Returns:
         Instances with the classes of the tracks, score 0 and empty boxes.
     """
-    detected = [
-        track for track in tracks if not track.missed and track.newest.is_located and track.label != UNLABELLED
-    ]
+    detected = [track for track in tracks if not track.missed and track.newest.is_located and track.label != UNLABELLED]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
     projected = silhouettes([track.predict_cloud(view.stamp) @ R.T + t for track in detected], camera, spacing)
     masks = [each.mask(view.depth, 0, _DEPTH_TOLERANCE, include_missing=True) for each in projected]

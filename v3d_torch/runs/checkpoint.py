@@ -70,7 +70,7 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> N
     metadata: dict[str, Any] = {"request": request.absolute().to_dict()}
     state: dict[str, Any] = {}
     if isinstance(sequence, RGBDSequence):
-        metadata |= {"sequence": _fingerprint(sequence), "frames": len(pipeline.slam.poses.statuses)}
+        metadata |= {"sequence": _fingerprint(sequence), "frames": len(pipeline.slam.poses)}
         state = pipeline.state_dict()
     write_state(folder / CHECKPOINT, metadata, state)
 

@@ -55,7 +55,7 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
             for frame in frames
         ):
             return f"all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise features.max_depth"
-    if pipeline.record.dynamics:
+    if len(pipeline.record.dynamics):
         return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 

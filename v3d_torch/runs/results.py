@@ -23,9 +23,12 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
+from v3d_torch.mapping.tensor_table import TensorTable
+from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import fuse_points
+from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
 from v3d_torch.viz.run_figures import draw_run
@@ -83,7 +86,7 @@ def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
         OutputError: If the folder cannot be written or the disk is full.
     """
     _, evaluation = _write_tables(folder, pipeline)
-    done = len(pipeline.slam.poses.statuses)
+    done = len(pipeline.slam.poses)
     total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
     _write_metrics(folder, pipeline, evaluation, f"killed or still running after {done}{total} frames")
 
@@ -102,8 +105,8 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
         write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
         with suppress(InputError):  # too few poses for scores
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frame_count)
-    _write_table(folder / "frames.parquet", *_frame_table(pipeline))
-    _write_table(folder / "dynamics.parquet", pipeline.record.dynamics, _DYNAMICS)
+    _write_table(folder / "frames.parquet", _frame_table(pipeline))
+    _write_table(folder / "dynamics.parquet", _object_table(pipeline.record.dynamics))
     return trajectory, evaluation
 
 
@@ -111,13 +114,13 @@ def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | No
     write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation, failure), indent=2) + "\n")
 
 
-def _frame_table(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema]:
+def _frame_table(pipeline: Pipeline) -> pa.Table:
     """Return the table of frames: status, keyframe, and seconds of each stage, 0 if it did not run."""
     slam, rows = pipeline.slam, pipeline.record.frames
     stages = list(slam.timer.seconds)
     columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
     keyframes = {keyframe.frame for keyframe in slam.map.active_keyframes}
-    table: list[dict[str, object]] = [
+    table = [
         {
             **{
                 "frame": row["frame"],
@@ -129,12 +132,34 @@ def _frame_table(pipeline: Pipeline) -> tuple[list[dict[str, object]], pa.Schema
         }
         for row, status in zip(rows, slam.poses.statuses, strict=False)  # one row less if a frame was interrupted
     ]
-    return table, pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
+    schema = pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
+    return pa.Table.from_pylist(table, schema=schema)
 
 
-def _write_table(path: Path, rows: list[dict[str, object]], schema: pa.Schema) -> None:
+def _object_table(dynamics: TensorTable) -> pa.Table:
+    """Return the table of objects: one row per frame and object."""
+    x, y, z = dynamics["centroid"].T
+    states = [state.value for state in MotionState]
+    columns = {
+        "frame": dynamics["frame"],
+        "stamp": dynamics["stamp"],
+        "id": dynamics["id"],
+        "class": [class_name(label) for label in dynamics["label"].tolist()],
+        "x": x,
+        "y": y,
+        "z": z,
+        "votes": dynamics["votes"],
+        "chamfer": dynamics["chamfer"],
+        "motion_state": [states[code] for code in dynamics["motion_state"].tolist()],
+        "missed": dynamics["missed"],
+    }
+    arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
+    return pa.table(arrays, schema=_DYNAMICS)
+
+
+def _write_table(path: Path, table: pa.Table) -> None:
     with atomic_write(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
+        pq.write_table(table, temporary)
 
 
 def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> dict[str, object]:

@@ -58,7 +58,7 @@ class MotionModel:
 
     def predict(self, poses: PoseHistory) -> PosePrediction:
         """Predict the motion after the last frame; before the first frame the camera stands at the origin."""
-        stamp = poses.stamp if poses.statuses else 0.0
+        stamp = poses.stamp if len(poses) else 0.0
         return PosePrediction(stamp, poses.T_cw, self.velocity)
 
     def update(self, poses: PoseHistory, stamp: float, pose: FramePose, motion: CameraMotion) -> None:
@@ -71,7 +71,7 @@ class MotionModel:
             motion: Motion of the camera since the previous frame.
         """
         self.previous_velocity = None
-        if not poses.statuses:
+        if not len(poses):
             return
         elapsed = stamp - poses.stamp
         if pose.status is TrackingStatus.LOST and motion.is_measured:

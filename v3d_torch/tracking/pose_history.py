@@ -15,7 +15,7 @@ from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class PoseEntry:
     """Pose of one frame.
 
@@ -49,6 +49,10 @@ class PoseHistory:
     def __init__(self) -> None:
         self._entries: list[PoseEntry] = []
         self.landmark_ids = torch.zeros(0, dtype=torch.int64)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._entries)
 
     @property
     def statuses(self) -> list[TrackingStatus]:

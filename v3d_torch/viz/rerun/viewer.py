@@ -158,7 +158,7 @@ class RerunViewer:
         self._unaligned = None
 
     def _log_text(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, is_keyframe: bool) -> None:
-        status = slam.poses.statuses[-1]
+        status = slam.poses.status or TrackingStatus.LOST
         heading = f"**frame {frame.index}** at {frame.stamp:.3f} s: {status.value}"
         summary = rr.TextDocument(f"{heading}\n\n{format_objects(objects)}", media_type="text/markdown")
         self._stream.log("frame_summary", summary)
