@@ -16,7 +16,13 @@ from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
-from v3d_torch.runs.console import interrupts_between_frames, open_sequences, progress_bars, wide_console
+from v3d_torch.runs.console import (
+    compile_kernels,
+    interrupts_between_frames,
+    open_sequences,
+    progress_bars,
+    wide_console,
+)
 from v3d_torch.runs.result_folder import make_result_folder
 
 
@@ -74,6 +80,7 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
             f"{folder}: contains runs of an earlier batch; continue it with --resume, or choose another folder"
         )
     record.write()  # a folder that is not writable is an error before the first run
+    compile_kernels(console)  # once, and not in each worker
     interrupted = _run(record, executor, console)
     for table in record.screen_tables():
         console.print(table)

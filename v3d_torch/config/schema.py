@@ -44,8 +44,8 @@ class SegmentationConfig(Section):
     max_instances: int = Field(32, gt=0)
     """Maximum number of instances in an image, by score. It bounds memory and is far above the number in a room."""
     interval: int = Field(1, gt=0)
-    """The network sees every n-th frame of a sequence. In the frames between, masks follow the motion of the objects and
-    are redrawn from the depth."""
+    """The network sees every n-th frame of a sequence. In the frames between, masks follow the objects' motion and are
+    redrawn from the depth."""
     threads: int = Field(1, gt=0, le=256)
     """Threads of the inference engine. On two cores a second thread would take time from tracking."""
 

@@ -20,6 +20,7 @@ from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.kernels import compiler
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.log import log_to
@@ -103,6 +104,7 @@ def run_with_progress(
     """
     if checkpoint is None:
         clear_earlier_results(folder)
+    compile_kernels(console)
     log = log_to(folder / "run.log", append=checkpoint is not None)
     with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log:
         run = make_run()
@@ -112,6 +114,18 @@ def run_with_progress(
         evaluation = run(_TrackingBar(progress, total, interrupted, done))
     run.pipeline.record.interrupted |= interrupted.is_set()  # also after the last frame, while results were written
     return run.pipeline, evaluation
+
+
+def compile_kernels(console: Console) -> None:
+    """Load the compiled kernels, or compile them with a progress bar; that takes some seconds after an installation."""
+    bar = None
+    with progress_bars(console) as progress:
+        for compiled, left in compiler.compile_kernels():
+            if compiled and bar is None:
+                console.print("compiling kernels for this processor; this is done once")
+                bar = ProgressBar(progress, "kernels")
+            if bar is not None:
+                bar(compiled, compiled + left)
 
 
 def progress_bars(console: Console) -> Progress:
