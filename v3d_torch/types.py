@@ -252,14 +252,14 @@ class FramePose:
     landmarks: Tensor
 
     @property
-    def landmark_ids(self) -> Tensor:
-        """IDs of the landmarks found, int64, shape :math:`(F,)`."""
+    def observed_landmarks(self) -> Tensor:
+        """IDs of the landmarks that the frame observes, int64, shape :math:`(F,)`."""
         return self.landmarks[self.landmarks >= 0]
 
     @property
     def count(self) -> int:
-        """Number of landmarks found."""
-        return len(self.landmark_ids)
+        """Number of landmarks that the frame observes."""
+        return len(self.observed_landmarks)
 
 
 @dataclass(frozen=True)
