@@ -186,7 +186,12 @@ def test_id_switches_are_invariant_to_renaming_and_grow_with_absence(visits: lis
     renamed = torch.tensor([0, 17, 4, 9])[ids]
     switches = count_id_switches(stamps, ids, max_absence=0.5)
     assert count_id_switches(stamps, renamed, max_absence=0.5) == switches
-    assert count_id_switches(stamps, ids, max_absence=10.0) >= switches >= count_id_switches(stamps, ids, max_absence=0.05) == 0
+    assert (
+        count_id_switches(stamps, ids, max_absence=10.0)
+        >= switches
+        >= count_id_switches(stamps, ids, max_absence=0.05)
+        == 0
+    )
 
 
 def person_at(column: int, value: int = 1) -> Tensor:

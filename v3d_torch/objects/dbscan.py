@@ -58,7 +58,9 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
     if eps <= 0 or min_samples < 1:
-        raise ConfigError(f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1")
+        raise ConfigError(
+            f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"
+        )
     mask = valid.numpy()
     index = np.flatnonzero(mask)
     coordinates = points.detach().numpy().reshape(-1, 3).take(index, axis=0).astype(np.float64)
