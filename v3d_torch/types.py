@@ -43,7 +43,7 @@ class RGBDFrame:
         stamp: Time of the colour image, seconds.
         image: Colour image with lens distortion, uint8 RGB, shape :math:`(3, H, W)`.
         depth: Depth registered to the colour image, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-        camera: Camera of both images; None if the receiver knows it.
+        camera: Camera of both images; optional, because `V3DSLAM` gets the camera separately.
         depth_delay: Time of the depth image minus time of the colour image, seconds.
     """
 
