@@ -216,7 +216,9 @@ class V3DSLAM:
         with self.timer("mapping"):
             self._apply_world_correction(self.back_end.apply(result))
             previous = None if self._previous is None else self._previous.landmarks
-            self.map.compact([self.poses.landmark_ids] if previous is None else [self.poses.landmark_ids, previous])
+            self.map.compact(
+                [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous]
+            )
 
     def advance_predictions(self) -> PosePrediction | None:
         """Append the prediction for the frame after the next `PREFETCHED_FRAMES`, and return it.

@@ -43,7 +43,7 @@ class RGBDFrame:
         stamp: Time of the colour image, seconds.
         image: Colour image with lens distortion, uint8 RGB, shape :math:`(3, H, W)`.
         depth: Depth registered to the colour image, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-        camera: Camera of both images; None if the receiver knows it.
+        camera: Camera of both images; optional, because `V3DSLAM` gets the camera separately.
         depth_delay: Time of the depth image minus time of the colour image, seconds.
     """
 
@@ -252,14 +252,14 @@ class FramePose:
     landmarks: Tensor
 
     @property
-    def landmark_ids(self) -> Tensor:
-        """IDs of the landmarks found, int64, shape :math:`(F,)`."""
+    def observed_landmarks(self) -> Tensor:
+        """IDs of the landmarks that the frame observes, int64, shape :math:`(F,)`."""
         return self.landmarks[self.landmarks >= 0]
 
     @property
     def count(self) -> int:
-        """Number of landmarks found."""
-        return len(self.landmark_ids)
+        """Number of landmarks that the frame observes."""
+        return len(self.observed_landmarks)
 
 
 @dataclass(frozen=True)

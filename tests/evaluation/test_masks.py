@@ -176,7 +176,7 @@ def test_id_switches_equal_a_loop_over_frames(visits: list[tuple[float, int]]) -
         if id_:
             switches += last not in (0, id_)
             last = id_
-    assert count_id_switches(*to_tensors(visits), absence=0.5) == switches
+    assert count_id_switches(*to_tensors(visits), max_absence=0.5) == switches
 
 
 @given(VISITS)
@@ -184,9 +184,14 @@ def test_id_switches_equal_a_loop_over_frames(visits: list[tuple[float, int]]) -
 def test_id_switches_are_invariant_to_renaming_and_grow_with_absence(visits: list[tuple[float, int]]) -> None:
     stamps, ids = to_tensors(visits)
     renamed = torch.tensor([0, 17, 4, 9])[ids]
-    switches = count_id_switches(stamps, ids, absence=0.5)
-    assert count_id_switches(stamps, renamed, absence=0.5) == switches
-    assert count_id_switches(stamps, ids, absence=10.0) >= switches >= count_id_switches(stamps, ids, absence=0.05) == 0
+    switches = count_id_switches(stamps, ids, max_absence=0.5)
+    assert count_id_switches(stamps, renamed, max_absence=0.5) == switches
+    assert (
+        count_id_switches(stamps, ids, max_absence=10.0)
+        >= switches
+        >= count_id_switches(stamps, ids, max_absence=0.05)
+        == 0
+    )
 
 
 def person_at(column: int, value: int = 1) -> Tensor:

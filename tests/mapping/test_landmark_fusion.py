@@ -75,7 +75,10 @@ def assert_consistent(sparse_map: SparseMap) -> None:
         for feature in torch.nonzero(keyframe.landmarks >= 0)[:, 0].tolist()
     ]
     assert in_table == in_keyframes
-    assert all(len(keyframe.landmark_ids.unique()) == len(keyframe.landmark_ids) for keyframe in sparse_map.keyframes)
+    assert all(
+        len(keyframe.observed_landmarks.unique()) == len(keyframe.observed_landmarks)
+        for keyframe in sparse_map.keyframes
+    )
     assert sparse_map.landmarks["active"][table["landmark"][rows]].all()
 
 

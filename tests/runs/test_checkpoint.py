@@ -338,8 +338,8 @@ def test_reading_runs_no_code_and_creates_allowed_classes_only(tmp_path: Path) -
 
 def test_state_of_another_version_or_content_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = write_value(tmp_path / "s")
-    (tmp_path / "s").write_bytes(content.replace(b"state 9 ", b"state 8 ", 1))
-    with pytest.raises(InputError, match=r"/s: has state format 8, .* reads format 9"):
+    (tmp_path / "s").write_bytes(content.replace(b"state 10 ", b"state 9 ", 1))
+    with pytest.raises(InputError, match=r"/s: has state format 9, .* reads format 10"):
         read_state(tmp_path / "s", [])
     with monkeypatch.context() as patch:
         patch.setattr("v3d_torch.io.state_file.version", lambda _: "9.9")

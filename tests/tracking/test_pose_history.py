@@ -329,7 +329,7 @@ def test_pose_of_a_new_keyframe_is_that_of_the_keyframe() -> None:
     assert torch.equal(camera.poses.T_cw, own.T_cw)
     own.T_cw = se3_exp(2 * TWIST)
     assert torch.equal(camera.poses.T_cw, own.T_cw)
-    assert camera.poses.landmark_ids.tolist() == list(range(7))
+    assert camera.poses.observed_landmarks.tolist() == list(range(7))
     assert len(camera.poses.statuses) == 2
 
 
@@ -357,4 +357,4 @@ def test_landmark_ids_are_those_of_the_last_found_frame() -> None:
     camera = Camera()
     camera.append(0.0, frame_pose(EYE, landmarks=(5, -1, 2)), None)
     camera.append(0.1, frame_pose(EYE, TrackingStatus.LOST, landmarks=(-1, -1)), None)
-    assert camera.poses.landmark_ids.tolist() == [5, 2]
+    assert camera.poses.observed_landmarks.tolist() == [5, 2]

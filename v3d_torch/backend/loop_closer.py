@@ -117,7 +117,7 @@ class LoopCloser:
             motion = self._motion(keyframe.features, features)
             if motion is None:
                 continue
-            local = sparse_map.local_map(keyframe.landmark_ids, self._local_keyframes)
+            local = sparse_map.local_map(keyframe.observed_landmarks, self._local_keyframes)
             propagated = motion.propagate_landmarks(keyframe.landmarks, len(features))
             tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, propagated)
             if tracking is not None and tracking.count >= self._config.min_inliers:
@@ -166,7 +166,7 @@ class LoopCloser:
         """Find a place that is neither recent nor covisible; None soon after another loop."""
         if sparse_map.loops and keyframe.index - sparse_map.loops[-1].j < self._config.min_keyframe_gap:
             return None
-        covisible = sparse_map.count_shared_landmarks(keyframe.landmark_ids).nonzero()[:, 0].tolist()
+        covisible = sparse_map.count_shared_landmarks(keyframe.observed_landmarks).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_keyframe_gap, keyframe.index + 1)
         place = self.relocalise(keyframe.features, sparse_map, {*covisible, *recent})
         if place is None or place.tracking.count < self._config.min_inlier_ratio * len(place.tracking.visible):

@@ -18,7 +18,7 @@ unit of depth changes it by more."""
 
 _MAX_UNEXPLAINED_VARIANCE = 0.25
 """Maximum fraction of the ground truth's variance that a rescaled estimate leaves unexplained, for a scale error. With
-more, the estimate has another shape, and its size says nothing about the unit of depth."""
+more, the estimate has another shape, and its size does not indicate the unit of depth."""
 
 
 class RotationSource(StrEnum):

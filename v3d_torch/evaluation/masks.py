@@ -72,14 +72,14 @@ class MaskEvaluation:
     A person is in view if enough of their pixels have depth. A person is covered by the object whose mask has the
     largest intersection over union with the ground truth, if it is above one half, as for the id switches of MOTS
     (Voigtlaender et al., CVPR 2019). In frames in which no object covers the person, the last id is kept. A person who
-    was out of view for longer than `ABSENCE` may return under another id.
+    was out of view for longer than `MAX_ABSENCE` can return with another id; this is not an id switch.
     """
 
-    IN_VIEW = 0.003
+    MIN_FRACTION_IN_VIEW = 0.003
     """Minimum fraction of the image that a person in view covers, 900 pixels at 640x480. About a tenth of a person at
-    5 m; less is a sleeve behind a door, which no detector finds."""
+    5 m; no detector finds smaller parts, such as a sleeve behind a door."""
 
-    ABSENCE = 0.5
+    MAX_ABSENCE = 0.5
     """Longest time out of view after which the id must be the same, seconds. Without appearance features the identity
     of a person who returns later cannot be known."""
 
@@ -97,7 +97,7 @@ class MaskEvaluation:
                 :math:`(H, W)`.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             masked: Masked pixels, bool, shape :math:`(H, W)`.
-            objects: Mask of each object by its id (> 0), bool, shape :math:`(H, W)`; masks may overlap.
+            objects: Mask of each object by its id (> 0), bool, shape :math:`(H, W)`; masks can overlap.
         """
         measured = depth[0] > 0
         static = truth == STATIC
@@ -105,7 +105,7 @@ class MaskEvaluation:
         self._moving += tally(masked, ~static & (truth != UNSURE) & measured)
         self._static += tally(masked, static & measured)
         self._anywhere += tally(masked, static)
-        people = people_in_view(truth, measured, round(self.IN_VIEW * truth.numel()))
+        people = people_in_view(truth, measured, round(self.MIN_FRACTION_IN_VIEW * truth.numel()))
         for person, id_ in zip(people.tolist(), covering_ids(truth, people, objects).tolist(), strict=True):
             self._ids_in_view.setdefault(person, []).append((stamp, id_))
 
@@ -128,7 +128,7 @@ class MaskEvaluation:
     def _score(self, person: int) -> PersonScore:
         stamps, ids = zip(*self._ids_in_view[person], strict=True)
         object_ids = torch.tensor(ids)
-        switches = count_id_switches(torch.tensor(stamps, dtype=torch.float64), object_ids, self.ABSENCE)
+        switches = count_id_switches(torch.tensor(stamps, dtype=torch.float64), object_ids, self.MAX_ABSENCE)
         return PersonScore(person, in_view=len(ids), found=int((object_ids > 0).sum()), id_switches=switches)
 
 
@@ -184,16 +184,16 @@ def covering_ids(truth: Tensor, people: Tensor, objects: Mapping[int, Tensor]) -
     return torch.tensor([0, *objects])[torch.stack(overlaps).argmax(dim=0)]
 
 
-def count_id_switches(stamps: Tensor, ids: Tensor, absence: float) -> int:
+def count_id_switches(stamps: Tensor, ids: Tensor, max_absence: float) -> int:
     """Count the id switches of a person.
 
     Args:
         stamps: Timestamps of the frames in which the person is in view, seconds, increasing, float64, shape
             :math:`(F,)`.
         ids: Id of the object that covers the person in these frames, 0 for none, int64, shape :math:`(F,)`.
-        absence: A new id after a longer time out of view is not a switch, seconds.
+        max_absence: Longest time out of view, seconds; a new id after a longer time is not a switch.
     """
-    visit, found = (stamps.diff(prepend=stamps[:1]) > absence).cumsum(dim=0), ids > 0
+    visit, found = (stamps.diff(prepend=stamps[:1]) > max_absence).cumsum(dim=0), ids > 0
     visit, ids = visit[found], ids[found]
     return int(((ids[1:] != ids[:-1]) & (visit[1:] == visit[:-1])).sum())
 

@@ -44,9 +44,9 @@ class Features:
     def __len__(self) -> int:
         return self.uv.shape[0]
 
-    def __getitem__(self, keep: Tensor) -> Features:
+    def __getitem__(self, selected: Tensor) -> Features:
         """Select features by a boolean mask or by indices."""
-        return Features(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
+        return Features(**{field.name: getattr(self, field.name)[selected] for field in fields(self)})
 
     @property
     def inverse_depth(self) -> Tensor:

@@ -57,7 +57,7 @@ class ProjectionMatcher:
 
     Args:
         config: Thresholds of descriptor matching.
-        features: Scale pyramid of the features.
+        pyramid: Scale pyramid of the features.
         camera: Intrinsics.
     """
 
@@ -71,15 +71,15 @@ class ProjectionMatcher:
     _MIN_DEPTH = 0.05
     """Smallest depth of a landmark, metres: below the range of any RGB-D camera."""
 
-    def __init__(self, config: TrackingConfig, features: FeaturesConfig, camera: PinholeCamera) -> None:
+    def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._scale = features.scale
-        self._levels = features.levels
+        self._scale = pyramid.scale
+        self._levels = pyramid.levels
         self._camera = camera
         # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower ones are inclusive.
         margin = self._LEVEL_MARGIN
         lower = [self._MIN_DEPTH, 0.0, 0.0, self._MIN_COSINE, -margin]
-        upper = [math.inf, camera.width, camera.height, math.inf, features.levels - 1 + margin]
+        upper = [math.inf, camera.width, camera.height, math.inf, pyramid.levels - 1 + margin]
         self._lower, self._upper = torch.tensor([lower, upper], dtype=torch.float64)[..., None]
 
     def __call__(

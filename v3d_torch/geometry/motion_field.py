@@ -1,4 +1,4 @@
-r"""Motion field: image velocity of points seen by a moving camera.
+r"""Motion field: image velocity of points observed by a moving camera.
 
 A point with normalised image coordinates :math:`(x, y)` and inverse depth :math:`w` that moves in the camera frame by
 the twist :math:`(v, \omega)`, that is :math:`\dot p = v + \omega \times p`, has

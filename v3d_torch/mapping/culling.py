@@ -74,7 +74,7 @@ def cull_redundant_keyframes(tables: MapTables, newest: Keyframe, config: Mappin
         newest: The new keyframe.
         config: Criterion of redundancy, and size of the neighbourhood.
     """
-    neighbours = covisible_keyframes(tables, newest.landmark_ids, config.bundle_keyframes).tolist()
+    neighbours = covisible_keyframes(tables, newest.observed_landmarks, config.bundle_keyframes).tolist()
     neighbourhood = _Neighbourhood(tables, neighbours)
     references: dict[int, int] = {}
     ratios = neighbourhood.redundant_ratios(config.redundant_views)

@@ -51,7 +51,7 @@ class Keyframe:
         return self.frame < 0
 
     @property
-    def landmark_ids(self) -> Tensor:
+    def observed_landmarks(self) -> Tensor:
         """IDs of the observed landmarks, int64, shape :math:`(L,)`."""
         return self.landmarks[self.landmarks >= 0]
 

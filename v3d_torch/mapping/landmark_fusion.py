@@ -44,19 +44,19 @@ class LandmarkFusion:
             keyframe: The newest keyframe.
         """
         covisible = sparse_map.covisible_keyframes(
-            keyframe.landmark_ids, self._config.mapping.fusion_keyframes + 1
+            keyframe.observed_landmarks, self._config.mapping.fusion_keyframes + 1
         ).tolist()
         neighbours = [sparse_map.keyframes[index] for index in covisible if index != keyframe.index]
         for neighbour in neighbours:
-            self._fuse(sparse_map, keyframe.landmark_ids, neighbour)
+            self._fuse(sparse_map, keyframe.observed_landmarks, neighbour)
         if neighbours:
-            landmarks = torch.cat([neighbour.landmark_ids for neighbour in neighbours]).unique()
+            landmarks = torch.cat([neighbour.observed_landmarks for neighbour in neighbours]).unique()
             self._fuse(sparse_map, landmarks, keyframe)
 
     def _fuse(self, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe) -> None:
         """Match landmarks to features of a keyframe by projection, and fuse the matches."""
         features, config = keyframe.features, self._config
-        observed = contains(keyframe.landmark_ids, landmarks, len(sparse_map.landmarks))
+        observed = contains(keyframe.observed_landmarks, landmarks, len(sparse_map.landmarks))
         local = sparse_map.select_landmarks(landmarks[~observed].sort().values)
         projected = self._match.project(keyframe.T_cw, local)
         row, feature = self._match(features, projected, local, _SEARCH_RADIUS).unbind(dim=1)

@@ -77,7 +77,7 @@ def local_bundle_adjust(
     Returns:
         The result, or None if there are fewer than two keyframes or no observations to adjust.
     """
-    window = sparse_map.covisible_keyframes(keyframe.landmark_ids, config.mapping.bundle_keyframes)
+    window = sparse_map.covisible_keyframes(keyframe.observed_landmarks, config.mapping.bundle_keyframes)
     table = sparse_map.observations
     rows = _select_observations(sparse_map, window)
     if len(window) < 2 or len(rows) == 0:

@@ -216,7 +216,7 @@ class SparseMap(MapTables):
             keyframe: Keyframe whose features were matched.
             landmarks: ID of the matched landmark of each feature, -1 for none, int64, shape :math:`(N,)`.
         """
-        observed = landmark_ids.contains(keyframe.landmark_ids, landmarks, len(self.landmarks))
+        observed = landmark_ids.contains(keyframe.observed_landmarks, landmarks, len(self.landmarks))
         matched = (landmarks >= 0) & ~observed
         duplicate = matched & (keyframe.landmarks >= 0)
         self._add_observations(keyframe, torch.nonzero(matched & ~duplicate)[:, 0], landmarks)

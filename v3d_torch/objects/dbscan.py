@@ -17,7 +17,7 @@ _MAX_PAIRS = 2**25
 """Upper bound on the number of neighbour pairs that are listed at once. It bounds memory."""
 
 _BLOCK = 2**20
-"""Number of neighbours in a block, if a cloud has more pairs than that."""
+"""Number of neighbours that are listed in one block, if a cloud has more pairs than `_MAX_PAIRS`."""
 
 _MAX_NEIGHBOUR_CELLS = 13.5
 """Upper bound on the pairs per squared number of points in a cell: each of the 27 cells around a point can hold its
@@ -58,7 +58,9 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
     if eps <= 0 or min_samples < 1:
-        raise ConfigError(f"DBSCAN needs eps > 0 and min_samples >= 1, not {eps} and {min_samples}.")
+        raise ConfigError(
+            f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"
+        )
     mask = valid.numpy()
     index = np.flatnonzero(mask)
     coordinates = points.detach().numpy().reshape(-1, 3).take(index, axis=0).astype(np.float64)

@@ -29,8 +29,8 @@ class TrackedObject:
         mask: Pixels of the object, bool, shape :math:`(H, W)`.
         centroid: Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown.
         votes: Number of votes in this frame, maximum over the baselines.
-        chamfer: Root mean nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured, for
-            example because the object is dynamic.
+        chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured,
+            for example because the object is dynamic.
         motion_state: Static, dynamic, deforming or unknown.
         missed: True if the network did not detect the object in this frame, so that mask and centroid are predicted.
         cloud: Point cloud of the last detection, world frame, metres, float32, shape :math:`(P, 3)`.

@@ -15,8 +15,8 @@ class Deformation(NamedTuple):
     r"""Change of shape of B objects between two times.
 
     Attributes:
-        distance: Root mean nearest-neighbour distance, :math:`\sqrt{D / 2}` with D the Chamfer distance, metres, dtype
-            of the clouds, shape :math:`(B,)`; NaN if one of the two clouds is empty.
+        distance: Root-mean-square nearest-neighbour distance, :math:`\sqrt{D / 2}` with D the Chamfer distance, metres,
+            dtype of the clouds, shape :math:`(B,)`; NaN if one of the two clouds is empty.
         deforming: Objects whose distance is at least the threshold, bool, shape :math:`(B,)`; False if the distance is
             NaN.
     """

@@ -176,7 +176,7 @@ class ChamferEvidence:
     """Change of shape of the compared objects.
 
     Attributes:
-        distances: Root mean nearest-neighbour distance of each compared object, metres; NaN if a cloud is empty.
+        distances: Root-mean-square nearest-neighbour distance of each compared object, metres; NaN if a cloud is empty.
         deforming: Objects that deform.
     """
 

@@ -52,9 +52,9 @@ class Detection3D:
 class Track:
     """One object with an id.
 
-    Measured are the detections and the class. A Kalman filter on the centroids predicts the position and the cloud. The
-    masks belong to the newest frame and are either measured or predicted, see ``missed``. The motion evidence is what
-    votes and Chamfer distances have found so far.
+    The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
+    masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` and
+    ``last_deforming`` record the results of votes and Chamfer distances.
 
     Args:
         config: Noise and maximum speed of the Kalman filter.

@@ -61,9 +61,10 @@ class WhitenedMeasurements:
     """Measurements in whitened form: residual = ``scale * (x/z, y/z, 1/z) + offset``.
 
     Attributes:
-        scale: Focal length or 1, over the standard deviation, float64, shape :math:`(3, M)`; 0 for depth that was not
-            measured.
-        offset: Principal point minus measurement, over the standard deviation, float64, shape :math:`(3, M)`.
+        scale: Focal lengths, and 1 for 1/z, divided by the standard deviations, float64, shape :math:`(3, M)`; 0 for
+            depth that was not measured.
+        offset: Principal point (0 for 1/z) minus measurement, divided by the standard deviations, float64, shape
+            :math:`(3, M)`.
     """
 
     scale: Tensor

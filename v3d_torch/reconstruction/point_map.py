@@ -94,7 +94,7 @@ def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) 
 
 
 def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) -> Tensor:
-    """Check which points lie where at least one view, and at least as many as observe a surface, observe free space.
+    """Check which points at least one view, and at least as many views as observe a surface there, observe as free.
 
     Points closer together than the depth tolerance share one check, which is faster.
 

@@ -17,7 +17,7 @@ def check_parameters(camera: PinholeCamera, config: Config | None) -> None:
     """Check the types of the parameters of `V3DSLAM`.
 
     Raises:
-        ConfigError: If one has the wrong type.
+        ConfigError: If a parameter has the wrong type.
     """
     if not isinstance(camera, PinholeCamera):
         raise ConfigError(f"V3DSLAM needs a PinholeCamera, got {_kind(camera)}; give one, such as sequence.camera")
@@ -29,7 +29,7 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
     """Check that a frame is complete and belongs to the camera.
 
     Raises:
-        InputError: If it does not.
+        InputError: If the frame is not valid or of another camera.
     """
     if not isinstance(frame, RGBDFrame):
         raise InputError(f"expected an RGBDFrame, got {_kind(frame)}; RGBDFrame.from_arrays makes frames from arrays")
@@ -56,7 +56,7 @@ def check_order(frame: RGBDFrame, previous_stamp: float) -> None:
     """Check that a frame is later than the previous one.
 
     Raises:
-        InputError: If it is not.
+        InputError: If the frame is not later than the previous one.
     """
     if frame.stamp <= previous_stamp:
         raise InputError(
@@ -69,7 +69,7 @@ def check_instances(instances: Instances, frame: RGBDFrame) -> None:
     """Check that a segmenter returned valid instances.
 
     Raises:
-        ConfigError: If it did not.
+        ConfigError: If the segmenter returned something other than valid instances.
     """
     if not isinstance(instances, Instances):
         raise ConfigError(

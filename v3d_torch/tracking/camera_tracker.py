@@ -67,7 +67,7 @@ class CameraTracker:
             poses: Poses of all earlier frames.
         """
         if self._map.keyframes:
-            local_map = self._map.local_map(poses.landmark_ids, self._local_keyframes)
+            local_map = self._map.local_map(poses.observed_landmarks, self._local_keyframes)
             tracking = self._track_map(features, T_cw, local_map, landmarks, depth)
             if tracking is None:
                 match = self._relocaliser.relocalise(features, self._map)
@@ -82,5 +82,5 @@ class CameraTracker:
     def reference_keyframe(self, pose: FramePose) -> Keyframe | None:
         """Return the keyframe that shares most landmarks with a frame, else the last one; None if there are none."""
         keyframes = self._map.keyframes
-        best = self._map.covisible_keyframes(pose.landmark_ids, 1)
+        best = self._map.covisible_keyframes(pose.observed_landmarks, 1)
         return keyframes[int(best[0])] if len(best) else (keyframes[-1] if keyframes else None)

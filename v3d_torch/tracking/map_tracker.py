@@ -54,15 +54,15 @@ class MapTracker:
 
     Args:
         config: Matching thresholds and noise.
-        features: Scale pyramid of the features.
+        pyramid: Scale pyramid of the features.
         camera: Camera of all frames.
     """
 
-    def __init__(self, config: TrackingConfig, features: FeaturesConfig, camera: PinholeCamera) -> None:
+    def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._features = features
+        self._pyramid = pyramid
         self._camera = camera
-        self._match = ProjectionMatcher(config, features, camera)
+        self._match = ProjectionMatcher(config, pyramid, camera)
 
     def __call__(
         self, features: Features, T_cw: Tensor, local_map: LocalMap, landmarks: Tensor, depth: Tensor | None = None
@@ -120,7 +120,7 @@ class MapTracker:
         if len(features) < config.min_inliers:
             return None
         refined = refine_pose(
-            T_cw, points, to_measurements(features, config, self._features), self._camera, rounds=rounds
+            T_cw, points, to_measurements(features, config, self._pyramid), self._camera, rounds=rounds
         )
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 

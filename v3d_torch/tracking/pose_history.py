@@ -43,12 +43,12 @@ class PoseHistory:
     """Poses of all frames in the order of time.
 
     Attributes:
-        landmark_ids: Landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
+        observed_landmarks: IDs of the landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
     """
 
     def __init__(self) -> None:
         self._entries: list[PoseEntry] = []
-        self.landmark_ids = torch.zeros(0, dtype=torch.int64)
+        self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -121,14 +121,14 @@ class PoseHistory:
         if new is None:
             entry = PoseEntry(stamp, status, reference, _relative(pose.T_cw, reference), motion.is_measured)
             if pose.count:
-                self.landmark_ids = pose.landmark_ids
+                self.observed_landmarks = pose.observed_landmarks
         else:
             if new.disconnected:
                 status = TrackingStatus.DISCONNECTED
             elif status is TrackingStatus.LOST:
                 status = TrackingStatus.TRACKED  # the first keyframe of the map
             entry = PoseEntry(stamp, status, new, torch.eye(4, dtype=torch.float64), motion.is_measured)
-            self.landmark_ids = new.landmark_ids
+            self.observed_landmarks = new.observed_landmarks
         self._entries.append(entry)
         return T_new_old
 
@@ -146,11 +146,11 @@ class PoseHistory:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the poses of all frames."""
-        return {"entries": self._entries, "landmark_ids": self.landmark_ids}
+        return {"entries": self._entries, "observed_landmarks": self.observed_landmarks}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
-        self._entries, self.landmark_ids = list(state["entries"]), state["landmark_ids"]
+        self._entries, self.observed_landmarks = list(state["entries"]), state["observed_landmarks"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end: those linked to the new frame by measured motions, or all of them."""

@@ -58,7 +58,7 @@ class Bottleneck(nn.Module):
 
 
 class C2f(nn.Module):
-    """Cross-stage block of YOLOv8: half of the channels passes a chain of modules; all intermediate maps are joined.
+    """Cross-stage block of YOLOv8: half of the channels pass through a chain of modules; all maps are joined.
 
     Args:
         inputs: Input channels.

@@ -1,4 +1,4 @@
-"""YOLO11n-seg: unlike YOLOv8, with lighter stages, attention at the coarsest level and depthwise class branches."""
+"""YOLO11n-seg: YOLOv8 with lighter stages, attention at the coarsest level and depthwise class branches."""
 
 from __future__ import annotations
 
