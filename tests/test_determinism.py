@@ -57,8 +57,7 @@ def trajectory(sequence: RGBDSequence, overrides: tuple[str, ...], path: Path) -
 @pytest.mark.usefixtures("one_thread_after")
 def test_trajectory_is_identical_in_every_run(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     """With the network. The camera of walkers_desk rolls, so its images are rotated by the predicted pose."""
-    root = None if name == "demo" else request.getfixturevalue("v3d_data")
-    sequence = load_sequence(name, data_root=root)
+    sequence = load_sequence(name if name == "demo" else str(request.getfixturevalue("real_sequence")(name)))
     trajectories = {
         run: trajectory(sequence, overrides, tmp_path / "trajectory.txt") for run, overrides in RUNS.items()
     }
