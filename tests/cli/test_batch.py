@@ -17,6 +17,7 @@ from threading import Event
 
 import numpy as np
 import pandas as pd
+import psutil
 import pytest
 from helpers.batches import plan_seeds, repeat_sequence
 from helpers.corpus.base import write_base
@@ -266,8 +267,17 @@ def test_incomplete_run_has_no_earlier_outcome(
 # --- Ctrl-C
 
 
-def interrupt(arguments: Sequence[str | Path], when: Callable[[], bool]) -> subprocess.CompletedProcess[str]:
-    """Run the command and send Ctrl-C to all its processes, as a terminal does, when a condition holds."""
+ENDLESS = 2000
+"""Number of frames of a sequence that does not end before an interrupt, however busy the machine is."""
+
+
+def interrupt(
+    arguments: Sequence[str | Path], when: Callable[[psutil.Process], bool]
+) -> subprocess.CompletedProcess[str]:
+    """Run the command and send Ctrl-C to all its processes, as a terminal does, when a condition holds.
+
+    The test fails if the command ends before.
+    """
     with subprocess.Popen(  # noqa: S603
         command(*arguments),
         env=environment(),
@@ -276,26 +286,30 @@ def interrupt(arguments: Sequence[str | Path], when: Callable[[], bool]) -> subp
         text=True,
         start_new_session=True,
     ) as process:
-        deadline = time.monotonic() + 100
-        while not when() and time.monotonic() < deadline:
-            time.sleep(0.01)
-        os.killpg(process.pid, signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=100)
+        try:
+            while not when(psutil.Process(process.pid)):
+                assert process.poll() is None, "the command ended before the interrupt"
+                time.sleep(0.01)
+            os.killpg(process.pid, signal.SIGINT)
+            stdout, stderr = process.communicate()
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)
+            raise
     return subprocess.CompletedProcess(process.args, process.returncode, stdout, stderr)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
 def test_ctrl_c_keeps_partial_results_and_resume_finishes(moment: Path, tmp_path: Path) -> None:
-    sequence = repeat_sequence(moment, tmp_path / "long", frames=80)
+    sequence = repeat_sequence(moment, tmp_path / "long", ENDLESS)
     out = tmp_path / "out"
     arguments = ("--seqs", sequence, "--configs", "baseline", "--out", out)
     folder = out / "long" / "baseline" / "seed0"
     log = folder / "run.log"
-    done = interrupt(arguments, lambda: log.is_file() and log.read_text().count(" frame ") >= 3)
+    done = interrupt(arguments, lambda _: log.is_file() and log.read_text().count(" frame ") >= 3)
     assert_error_line(done.returncode, done.stderr, "interrupted with 0 of 1 runs done", "--resume")
     assert "Traceback" not in done.stdout and "long, baseline, seed 0: failed: interrupted after" in done.stdout
     metrics = metrics_of(folder)
-    assert 3 <= metrics["processed"] < 80
+    assert 3 <= metrics["processed"] < ENDLESS
     assert len((folder / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
     assert files_in(folder) | {"figures/masks.png", "groundtruth.txt"} == FILES | {"checkpoint.v3d"}
     assert pd.read_parquet(out / "runs.parquet")["failure"].tolist() == [metrics["failure"]]
@@ -308,11 +322,13 @@ def test_ctrl_c_keeps_partial_results_and_resume_finishes(moment: Path, tmp_path
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
 def test_ctrl_c_during_first_start_starts_no_other_process(moment: Path, tmp_path: Path) -> None:
-    sequence = repeat_sequence(moment, tmp_path / "long", frames=80)
-    arguments = ("--seqs", sequence, "--configs", "baseline", "--seeds", "2", "--out", tmp_path / "out")
-    done = interrupt(arguments, (tmp_path / "out" / "summary.csv").exists)
+    sequence = repeat_sequence(moment, tmp_path / "long", ENDLESS)
+    out = tmp_path / "out"
+    arguments = ("--seqs", sequence, "--configs", "baseline", "--seeds", "2", "--out", out)
+    # The batch writes its tables, then starts the process of its first job.
+    done = interrupt(arguments, lambda batch: (out / "summary.csv").exists() and bool(batch.children()))
     assert_error_line(done.returncode, done.stderr, "interrupted with 0 of 2 runs done")
-    assert not (tmp_path / "out" / "long" / "baseline" / "seed1").exists()
+    assert not (out / "long" / "baseline" / "seed1").exists()
 
 
 def test_second_ctrl_c_kills_running_jobs(moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
