@@ -23,12 +23,8 @@ FORWARD, DARK, BACKWARD = range(0, 180, 9), [180] * 12, range(360, 60, -10)
 CONFIG = load_config(
     overrides=[
         *("features.count=400", "features.levels=4", "mapping.max_keyframe_interval=3", "mapping.min_tracked=30"),
-        *(
-            "mapping.landmarks_per_keyframe=200",
-            "loop.min_keyframe_gap=2",
-            "loop.min_inliers=20",
-            "loop.min_inlier_ratio=0.1",
-        ),
+        *("mapping.landmarks_per_keyframe=200", "loop.min_keyframe_gap=2"),
+        *("loop.min_inliers=20", "loop.min_inlier_ratio=0.1"),
         *("objects.clouds.stride=1", "objects.clouds.min_points=10", "objects.free_space.min_points=10"),
     ]
 )
@@ -93,6 +89,8 @@ def make_pipeline(*, prefetch: bool) -> Pipeline:
 
 
 def interrupt_after(stop: int) -> FrameCallback:
+    """Return a callback that interrupts the run after a frame."""
+
     def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
         if frame.index == stop:
             raise KeyboardInterrupt

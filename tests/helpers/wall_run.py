@@ -72,7 +72,7 @@ def square(frame: RGBDFrame) -> Instances:
 
 
 def make_pipeline(sequence: Wall | None = None, masks: Path | None = None, config: Config | None = None) -> Pipeline:
-    """Make a pipeline along the wall; without a sequence, along the whole wall."""
+    """Make a pipeline with one object, the square, over a sequence along the wall; by default an intact one."""
     return Pipeline(sequence or Wall(), V3DSLAM(CAMERA, square, config), masks)
 
 

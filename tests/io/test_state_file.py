@@ -54,11 +54,11 @@ class RunsCode:
 def test_reading_runs_no_code_and_creates_allowed_classes_only(tmp_path: Path) -> None:
     write_value(tmp_path / "s", RunsCode(tmp_path / "created"))
     with pytest.raises(InputError, match="damaged or not a state"):
-        read_state(tmp_path / "s", [Path])
+        read_state(tmp_path / "s", [set])
     assert not (tmp_path / "created").exists()
     write_value(tmp_path / "s", CAMERA)
     with pytest.raises(InputError, match="damaged or not a state"):
-        read_state(tmp_path / "s", [Path])
+        read_state(tmp_path / "s", [set])
     assert read_state(tmp_path / "s", [PinholeCamera])[1]["value"] == CAMERA
 
 
