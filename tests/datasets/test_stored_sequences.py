@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of
 from PIL import Image
 
 from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
@@ -20,8 +21,6 @@ from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 WALKING_XYZ = "rgbd_dataset_freiburg3_walking_xyz"
-WIDTH, HEIGHT = 32, 24
-CAMERA_YAML = f"fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: 1000\n"
 
 
 @pytest.fixture(autouse=True)
@@ -29,14 +28,6 @@ def isolated_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep all tests away from the user's own data and cache."""
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("V3D_DATA", raising=False)
-
-
-def colour_of(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-
-
-def depth_of(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed + 100).integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)
 
 
 @pytest.fixture
