@@ -85,9 +85,8 @@ def test_frame_table_has_status_keyframe_and_stage_times(results: Path, run: Pip
     metrics = json.loads((results / "metrics.json").read_text())
     for stage, total in metrics["seconds_per_stage"].items():
         assert (table[f"seconds_{stage}"] >= 0).all()
-        assert table[f"seconds_{stage}"].sum() == pytest.approx(
-            total, abs=2e-3
-        )  # the last attempt to read a frame has no row
+        # The last attempt to read a frame has no row.
+        assert table[f"seconds_{stage}"].sum() == pytest.approx(total, abs=2e-3)
     after_keyframe = table["keyframe"].shift(1, fill_value=False)  # applied with the next frame
     assert (table["seconds_loop"] > 0).tolist() == (table["seconds_bundle"] > 0).tolist() == after_keyframe.tolist()
 
