@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.unpickled_code import CreatesFile
 
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -41,18 +42,8 @@ def test_damaged_state_file_is_rejected(tmp_path: Path) -> None:
         read_state(tmp_path / "none", [])
 
 
-class RunsCode:
-    """Object that creates a file when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return (Path.touch, (self.path,))
-
-
 def test_reading_runs_no_code_and_creates_allowed_classes_only(tmp_path: Path) -> None:
-    write_value(tmp_path / "s", RunsCode(tmp_path / "created"))
+    write_value(tmp_path / "s", CreatesFile(tmp_path / "created"))
     with pytest.raises(InputError, match="damaged or not a state"):
         read_state(tmp_path / "s", [set])
     assert not (tmp_path / "created").exists()
