@@ -12,20 +12,21 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any
 
-import yaml
+import descriptions
 from command import add_vocabulary_option, make_parser, publish
 from contenders import PEERS
 from contenders.process import ContenderError, failure, measure
 from heading import make_heading
 from sequences import list_sequences, locate_sequence, trained_vocabulary
 from storage import Measurement, Row
+from tables import unique
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import InputError, V3DError
@@ -40,8 +41,6 @@ CONFIGURATIONS = {
     "global_shutter": ["--config", "global_shutter"],
     "paper": ["--config", "paper"],
 }
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ def run_peer(sequence: str, peer: str, turn: int, data_root: Path, vocabulary: P
     return Outcome(sequence, peer, turn, metrics)
 
 
-def accuracy_table(outcomes: Sequence[Outcome], known: dict[str, Any], data_root: Path) -> Iterator[str]:
+def accuracy_table(outcomes: Sequence[Outcome], known: Mapping[str, Any], data_root: Path) -> Iterator[str]:
     """Yield a row per sequence: ATE of each configuration and peer that ran, then published ATE of other systems."""
     sequences = unique(outcome.sequence for outcome in outcomes)
     configurations = unique(outcome.configuration for outcome in outcomes)
@@ -160,7 +159,7 @@ def accuracy_rows(outcomes: Sequence[Outcome]) -> Iterator[Row]:
         yield cells
 
 
-def notes(outcomes: Sequence[Outcome], known: dict[str, Any]) -> Iterator[str]:
+def notes(outcomes: Sequence[Outcome], known: Mapping[str, Any]) -> Iterator[str]:
     """Yield remarks: every failure, and notes on the sequences and the peers."""
     yield from (f"- {outcome}" for outcome in outcomes if outcome.ate is None)
     notes_of: dict[str, list[str]] = {}
@@ -174,7 +173,7 @@ def notes(outcomes: Sequence[Outcome], known: dict[str, Any]) -> Iterator[str]:
         yield f"- {known['about']}"
 
 
-def known_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
+def known_scores(sequence: str, known: Mapping[str, Any]) -> dict[str, str]:
     """Return the ATE RMSE in metres of systems that were measured elsewhere, by system."""
     if (paper := find_paper_sequence(sequence)) is not None:
         scores = load_paper_scores()["ate"][paper]
@@ -183,7 +182,7 @@ def known_scores(sequence: str, known: dict[str, Any]) -> dict[str, str]:
     return {f"{name} (not rerun)": score for name, score in scores.items()}
 
 
-def description(sequence: str, known: dict[str, Any], data_root: Path) -> str:
+def description(sequence: str, known: Mapping[str, Any], data_root: Path) -> str:
     """Return the description of a sequence in ``peers.yaml``, else the first line of its README."""
     name = Path(sequence).name
     if name in known["sequences"]:
@@ -201,11 +200,6 @@ def ate_cell(runs: Sequence[Outcome]) -> str:
     return format_median_and_range([run.ate for run in runs if run.ate is not None], ".4f") + (
         f", {failed} failed" if failed else ""
     )
-
-
-def unique(items: Iterable[T]) -> list[T]:
-    """Return the distinct items in the order of their first occurrence."""
-    return list(dict.fromkeys(items))
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -250,14 +244,13 @@ def main() -> None:
             for turn in range(options.seeds):
                 outcomes.append(run_peer(sequence, peer, turn, options.data_root, vocabulary))
                 print(outcomes[-1], file=sys.stderr)
-    known = yaml.safe_load(Path(__file__).with_name("peers.yaml").read_text(encoding="utf-8"))
     lines += ["ATE RMSE in metres; of several seeds, the median [lowest-highest].", ""]
     lines += [
-        *accuracy_table(outcomes, known, options.data_root),
+        *accuracy_table(outcomes, descriptions.PEERS, options.data_root),
         "",
         *runs_table(outcomes),
         "",
-        *notes(outcomes, known),
+        *notes(outcomes, descriptions.PEERS),
     ]
     publish(lines, options, parser, {"accuracy": Measurement(heading, list(accuracy_rows(outcomes)))})
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial, reduce
 from statistics import fmean, median
-from typing import TypeVar
 
+import columns
 import psutil
 import torch
 from command import make_parser, publish
@@ -22,6 +22,8 @@ from heading import make_heading
 from replay import Replay, forth_and_back
 from sequences import locate_sequence
 from storage import Measurement, Row
+from tables import flat
+from timing import timed
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
@@ -40,8 +42,6 @@ FRACTIONS = (0.1, 0.25, 0.5, 1.0)
 
 QUERIES = 10
 """Number of timings, of which the median is reported."""
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -142,25 +142,6 @@ def measure_keyframes(max_count: int) -> Iterator[Row]:
         yield {"keyframes": str(count), "add_ms": add_ms, "query_ms": query_ms, **close_ring(count, generator)}
 
 
-KEYFRAME_COLUMNS = {
-    "keyframes": "keyframes",
-    "add_ms": "add one, ms",
-    "query_ms": "query, ms",
-    "pose_graph_s": "pose graph, s",
-    "iterations": "iterations",
-    "error_before": "error before, m",
-    "error_after": "error after, m",
-}
-"""Headings of the second table by the cell of a row."""
-
-
-def keyframe_table(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield a line per number of keyframes."""
-    yield markdown_row(list(KEYFRAME_COLUMNS.values()))
-    yield markdown_row(["---:"] * len(KEYFRAME_COLUMNS))
-    yield from (markdown_row([cells[name] for name in KEYFRAME_COLUMNS]) for cells in rows)
-
-
 def random_descriptors(generator: torch.Generator) -> Tensor:
     """Return random descriptors of a keyframe, uint8, shape (N, 32); they differ more than those of images."""
     return torch.randint(256, (Config().features.count, 32), generator=generator, dtype=torch.uint8)
@@ -179,10 +160,8 @@ def close_ring(count: int, generator: torch.Generator) -> Row:
         Cells: time of the pose graph, number of iterations, mean position error before and after.
     """
     turn = torch.zeros(6, dtype=torch.float64)
-    turn[0], turn[4] = (
-        2 * torch.pi * 5 / count,
-        2 * torch.pi / count,
-    )  # along the circle, about the vertical axis
+    turn[0] = 2 * torch.pi * 5 / count  # along the circle
+    turn[4] = 2 * torch.pi / count  # about the vertical axis
     step = se3_exp(turn)
     noise = se3_exp(1e-3 * torch.randn(count, 6, generator=generator, dtype=torch.float64))
     true, drifted = [torch.eye(4, dtype=torch.float64)], [torch.eye(4, dtype=torch.float64)]
@@ -202,13 +181,6 @@ def close_ring(count: int, generator: torch.Generator) -> Row:
         "error_before": f"{before:.3f}",
         "error_after": f"{after:.3f}",
     }
-
-
-def timed(call: Callable[[], Result]) -> tuple[float, Result]:
-    """Return the wall time of a call, seconds, and its result."""
-    start = time.perf_counter()
-    result = call()
-    return time.perf_counter() - start, result
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -234,7 +206,7 @@ def main() -> None:
         parser.error(str(error))
     rows = list(measure_keyframes(options.keyframes))
     lines = [*heading.lines(), "", f"## {options.seq}, forth and back", "", *run.lines]
-    lines += ["", "## Synthetic keyframes", "", *keyframe_table(rows)]
+    lines += ["", "## Synthetic keyframes", "", *flat(rows, columns.KEYFRAMES | {"iterations": "iterations"})]
     measurements = {"growth": Measurement(heading, [run.row]), "keyframes": Measurement(heading, rows)}
     publish(lines, options, parser, measurements)
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import columns
 import torch
 from command import make_parser, publish
 from heading import make_heading
@@ -28,6 +29,7 @@ from interruptions import (
 )
 from sequences import locate_sequence
 from storage import Measurement, Row
+from tables import flat
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -36,7 +38,6 @@ from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
-from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import NoSegmentation
@@ -198,22 +199,6 @@ def measure(
         }
 
 
-COLUMNS = {
-    "sequence": "sequence",
-    "interruption": "interruption",
-    "recovery": "frames to recover",
-    "unflagged": "covered but tracked",
-    "found": "reliable poses",
-    "ate": "ATE, m",
-    "reference": "uninterrupted, m",
-    "ratio": "ratio",
-    "worst": "worst error, m",
-    "reference_worst": "uninterrupted, m",
-    "passes": "passes",
-}
-"""Headings of the table by the cell of a row."""
-
-
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = make_parser("Recovery of a camera that was covered, lost frames or was moved elsewhere, as Markdown.")
@@ -242,13 +227,7 @@ def main() -> None:
             rows += measure(sequence, options.gaps, options.before, options.after, config, masks)
     except V3DError as error:
         parser.error(str(error))
-    lines = [
-        *heading.lines(),
-        "",
-        markdown_row(list(COLUMNS.values())),
-        markdown_row(["---", "---", *(len(COLUMNS) - 2) * ["---:"]]),
-    ]
-    lines += [markdown_row([cells[name] for name in COLUMNS]) for cells in rows]
+    lines = [*heading.lines(), "", *flat(rows, columns.LOST | {"reference": "ATE uninterrupted, m"})]
     publish(lines, options, parser, {"lost": Measurement(heading, rows)})
 
 

@@ -9,15 +9,17 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
 
+import columns
 import torch
 from command import make_parser, publish
 from heading import make_heading
 from sequences import locate_sequence
 from storage import Measurement, Row
+from tables import flat
+from timing import timed
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -25,7 +27,6 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.base import HasMotionMasks
 from v3d_torch.errors import InputError, V3DError
-from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction.mesh import fuse_mesh
@@ -35,18 +36,6 @@ from v3d_torch.slam import V3DSLAM
 
 NO_CHECK = load_config(overrides=["objects.free_space.min_tolerance=1000"])
 """Configuration in which no point counts as free space."""
-
-COLUMNS = {
-    "pixels": "pixels in the map",
-    "points_before": "points without free-space check",
-    "people_before": "people",
-    "points_after": "points with it",
-    "people_after": "people",
-    "static_lost": "static points lost",
-}
-"""Headings of the table by the cell of a row."""
-
-Result = TypeVar("Result")
 
 
 def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticViews]]:
@@ -101,10 +90,10 @@ def measure_costs(sequence: RGBDSequence, slam: V3DSLAM, views: StaticViews) -> 
     """Measure CPU time and size of each product."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "room.map"
-        points, cloud = timed(lambda: fuse_points(views, slam.config))
-        faces, mesh = timed(lambda: fuse_mesh(views, slam.config.dense_map))
-        saving, _ = timed(lambda: save_map(path, slam.map, views))
-        loading, _ = timed(lambda: load_map(path, sequence.camera, slam.config))
+        points, cloud = timed(lambda: fuse_points(views, slam.config), time.process_time)
+        faces, mesh = timed(lambda: fuse_mesh(views, slam.config.dense_map), time.process_time)
+        saving, _ = timed(lambda: save_map(path, slam.map, views), time.process_time)
+        loading, _ = timed(lambda: load_map(path, sequence.camera, slam.config), time.process_time)
         return {
             "sequence": sequence.name,
             "keyframes": str(len(views)),
@@ -113,13 +102,6 @@ def measure_costs(sequence: RGBDSequence, slam: V3DSLAM, views: StaticViews) -> 
             "saving": f"{saving:.1f} s, {path.stat().st_size / 1e6:.0f} MB",
             "loading": f"{loading:.1f} s",
         }
-
-
-def timed(call: Callable[[], Result]) -> tuple[float, Result]:
-    """Return the CPU time of a call, seconds, and its result."""
-    start = time.process_time()
-    result = call()
-    return time.process_time() - start, result
 
 
 def main() -> None:
@@ -138,14 +120,7 @@ def main() -> None:
             slam, views, people = run(sequence)
             rows = list(count_people(sequence.name, people))
             costs = measure_costs(sequence, slam, views)
-            lines += [
-                "",
-                f"## {name}",
-                "",
-                markdown_row(list(COLUMNS.values())),
-                markdown_row(["---"] + ["---:"] * (len(COLUMNS) - 1)),
-            ]
-            lines += [markdown_row([cells[column] for column in COLUMNS]) for cells in rows]
+            lines += ["", f"## {name}", "", *flat(rows, columns.MAPS)]
             lines += ["", f"CPU time on {os.cpu_count()} cores: " + "; ".join(f"{k} {v}" for k, v in costs.items())]
             people_rows += rows
             cost_rows.append(costs)

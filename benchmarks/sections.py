@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
+import columns
 from descriptions import PEERS, kind, sequence_notes
-from storage import Measurement
+from storage import Measurement, Row
 from tables import accuracy_table, bullets, flat, notes, pivot, provenance, rows_of, speed_table, unique
 
 VARIANTS = {
@@ -22,240 +23,173 @@ VARIANTS = {
 """Names of the variants of the ablation study in tables."""
 
 
+def part(
+    text: str,
+    table: Iterable[str],
+    measurements: Sequence[Measurement] = (),
+    key: str | None = None,
+    remarks: Iterable[str] | None = None,
+) -> Iterator[str]:
+    """Yield a part of a section: a text, a table, and how the table was measured.
+
+    Args:
+        text: Paragraph above the table.
+        table: Lines of the table.
+        measurements: Measurements of the table.
+        key: Cell that distinguishes the rows of several measurements.
+        remarks: List items below the provenance of the measurements; None for their notes.
+    """
+    yield from ("", text, "", *table)
+    below = [*provenance(measurements, key), *(bullets(notes(measurements)) if remarks is None else remarks)]
+    if below:
+        yield from ("", *below)
+
+
 def accuracy_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on accuracy."""
     yield "## Accuracy"
-    yield ""
-    yield (
+    text = (
         "ATE RMSE in metres, lower is better; the lowest value of a row is bold. `full` is the default"
         " configuration, `baseline` is `--segmenter none`. ORB-SLAM3 (PyPI) is pyorbslam3 with a vocabulary trained"
         " on the sequences; it is not deterministic. A system that leaves out hard frames has a lower error, so"
         " coverage is given if it is below 100%."
     )
-    yield ""
-    yield from accuracy_table(measurements)
-    yield ""
-    yield from provenance(measurements, "system")
-    yield f"- ORB-SLAM2, ORB-SLAM3, NGD-SLAM: {PEERS['about']}"
-    yield from bullets(notes(measurements))
-    yield from (f"- {name}: {note}" for note, name in sequence_notes())
+    remarks = [
+        f"- ORB-SLAM2, ORB-SLAM3, NGD-SLAM: {PEERS['about']}",
+        *bullets(notes(measurements)),
+        *(f"- {name}: {note}" for note, name in sequence_notes()),
+    ]
+    yield from part(text, accuracy_table(measurements), measurements, "system", remarks)
 
 
 def speed_section(measurements: Sequence[Measurement], stages: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on speed."""
     yield "## Speed"
-    yield ""
-    yield (
+    text = (
         "Frames per second, higher is better, and in parentheses CPU ms per frame: user and system time of all"
         " threads and processes, lower is better. The last columns compare frames per second with ORB-SLAM3 in the"
         " same turn. Images of 640x480 pixels are read and decoded within the time; contenders take turns."
     )
-    yield ""
-    yield from speed_table(measurements)
-    yield ""
-    yield from provenance(measurements, "contender")
-    yield from bullets(notes(measurements))
+    yield from part(text, speed_table(measurements), measurements, "contender")
     if stages:
-        yield ""
-        yield (
+        text = (
             "Time of each stage, ms per frame. Stages run in parallel with those of the next frame, so that the sum"
             " can exceed the time of a frame. `motion` is the odometry, `bundle` local bundle"
             " adjustment. `v3d-torch run --profile` prints such a table for any run."
         )
-        yield ""
-        yield from pivot(rows_of(stages), "stage", "sequence", "ms")
-        yield ""
-        yield from provenance(stages)
+        yield from part(text, pivot(rows_of(stages), "stage", "sequence", "ms"), stages)
 
 
 def growth_section(measurements: Sequence[Measurement], keyframes: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on long runs and large maps."""
     yield "## Growth"
-    yield ""
     if measurements:
-        yield (
+        text = (
             "A sequence is played forth and back. Time per frame and number of keyframes should stay constant,"
             " because the camera observes the same room. CPU ms per frame is given for each tenth of the run."
         )
-        yield ""
-        columns = {
-            "sequence": "sequence",
-            "frames": "frames",
-            "cpu_ms": "CPU ms per frame",
-            "memory_mb": "memory, MB",
-            "memory_kb_per_frame": "growth, kB per frame",
-            "keyframes": "keyframes",
-            "loops": "loops",
-        }
-        yield from flat(rows_of(measurements), columns)
-        yield ""
-        yield from provenance(measurements, "frames")
-        yield from bullets(notes(measurements))
+        yield from part(text, flat(rows_of(measurements), columns.GROWTH), measurements, "frames")
     if keyframes:
-        yield ""
-        yield (
+        text = (
             "Place recognition and pose graph alone, on synthetic keyframes: a query of the keyframe database, and a"
             " loop over all keyframes. Both times should grow slowly with the number of keyframes."
         )
-        yield ""
-        columns = {"keyframes": "keyframes", "add_ms": "add one, ms", "query_ms": "query, ms"}
-        columns |= {"pose_graph_s": "pose graph, s", "error_before": "error before, m", "error_after": "error after, m"}
-        yield from flat(rows_of(keyframes), columns)
-        yield ""
-        yield from provenance(keyframes)
+        yield from part(text, flat(rows_of(keyframes), columns.KEYFRAMES), keyframes)
 
 
 def lost_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on interruptions."""
     yield "## Lost and found"
-    yield ""
-    yield (
+    text = (
         "The camera is covered, frames are dropped, or the camera is moved elsewhere and back. A case passes if the"
         " camera is recovered within 10 frames at a known place, no covered frame is tracked, the ATE is at most 1.5"
         " times that of the uninterrupted run, and no pose reported as reliable is wrong by more than 0.1 m."
     )
-    yield ""
-    columns = {
-        "sequence": "sequence",
-        "interruption": "interruption",
-        "recovery": "frames to recover",
-        "unflagged": "covered but tracked",
-        "found": "reliable poses",
-        "ate": "ATE, m",
-        "ratio": "relative to uninterrupted",
-        "worst": "worst error, m",
-        "reference_worst": "uninterrupted, m",
-        "passes": "passes",
-    }
-    yield from flat(rows_of(measurements), columns)
-    yield ""
-    yield from provenance(measurements, "sequence")
-    yield from bullets(notes(measurements))
+    yield from part(text, flat(rows_of(measurements), columns.LOST), measurements, "sequence")
 
 
 def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on masks and ids of objects."""
     yield "## Objects: masks and ids"
-    yield ""
-    yield (
+    text = (
         "Moving masked: fraction of the true moving pixels with depth that tracking does not use, higher is"
         " better. Static masked: the same for static pixels, lower is better. ID switches: how often a person in"
         " view gets another ID in 60 frames, lower is better. Each cell has the three values in this order."
     )
-    yield ""
     rows = [
         cells | {"objects": f"{cells['moving_masked']} / {cells['static_masked']} / {cells['id_switches']}"}
         for cells in rows_of(measurements)
         if "moving_masked" in cells
     ]
-    yield from pivot(rows, "variant", "sequence", "objects", VARIANTS)
-    yield ""
-    yield from provenance(measurements)
+    # The notes on these measurements are in the section on the ablation.
+    yield from part(text, pivot(rows, "variant", "sequence", "objects", VARIANTS), measurements, remarks=())
 
 
 def ablation_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the effect of each part of the system."""
     yield "## Ablation"
-    yield ""
-    yield (
+    text = (
         "ATE RMSE in metres without each part of the system, lower is better. Many differences are smaller than the"
         " range over the seeds. [ablate](commands/ablate.md) describes the variants."
     )
-    yield ""
-    yield from pivot(rows_of(measurements), "variant", "sequence", "ate", VARIANTS)
-    yield ""
-    yield from provenance(measurements)
-    yield from bullets(notes(measurements))
+    yield from part(text, pivot(rows_of(measurements), "variant", "sequence", "ate", VARIANTS), measurements)
 
 
 def segmentation_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on segmentation networks."""
     yield "## Segmentation networks"
-    yield ""
-    yield (
+    text = (
         "People's pixels found: fraction of those that the network with 32 bits at 640x480 finds on the same frames."
         " The columns after it score the whole system as in the section on objects. ms: time of one core per frame."
         " If the network runs on every second or third frame, objects are predicted in between."
     )
-    rows = rows_of(measurements)
-    columns = {
-        "network": "network",
-        "ms": "ms",
-        "people_found": "people's pixels found",
-        "moving_masked": "moving masked",
-        "static_masked": "static masked",
-        "id_switches": "ID switches",
-        "ate": "ATE, m",
-    }
-    for sequence in unique(cells["sequence"] for cells in rows):
-        yield ""
+    yield from part(text, network_tables(rows_of(measurements)), measurements)
+
+
+def network_tables(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield a table of segmentation networks per sequence, each under a heading."""
+    for number, sequence in enumerate(unique(cells["sequence"] for cells in rows)):
+        if number:
+            yield ""
         yield f"### {sequence} ({kind(sequence)})"
         yield ""
-        yield from flat([cells for cells in rows if cells["sequence"] == sequence], columns)
-    yield ""
-    yield from provenance(measurements)
-    yield from bullets(notes(measurements))
+        yield from flat([cells for cells in rows if cells["sequence"] == sequence], columns.SEGMENTATION)
 
 
 def maps_section(measurements: Sequence[Measurement], costs: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on dense maps."""
     yield "## Maps"
-    yield ""
     if measurements:
-        yield (
+        text = (
             "Points of the coloured map that belong to people, by the true masks, without and with the free-space"
             " check; fewer are better. Static points lost is the price of the check."
         )
-        yield ""
-        columns = {
-            "sequence": "sequence",
-            "pixels": "pixels in the map",
-            "points_before": "points",
-            "people_before": "people",
-            "points_after": "points with check",
-            "people_after": "people with check",
-            "static_lost": "static points lost",
-        }
-        yield from flat(rows_of(measurements), columns)
-        yield ""
-        yield from provenance(measurements, "sequence")
+        yield from part(text, flat(rows_of(measurements), columns.MAPS), measurements, "sequence")
     if costs:
-        yield ""
-        yield "CPU time and size of the map, the mesh and the map file."
-        yield ""
-        columns = {"sequence": "sequence", "keyframes": "keyframes", "points": "points", "triangles": "triangles"}
-        yield from flat(rows_of(costs), columns | {"saving": "saving", "loading": "loading"})
-        yield ""
-        yield from provenance(costs, "sequence")
+        text = "CPU time and size of the map, the mesh and the map file."
+        yield from part(text, flat(rows_of(costs), columns.MAP_COSTS), costs, "sequence")
 
 
 def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the primitives of the object stage."""
     yield "## Primitives of the object stage"
-    yield ""
-    yield "Median time; the ratio is the time of the competitor over ours in the same turn: above 1 ours is faster."
-    yield ""
-    columns = {"primitive": "primitive", "size": "size", "threads": "threads", "competitor": "competitor"}
-    yield from flat(rows_of(measurements), columns | {"ms": "ms", "ratio": "ratio"})
-    yield ""
-    yield from provenance(measurements)
+    text = "Median time; the ratio is the time of the competitor over ours in the same turn: above 1 ours is faster."
+    yield from part(text, flat(rows_of(measurements), columns.PRIMITIVES), measurements)
 
 
 def design_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on single measurements behind design choices."""
     yield "## Design choices"
-    yield ""
-    yield (
+    text = (
         "Single measurements that led to a choice. Each compares the choice with its alternative at one commit; no"
         " script repeats them. If the commit of the measurement is not known, the commit that recorded it is given."
     )
-    yield ""
     rows = [
         cells | {"commit": f"{measurement.heading.commit}, {measurement.heading.date}"}
         for measurement in measurements
         for cells in measurement.rows
     ]
-    yield from flat(rows, {"choice": "choice", "sequence": "sequence", "result": "result", "commit": "commit"})
+    yield from part(text, flat(rows, columns.DESIGN_CHOICES))
 
 
 SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (

@@ -8,21 +8,22 @@ predicted as missed objects are. If a sequence has true masks, the whole system 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 
+import columns
 from command import make_parser, publish
 from heading import make_heading
 from sequences import locate_sequence
 from storage import Measurement, Row
+from tables import flat
 from torch import Tensor
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
@@ -129,27 +130,8 @@ def format_value(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
-COLUMNS = {
-    "network": "network",
-    "ms": "ms per frame",
-    "people_found": "people's pixels found",
-    "moving_masked": "moving masked",
-    "static_masked": "static masked",
-    "id_switches": "ID switches",
-    "ate": "ATE, m",
-}
-"""Headings of the table by the cell of a row."""
-
-
-def table(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield a line per variant."""
-    yield markdown_row(list(COLUMNS.values()))
-    yield markdown_row(["---"] + ["---:"] * (len(COLUMNS) - 1))
-    yield from (markdown_row([cells[name] for name in COLUMNS]) for cells in rows)
-
-
 ABOUT = (
-    "ms per frame: wall time of one core, including rotation, decoding and, at first, the network on all four"
+    "ms: wall time of one core per frame, including rotation, decoding and, at first, the network on all four"
     f" rotations. People's pixels: fraction of those that {REFERENCE}, finds on the same frames. Masked: fraction of"
     " the true moving and static pixels with depth that the whole system masks. ID switches: of a person, in 60 frames."
 )
@@ -166,7 +148,7 @@ def main() -> None:
     try:
         for name in options.seqs:
             sequence_rows = list(compare(load_sequence(locate_sequence(name, options.data_root))))
-            lines += ["", f"## {name}", "", *table(sequence_rows)]
+            lines += ["", f"## {name}", "", *flat(sequence_rows, columns.SEGMENTATION)]
             rows += sequence_rows
     except V3DError as error:
         parser.error(str(error))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TypeVar
 
 from descriptions import describe, kind, published
 from storage import Measurement, Row
 
 from v3d_torch.evaluation.tables import markdown_row
+
+T = TypeVar("T")
 
 SYSTEMS = {"full": "full", "baseline": "baseline", "pyorbslam3": "ORB-SLAM3 (PyPI)", "open3d": "Open3D odometry"}
 """Names of systems in tables; other systems keep their own names."""
@@ -145,6 +148,6 @@ def provenance(measurements: Sequence[Measurement], key: str | None = None) -> I
         yield f"- {label}" + "; ".join([*command, *filter(None, details)])
 
 
-def unique(items: Iterable[str]) -> list[str]:
+def unique(items: Iterable[T]) -> list[T]:
     """Return the distinct items in the order of their first occurrence."""
     return list(dict.fromkeys(items))

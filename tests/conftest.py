@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -45,3 +46,15 @@ def v3d_data() -> Path:
     if not root.is_dir():
         pytest.skip(f"no real data: {root} is not there; set V3D_DATA to a folder of TUM-layout sequences")
     return root
+
+
+@pytest.fixture(scope="session")
+def real_sequence(v3d_data: Path) -> Callable[[str], Path]:
+    """Function that returns the folder of a sequence in `v3d_data`, or skips the test if the folder is missing."""
+
+    def find(name: str) -> Path:
+        if not (v3d_data / name).is_dir():
+            pytest.skip(f"no real data: {v3d_data / name} is missing")
+        return v3d_data / name
+
+    return find

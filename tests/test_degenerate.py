@@ -201,10 +201,10 @@ def test_refined_pose_of_degenerate_points(shape: str, offset: float, depth: boo
     cloud = points(shape)
     T_cw = se3_exp(TURN + STEP)
     T_cw[:3, 3] -= T_cw[:3, :3] @ (offset * KILOMETRE)
-    seen = (cloud + offset * KILOMETRE) @ T_cw[:3, :3].T + T_cw[:3, 3]
+    in_camera = (cloud + offset * KILOMETRE) @ T_cw[:3, :3].T + T_cw[:3, 3]
     measured = Measurements(
-        uv=CAMERA.project(seen),
-        inverse_depth=(1 / seen[:, 2]) * depth,
+        uv=CAMERA.project(in_camera),
+        inverse_depth=(1 / in_camera[:, 2]) * depth,
         pixel_sigma=torch.ones(len(cloud)).double(),
         inverse_depth_sigma=0.0025,
     )
@@ -222,14 +222,14 @@ def test_refined_pose_of_degenerate_points(shape: str, offset: float, depth: boo
 def observe_all(cloud: Tensor, T_cw: Tensor) -> Observations:
     """Exact observations of every point by every camera, with depth."""
     pose = torch.arange(len(T_cw)).repeat_interleave(len(cloud))
-    seen = (T_cw[:, None, :3, :3] @ cloud[..., None])[..., 0] + T_cw[:, None, :3, 3]
-    seen = seen.reshape(-1, 3)
+    in_camera = (T_cw[:, None, :3, :3] @ cloud[..., None])[..., 0] + T_cw[:, None, :3, 3]
+    in_camera = in_camera.reshape(-1, 3)
     return Observations(
         pose=pose,
         point=torch.arange(len(cloud)).repeat(len(T_cw)),
-        uv=CAMERA.project(seen),
-        inverse_depth=1 / seen[:, 2],
-        pixel_sigma=torch.ones(len(seen), dtype=torch.float64),
+        uv=CAMERA.project(in_camera),
+        inverse_depth=1 / in_camera[:, 2],
+        pixel_sigma=torch.ones(len(in_camera), dtype=torch.float64),
         inverse_depth_sigma=0.0025,
     )
 

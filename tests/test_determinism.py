@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.first_frames import FirstFrames
 
-from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.tum_trajectory import write_trajectory
@@ -25,18 +25,6 @@ RUNS = {
 }
 
 
-class FirstFrames:
-    """The first frames of a sequence."""
-
-    name, groundtruth = "first frames", None
-
-    def __init__(self, sequence: RGBDSequence) -> None:
-        self._sequence, self.camera = sequence, sequence.camera
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return islice(iter(self._sequence), FRAMES)
-
-
 @pytest.fixture
 def one_thread_after() -> Iterator[None]:
     """Restore one thread after the test."""
@@ -47,7 +35,7 @@ def one_thread_after() -> Iterator[None]:
 def trajectory(sequence: RGBDSequence, overrides: tuple[str, ...], path: Path) -> bytes:
     config = load_config(None, overrides)
     torch.set_num_threads(config.threads)
-    pipeline = Pipeline(FirstFrames(sequence), V3DSLAM(sequence.camera, config=config))
+    pipeline = Pipeline(FirstFrames(sequence, FRAMES), V3DSLAM(sequence.camera, config=config))
     assert pipeline().failure is None
     write_trajectory(path, pipeline.slam.poses.trajectory())
     return path.read_bytes()
@@ -57,8 +45,7 @@ def trajectory(sequence: RGBDSequence, overrides: tuple[str, ...], path: Path) -
 @pytest.mark.usefixtures("one_thread_after")
 def test_trajectory_is_identical_in_every_run(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     """With the network. The camera of walkers_desk rolls, so its images are rotated by the predicted pose."""
-    root = None if name == "demo" else request.getfixturevalue("v3d_data")
-    sequence = load_sequence(name, data_root=root)
+    sequence = load_sequence(name if name == "demo" else str(request.getfixturevalue("real_sequence")(name)))
     trajectories = {
         run: trajectory(sequence, overrides, tmp_path / "trajectory.txt") for run, overrides in RUNS.items()
     }

@@ -18,18 +18,18 @@ Run = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(scope="module")
-def run(v3d_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(real_sequence: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Function that runs a sequence from the command line and returns its metrics."""
 
     def run_sequence(name: str, *options: str) -> dict[str, Any]:
-        out = tmp_path_factory.mktemp(name)
-        arguments = ["--seq", str(v3d_data / name), "--out", str(out), "--set", "threads=1", *options]
+        folder, out = real_sequence(name), tmp_path_factory.mktemp(name)
+        arguments = ["--seq", str(folder), "--out", str(out), "--set", "threads=1", *options]
         done = subprocess.run(  # noqa: S603
             [sys.executable, "-m", "v3d_torch.run", *arguments], capture_output=True, text=True, env=os.environ
         )
         assert done.returncode == 0, done.stderr
         metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())
-        associated = (v3d_data / name / "associations.txt").read_text().splitlines()
+        associated = (folder / "associations.txt").read_text().splitlines()
         assert len(read_trajectory(out / "trajectory.txt")) == metrics["frames"] == len(associated)
         assert metrics["coverage"] == 1.0
         return metrics

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import gc
 import threading
-from collections.abc import Iterator
 
 import pytest
 import torch
+from helpers.first_frames import FirstFrames
 from torch import Tensor
 
 import v3d_torch.backend.back_end
-from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
@@ -113,21 +113,8 @@ def test_thread_ends_when_the_system_is_deleted(demo: RGBDSequence) -> None:
     assert not thread.is_alive()
 
 
-class FirstFrames:
-    """The first frames of the demo."""
-
-    name, groundtruth = "short", None
-
-    def __init__(self, demo: RGBDSequence) -> None:
-        self._demo = demo
-        self.camera = demo.camera
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return (self._demo[index] for index in range(FRAMES))
-
-
 def test_pipeline_in_inference_mode_equals_calls_outside_of_it(demo: RGBDSequence) -> None:
-    pipeline = Pipeline(FirstFrames(demo), V3DSLAM(demo.camera, config=make_config(in_background=True)))
+    pipeline = Pipeline(FirstFrames(demo, FRAMES), V3DSLAM(demo.camera, config=make_config(in_background=True)))
     assert pipeline().failure is None
     pipeline.flush()
     slam = V3DSLAM(demo.camera, config=make_config(in_background=False))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import random
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -118,11 +120,29 @@ def test_equal_scores_rank_in_order_of_insertion() -> None:
     assert [k for k, _ in database.query(place, k=3)] == [8, 3, 5]
 
 
-def test_real_images_of_the_same_direction_are_recognised(v3d_data: Path) -> None:
+@pytest.mark.parametrize("removed", [[3], [0, 1], [4, 0, 2], [0, 1, 2, 3, 4]])
+def test_removed_keyframes_do_not_influence_the_scores(removed: list[int]) -> None:
+    """Scores depend on the number of keyframes and on how many contain a descriptor: removed ones must not count."""
+    dice = random.Random(1)  # noqa: S311
+    common = descriptors(40, seed=9)
+    database, expected = KeyframeDatabase(), KeyframeDatabase()
+    for k in range(5):
+        keyframe = torch.cat([common[dice.sample(range(40), 25)], descriptors(20, seed=k)])
+        database.add(k, keyframe)
+        if k not in removed:
+            expected.add(k, keyframe)
+    database.remove([*removed[:1], 99])
+    database.remove(removed)
+    assert len(database) == len(expected) == 5 - len(removed)
+    assert database.query(common, k=5) == expected.query(common, k=5)
+    database.add(7, common)
+    expected.add(7, common)
+    assert database.query(common, k=5, exclude=[7]) == expected.query(common, k=5, exclude=[7])
+
+
+def test_real_images_of_the_same_direction_are_recognised(real_sequence: Callable[[str], Path]) -> None:
     """The camera of fr1_rpy rotates on the spot: images in the same direction show the same place."""
-    root = v3d_data / "fr1_rpy"
-    if not root.is_dir():
-        pytest.skip(f"{root} is missing")
+    root = real_sequence("fr1_rpy")
     rows = [line.split() for line in (root / "associations.txt").read_text(encoding="utf-8").splitlines()][::20]
     truth = np.loadtxt(root / "groundtruth.txt")
     database = KeyframeDatabase()

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.commands import assert_error_line
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import ablation_study
@@ -39,13 +40,6 @@ def shell(module: str, *arguments: str | Path) -> subprocess.CompletedProcess[st
         text=True,
         timeout=500,
     )
-
-
-def assert_error_line(result: Result, *words: str) -> None:
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1, result.stderr
-    for word in words:
-        assert word in result.stderr
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

@@ -9,19 +9,15 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from helpers.bags import DEPTH, INFO, RGB, MessageFactory
-from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
+from helpers.commands import assert_error_line
+from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of, save
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.record import app
 from v3d_torch.datasets import RGBDSequence, load_sequence
-from v3d_torch.datasets.tum_writer import TUMWriter
-from v3d_torch.errors import OutputError
-from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.types import RGBDFrame
 
 K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
 LISTS = {"rgb.txt", "depth.txt", "associations.txt", "camera.yaml"}
@@ -38,12 +34,6 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 def call_in_process(*arguments: str | Path) -> Result:
     """Call the command in this process, which is faster."""
     return CliRunner().invoke(app, list(map(str, arguments)))
-
-
-def assert_error_line(done: Result, *words: str) -> None:
-    assert done.exit_code == 2, done.stderr
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
-    assert all(word in done.stderr for word in words), done.stderr
 
 
 def assert_equal(saved: RGBDSequence, source: RGBDSequence) -> None:
@@ -130,36 +120,6 @@ def test_nonempty_folder_and_missing_camera_are_errors(tmp_path: Path) -> None:
     assert_error_line(done, str(tmp_path / "full"), "already exists and is not an empty folder; choose another")
     assert_error_line(call_in_process("--out", tmp_path / "new"), "realsense: ")
     assert not (tmp_path / "new").exists()
-
-
-def test_failure_of_source_keeps_saved_frames(tmp_path: Path) -> None:
-    camera = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=1000)
-    frame = RGBDFrame(0, 12.5, torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.ones(1, HEIGHT, WIDTH))
-    with pytest.raises(RuntimeError, match="broke"), TUMWriter(tmp_path / "out", camera) as writer:
-        writer.add(frame)
-        raise RuntimeError("broke")
-    assert load_sequence(str(tmp_path / "out")).stamps.tolist() == [12.5]
-
-
-def test_depth_is_exact_and_out_of_range_is_zero(tmp_path: Path) -> None:
-    camera = PinholeCamera(1, 2, 3, 4, 256, 256, depth_scale=1000)
-    units = torch.arange(256 * 256, dtype=torch.float32).reshape(1, 256, 256)
-    image = torch.from_numpy(colour_of(0, 256, 256)).permute(2, 0, 1)
-    for stamp, depth in ((1.0, units / 1000), (2.0, units / 1000 + 30)):
-        with TUMWriter(tmp_path / str(stamp), camera) as writer:
-            writer.add(RGBDFrame(0, stamp, image, depth))
-    frame = load_sequence(str(tmp_path / "1.0"))[0]
-    assert np.array_equal(as_rgb(frame.image), colour_of(0, 256, 256))
-    assert torch.equal(frame.depth, torch.where(units < 65535, units / 1000, 0))
-    far = load_sequence(str(tmp_path / "2.0"))[0].depth
-    assert torch.equal(far == 0, units >= 35535)
-
-
-def test_file_in_place_of_folder_is_error(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("")
-    for folder in (tmp_path / "taken", tmp_path / "taken" / "below"):
-        with pytest.raises(OutputError, match="taken"):
-            TUMWriter(folder, PinholeCamera(1, 2, 3, 4))
 
 
 def test_help_lists_options_and_does_not_import_torch() -> None:

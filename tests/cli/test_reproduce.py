@@ -15,6 +15,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from helpers.commands import assert_error_line
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import reproduction
@@ -24,9 +25,7 @@ from v3d_torch.cli.reproduce import app
 from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets import PAPER_SEQUENCES, locate, short_name
 from v3d_torch.evaluation.ablation import VARIANTS
-from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.evaluation.paper_tables import load_paper_scores
-from v3d_torch.evaluation.summary import format_csv, format_latex, format_markdown
 
 SHORT = [short_name(name) for name in PAPER_SEQUENCES]
 SERVED = [name for name in PAPER_SEQUENCES if name.endswith(("walking_xyz", "sitting_rpy"))]
@@ -40,13 +39,6 @@ class Handler(SimpleHTTPRequestHandler):
 
 def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(app, list(map(str, arguments)), env={"V3D_DATA": "", "NO_COLOR": "1"})
-
-
-def assert_error_line(result: Result, *words: str | Path) -> None:
-    assert result.exit_code == 2, result.output
-    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1, result.stderr
-    for word in words:
-        assert str(word) in result.stderr
 
 
 def table_in(document: str, heading: str) -> dict[str, dict[str, str]]:
@@ -245,18 +237,3 @@ def test_damaged_sequence_is_an_error(server: str, fake_runs: list[str], tmp_pat
     folder.mkdir(parents=True)
     assert_error_line(call("--data-root", tmp_path / "data", "--out", tmp_path / "out"), folder)
     assert not fake_runs
-
-
-# --- the tables
-
-
-def test_missing_sequences_keep_the_papers_order_and_scores() -> None:
-    runs = [Outcome("fr3/w/static", "full", 0, metrics_of(0.006)), Outcome("fr3/s/xyz", "full", 0, metrics_of(0.009))]
-    absent = [name for name in SHORT if name not in ("fr3/w/static", "fr3/s/xyz")]
-    table = table_in(format_markdown(runs, absent), "ATE, m")
-    assert list(table) == SHORT
-    assert table["fr3/w/rpy"]["full"] == "not here" and table["fr3/w/rpy"]["DynaSLAM (paper)"] == "**0.0354**"
-    assert table["fr3/w/static"]["full"] == "**0.0060**"
-    assert format_latex(runs, absent).count("not here") == 3 * 6
-    missing = [row for row in csv.DictReader(format_csv(runs, absent).splitlines()) if row["method"] == "full"]
-    assert [row["median"] for row in missing[:8]] == ["0.009", *[""] * 5, "0.006", ""]

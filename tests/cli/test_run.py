@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import shutil
@@ -12,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import chdir
-from datetime import datetime, tzinfo
 from pathlib import Path
 
 import cv2
@@ -20,22 +18,14 @@ import numpy as np
 import pandas as pd
 import plyfile
 import pytest
-from helpers.commands import assert_error_line, call, command, environment, files_in
+from helpers.commands import RUN_FILES, assert_error_line, call, command, environment, files_in
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
 from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE, write_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
-from v3d_torch.errors import OutputError
-from v3d_torch.runs import result_folder
 
-FILES = {
-    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),
-    *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
-    *("figures/trajectory.png", "figures/masks.png"),
-}
-"""Files that every run with ground truth writes."""
 OBJECT_FILES = {"figures/voting.png", "figures/clusters.png"}
 """Files that are written if objects were detected and voted on."""
 
@@ -99,7 +89,7 @@ def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
 
 
 def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
-    assert {name for name in files_in(first_out) if not name.startswith("masks/")} == FILES | OBJECT_FILES
+    assert {name for name in files_in(first_out) if not name.startswith("masks/")} == RUN_FILES | OBJECT_FILES
     trajectory = read_trajectory(first_out / "trajectory.txt")
     listed = [float(line.split()[0]) for line in (sequence / "associations.txt").read_text().splitlines()]
     assert trajectory.stamps.tolist() == listed
@@ -163,44 +153,12 @@ def test_run_without_segmenter_and_out_writes_a_folder_by_time(moment: Path, tmp
         assert done.exit_code == 0, done.stderr
         latest = runs / "latest"
         assert latest.is_symlink()
-        assert files_in(latest.resolve()) == FILES
+        assert files_in(latest.resolve()) == RUN_FILES
         assert json.loads((latest / "metrics.json").read_text())["seed"] == seed
         assert len(pd.read_parquet(latest / "dynamics.parquet")) == 0
         newest.append(latest.resolve())
     assert newest[0] != newest[1]
     assert {path.name for path in runs.iterdir()} == {"latest", *(path.name for path in newest)}
-
-
-def test_runs_started_in_the_same_second_have_separate_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class FixedTime(datetime):
-        @classmethod
-        def now(cls, tz: tzinfo | None = None) -> FixedTime:
-            return cls(2026, 1, 2, 3, 4, 5, tzinfo=tz)
-
-    monkeypatch.setattr(result_folder, "datetime", FixedTime)
-    monkeypatch.chdir(tmp_path)
-    folders = [result_folder.make_result_folder(None, "fr3/w/xyz") for _ in range(3)]
-    assert [folder.name for folder in folders] == [f"2026-01-02_03-04-05{suffix}" for suffix in ("", "_2", "_3")]
-    assert (tmp_path / "results" / "fr3_w_xyz" / "latest").resolve() == folders[-1].resolve()
-
-
-def test_make_result_folder_without_symlink_permission_makes_no_latest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(errno.EPERM, "A required privilege is not held by the client")
-
-    monkeypatch.setattr(Path, "symlink_to", refuse)
-    monkeypatch.chdir(tmp_path)
-    folder = result_folder.make_result_folder(None, "demo")
-    assert folder.is_dir() and [path.name for path in folder.parent.iterdir()] == [folder.name]
-
-
-def test_make_result_folder_that_fails_raises_output_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "results").symlink_to("nowhere")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(OutputError, match=r"demo: cannot be made \(.*\); choose another folder with --out"):
-        result_folder.make_result_folder(None, "demo")
 
 
 def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: Path) -> None:
@@ -261,7 +219,7 @@ def test_truncated_image_ends_the_run_with_partial_results(kind: str, index: int
     trajectory = tmp_path / "out" / "trajectory.txt"
     assert len(trajectory.read_text().splitlines() if trajectory.exists() else []) == index
     if index:
-        assert files_in(tmp_path / "out") == FILES | {"checkpoint.v3d"}
+        assert files_in(tmp_path / "out") == RUN_FILES | {"checkpoint.v3d"}
         assert str(tmp_path / "out") in done.stderr
         assert json.loads((tmp_path / "out" / "metrics.json").read_text())["processed"] == index
 
@@ -326,7 +284,7 @@ def test_ctrl_c_keeps_partial_results(sequence: Path, tmp_path: Path) -> None:
     metrics = json.loads((out / "metrics.json").read_text())
     assert 3 <= metrics["processed"] < 30
     assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
-    assert {name for name in files_in(out) if not name.startswith("masks/")} == FILES | {"checkpoint.v3d"}
+    assert {name for name in files_in(out) if not name.startswith("masks/")} == RUN_FILES | {"checkpoint.v3d"}
 
 
 def test_help_is_fast_and_names_every_option() -> None:
@@ -385,7 +343,7 @@ def near(people: pd.DataFrame, x: pd.Series | float, y: float, radius: float) ->
 
 def test_demo_writes_all_files_and_a_pose_for_each_frame(demo: tuple[Path, str]) -> None:
     out, stdout = demo
-    assert files_in(out) == FILES | OBJECT_FILES
+    assert files_in(out) == RUN_FILES | OBJECT_FILES
     assert len((out / "trajectory.txt").read_text().splitlines()) == FRAME_COUNT == 120
     assert "ATE rmse" in stdout
     for name in ("figures/trajectory.png", "figures/masks.png", *OBJECT_FILES):

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.commands import assert_error_line
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from typer.testing import CliRunner, Result
@@ -68,13 +69,6 @@ def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:
 
 def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(run.app, [str(argument) for argument in arguments])
-
-
-def assert_error_line(done: Result, *words: str) -> None:
-    assert done.exit_code == 2 and (done.exception is None or isinstance(done.exception, SystemExit)), done.exc_info
-    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
-    for word in words:
-        assert word in done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -293,8 +287,10 @@ def test_damaged_checkpoint_or_one_of_another_version_is_rejected(out: Path) -> 
     content = path.read_bytes()
     path.write_bytes(content[:-10])
     assert_error_line(call("--resume", out), f"{path}: is damaged or not a state of a run; start a new run")
-    path.write_bytes(content.replace(b"state 9", b"state 10", 1))
-    assert_error_line(call("--resume", out), f"{path}: has state format 10, this program reads format 9; continue with")
+    path.write_bytes(content.replace(b"state 10", b"state 11", 1))
+    assert_error_line(
+        call("--resume", out), f"{path}: has state format 11, this program reads format 10; continue with"
+    )
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.tiny_images import CAMERA_YAML
 
 from v3d_torch.datasets.cameras import PRESETS, load_camera
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-
-CAMERA_YAML = "fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 1000\n"
 
 
 def test_presets_have_published_parameters() -> None:

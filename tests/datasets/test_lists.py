@@ -1,4 +1,4 @@
-"""Image lists of the TUM layout and association of colour and depth."""
+"""Image lists of the TUM layout."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from v3d_torch.datasets.lists import pair_lists, read_associations, read_image_list
 from v3d_torch.errors import InputError
-from v3d_torch.io.timestamps import associate
 
 STAMPS = st.floats(min_value=-1e10, max_value=1e10, allow_nan=False)
 NAMES = st.from_regex(r"rgb/[a-z0-9_\-]+( [a-z0-9#,]+)*\.png", fullmatch=True)
@@ -66,21 +65,3 @@ def test_any_bytes_are_a_valid_list_or_raise_input_error(tmp_path: Path, content
             assert read(tmp_path / "rgb.txt")
         except InputError as error:
             assert "\n" not in str(error)
-
-
-# Binary fractions have exact differences, so that equal differences compare equal.
-TICKS = st.lists(st.integers(0, 2000), unique=True, max_size=60).map(
-    lambda ticks: [tick / 1024 for tick in sorted(ticks)]
-)
-
-
-@given(first=TICKS, second=TICKS)
-def test_association_pairs_nearest_stamps_first(first: list[float], second: list[float]) -> None:
-    """Reference: the benchmark's tool, which sorts all differences and uses each stamp once."""
-    limit = 20 / 1024
-    near = sorted((abs(a - b), i, j) for i, a in enumerate(first) for j, b in enumerate(second) if abs(a - b) <= limit)
-    expected: dict[int, int] = {}
-    for _, i, j in near:
-        if i not in expected and j not in expected.values():
-            expected[i] = j
-    assert associate(first, second, limit) == sorted(expected.items())

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of
 from PIL import Image
 
 from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
@@ -20,8 +21,6 @@ from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 WALKING_XYZ = "rgbd_dataset_freiburg3_walking_xyz"
-WIDTH, HEIGHT = 32, 24
-CAMERA_YAML = f"fx: 30.0\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: {WIDTH}\nheight: {HEIGHT}\ndepth_scale: 1000\n"
 
 
 @pytest.fixture(autouse=True)
@@ -29,14 +28,6 @@ def isolated_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep all tests away from the user's own data and cache."""
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv("V3D_DATA", raising=False)
-
-
-def colour_of(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-
-
-def depth_of(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed + 100).integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)
 
 
 @pytest.fixture
@@ -91,9 +82,10 @@ def test_decoded_colour_of_every_mode_equals_pillow(tmp_path: Path, mode: str) -
     assert np.array_equal(read_colour(path).permute(1, 2, 0).numpy(), np.asarray(Image.open(path).convert("RGB")))
 
 
-def test_images_of_a_real_sequence_equal_opencv(v3d_data: Path) -> None:
-    sequence = load_sequence("fr1/rpy", data_root=v3d_data)
-    colour, depth = (sorted((v3d_data / "fr1_rpy" / name).iterdir()) for name in ("rgb", "depth"))
+def test_images_of_a_real_sequence_equal_opencv(real_sequence: Callable[[str], Path]) -> None:
+    folder = real_sequence("fr1_rpy")
+    sequence = load_sequence("fr1/rpy", data_root=folder.parent)
+    colour, depth = (sorted((folder / name).iterdir()) for name in ("rgb", "depth"))
     frame = sequence[100]
     assert np.array_equal(frame.image.permute(1, 2, 0).numpy(), cv2.imread(str(colour[100]), cv2.IMREAD_COLOR_RGB))
     expected = cv2.imread(str(depth[100]), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000
@@ -340,8 +332,10 @@ def test_damaged_archive_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ("name", "frames", "poses"),
     [("fr1_rpy", 694, 2742), ("walkers_desk", 200, 200), ("crowd_rpy", 180, 180), ("walkers_room", 160, 160)],
 )
-def test_real_sequence_has_all_frames_and_poses(v3d_data: Path, name: str, frames: int, poses: int) -> None:
-    sequence = load_sequence(name, data_root=v3d_data)
+def test_real_sequence_has_all_frames_and_poses(
+    real_sequence: Callable[[str], Path], name: str, frames: int, poses: int
+) -> None:
+    sequence = load_sequence(name, data_root=real_sequence(name).parent)
     assert len(sequence) == frames
     assert sequence.groundtruth is not None
     assert len(sequence.groundtruth) == poses
@@ -351,8 +345,10 @@ def test_real_sequence_has_all_frames_and_poses(v3d_data: Path, name: str, frame
     assert 0.3 < float(frame.depth[frame.depth > 0].median()) < 6
 
 
-def test_lists_of_fr1_rpy_give_the_pairs_of_its_associations(v3d_data: Path, tmp_path: Path) -> None:
-    source, copy = v3d_data / "fr1_rpy", tmp_path / "fr1_rpy"
+def test_lists_of_fr1_rpy_give_the_pairs_of_its_associations(
+    real_sequence: Callable[[str], Path], tmp_path: Path
+) -> None:
+    source, copy = real_sequence("fr1_rpy"), tmp_path / "fr1_rpy"
     copy.mkdir()
     for name in ("rgb", "depth", "rgb.txt", "depth.txt"):
         (copy / name).symlink_to(source / name)

@@ -51,8 +51,8 @@ def test_variant_whose_runs_all_failed_has_a_dash() -> None:
 
 
 def test_mask_metrics_have_no_best() -> None:
-    def masks(variant: str, share: float) -> Outcome:
-        scores = {"moving_masked": share, "static_masked": share / 10, "id_switches_per_60_frames": share}
+    def masks(variant: str, fraction: float) -> Outcome:
+        scores = {"moving_masked": fraction, "static_masked": fraction / 10, "id_switches_per_60_frames": fraction}
         return Outcome("s", variant, 0, {"ate": None, "rpe": None, "masks": scores})
 
     document = format_markdown([masks("baseline", 0.0), masks("full", 0.97)])

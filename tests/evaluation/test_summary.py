@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from v3d_torch.datasets import PAPER_SEQUENCES, short_name
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.evaluation.paper_tables import load_paper_scores
 from v3d_torch.evaluation.summary import (
@@ -83,6 +84,20 @@ def test_other_sequences_have_no_paper_columns() -> None:
     assert rows(document)[0] == ["sequence", "full", "paper"]
     assert rows(document)[2] == ["demo", "**0.1000**", "0.2000"]
     assert "(paper)" not in document
+
+
+def test_missing_sequences_keep_the_papers_order_and_scores() -> None:
+    outcomes = [*runs("fr3/w/static", "full", 0.006), *runs("fr3/s/xyz", "full", 0.009)]
+    short = [short_name(name) for name in PAPER_SEQUENCES]
+    absent = [name for name in short if name not in ("fr3/w/static", "fr3/s/xyz")]
+    heading, _, *lines = rows(format_markdown(outcomes, absent).partition("\n## RPE")[0])
+    table = {line[0]: dict(zip(heading, line, strict=True)) for line in lines}
+    assert list(table) == short
+    assert table["fr3/w/rpy"]["full"] == "not here" and table["fr3/w/rpy"]["DynaSLAM (paper)"] == "**0.0354**"
+    assert table["fr3/w/static"]["full"] == "**0.0060**"
+    assert format_latex(outcomes, absent).count("not here") == 3 * 6
+    missing = [row for row in csv.DictReader(format_csv(outcomes, absent).splitlines()) if row["method"] == "full"]
+    assert [row["median"] for row in missing[:8]] == ["0.009", *[""] * 5, "0.006", ""]
 
 
 def test_failures_are_listed_below() -> None:

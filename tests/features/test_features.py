@@ -1,10 +1,12 @@
-"""Depth sampling and even selection of features."""
+"""Depth sampling, selection of features, and their readout Jacobian."""
 
 from __future__ import annotations
 
 import torch
+from helpers.rolling_camera import CAMERA, KINECT, VELOCITY, observe_rolling, points_in_view
 
 from v3d_torch.features.features import sample_depth, select_evenly
+from v3d_torch.odometry.rolling_shutter import RollingShutterCompensation
 
 
 def test_sampled_depth_outside_the_image_is_zero() -> None:
@@ -24,3 +26,14 @@ def test_select_evenly_prefers_sparse_cells() -> None:
     assert torch.equal(selected, selected.sort().values)
     assert torch.equal(select_evenly(pixel, 1000, 32), torch.arange(560))
     assert len(select_evenly(pixel, 0, 32)) == 0
+
+
+def test_selected_features_keep_their_readout_jacobian() -> None:
+    observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
+    compensated = RollingShutterCompensation(CAMERA)(observed, VELOCITY, KINECT)
+    assert torch.equal(compensated[torch.tensor([3, 1])].readout_jacobian, compensated.readout_jacobian[[3, 1]])
+
+
+def test_readout_jacobian_is_zero_by_default() -> None:
+    observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
+    assert torch.equal(observed.readout_jacobian, torch.zeros_like(observed.uv))

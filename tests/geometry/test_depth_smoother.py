@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -127,8 +128,8 @@ def test_even_window_is_rejected(kernel_size: int) -> None:
         smooth_depth(torch.ones(1, 1, 4, 4), kernel_size)
 
 
-def test_real_depth_changes_by_less_than_the_gate(v3d_data: Path) -> None:
-    path = sorted((v3d_data / "fr1_rpy" / "depth").glob("*.png"))[0]
+def test_real_depth_changes_by_less_than_the_gate(real_sequence: Callable[[str], Path]) -> None:
+    path = sorted((real_sequence("fr1_rpy") / "depth").glob("*.png"))[0]
     depth = torch.from_numpy(cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000)[None, None]
     smoothed = smooth_depth(depth)
     assert torch.equal(smoothed == 0, depth == 0)

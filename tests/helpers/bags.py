@@ -21,7 +21,7 @@ KINDS: tuple[Kind, ...] = ("bag", "db3", "mcap")
 RGB, DEPTH, INFO = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw", "/camera/color/camera_info"
 
 Message = tuple[str, float, Any]
-"""Topic, arrival time (seconds), and message made by `Messages`."""
+"""Topic, arrival time (seconds), and message made by `MessageFactory`."""
 
 
 class MessageFactory:

@@ -9,6 +9,13 @@ from pathlib import Path
 
 from typer.testing import Result
 
+RUN_FILES = {
+    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),
+    *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+    *("figures/trajectory.png", "figures/masks.png"),
+}
+"""Files that every run with ground truth writes."""
+
 
 def command(*arguments: str | Path) -> list[str]:
     # One thread: several would wait for each other on shared cores, and the results are the same.
@@ -26,13 +33,18 @@ def call(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.Comp
     )
 
 
-def assert_error_line(done: subprocess.CompletedProcess[str] | Result, *words: str) -> None:
-    assert (done.exit_code if isinstance(done, Result) else done.returncode) == 2, done.stderr
+def assert_error_line(done: subprocess.CompletedProcess[str] | Result, *words: str | Path) -> None:
+    """Check that a command ended with exit code 2 and one line on stderr that contains the words."""
+    if isinstance(done, Result):
+        assert done.exit_code == 2 and (done.exception is None or isinstance(done.exception, SystemExit)), done.exc_info
+    else:
+        assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1, done.stderr
     assert "Traceback" not in done.stdout + done.stderr
     for word in words:
-        assert word in done.stderr
+        assert str(word) in done.stderr
 
 
 def files_in(folder: Path) -> set[str]:
+    """Return the paths of all files in a folder, relative to the folder."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}

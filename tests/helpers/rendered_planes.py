@@ -1,4 +1,4 @@
-"""Exactly rendered planes for dense alignment, seen from two poses with a known motion."""
+"""Exactly rendered planes for dense alignment, from two poses with a known motion between them."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from v3d_torch.features.features import Features
+from helpers.sparse_maps import EYE, no_features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
@@ -15,16 +15,11 @@ ROOM = torch.tensor([[-1.53, -1.11, -1.47], [1.49, 1.17, 1.83]])
 """Lower and upper corner of the room, metres; not on voxel boundaries."""
 CRATE = torch.tensor([[-0.33, 0.41, 0.55], [0.37, 1.17, 1.21]])
 """Lower and upper corner of a box on the floor, metres; y points down."""
-EYE = torch.eye(4, dtype=torch.float64)
 
 
 def keyframe(T_cw: Tensor = EYE, frame: int = 0) -> Keyframe:
     """A keyframe at a pose, without features."""
-    empty = torch.zeros(0, dtype=torch.int64)
-    no_features = Features(
-        torch.zeros(0, 2), torch.zeros(0, 2).long(), empty.double(), empty, torch.zeros(0, 32).byte()
-    )
-    return Keyframe(frame, frame, frame / 30, T_cw, no_features, empty)
+    return Keyframe(frame, frame, frame / 30, T_cw, no_features(), torch.zeros(0, dtype=torch.int64))
 
 
 def looking_around(count: int, seed: int = 0) -> Tensor:

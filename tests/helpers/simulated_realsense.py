@@ -28,7 +28,7 @@ class SimulatedDevice:
 
     Args:
         record_to: File to record to; None for no recording.
-        scale: Integer factor by which the small images are scale.
+        scale: Integer factor by which the small images are enlarged.
         still: True to send frame 0 again and again.
     """
 

@@ -28,6 +28,12 @@ def features(count: int, seed: int = 0, depth: float | None = None) -> Features:
     return Features(uv, uv.round().long(), z, (4 * uniform(count, seed=seed + 2)).long(), bits)
 
 
+def no_features() -> Features:
+    """Features of an image without any."""
+    none = torch.zeros(0, dtype=torch.int64)
+    return Features(torch.zeros(0, 2), torch.zeros(0, 2).long(), none.double(), none, torch.zeros(0, 32).byte())
+
+
 def make_map(**settings: int) -> SparseMap:
     """An empty map with the given mapping configuration."""
     config = Config()

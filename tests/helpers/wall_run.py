@@ -1,14 +1,20 @@
-"""Short sequence of a camera in front of a wall, and instances for its frames."""
+"""Short sequence of a camera in front of a wall, instances for its frames, and runs along the wall."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
+from v3d_torch.config import Config
+from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, Trajectory
 
 CAMERA = PinholeCamera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
@@ -63,3 +69,15 @@ def square(frame: RGBDFrame) -> Instances:
     mask[:, 90:150, 130:190] = True
     box = torch.tensor([[130.0, 90, 190, 150]])
     return Instances(mask, torch.zeros(1, dtype=torch.int64), torch.ones(1), box)
+
+
+def make_pipeline(sequence: Wall | None = None, masks: Path | None = None, config: Config | None = None) -> Pipeline:
+    """Make a pipeline with one object, the square, over a sequence along the wall; by default an intact one."""
+    return Pipeline(sequence or Wall(), V3DSLAM(CAMERA, square, config), masks)
+
+
+def run_along_wall() -> Pipeline:
+    """Run along the whole wall, with a keyframe every 5 frames."""
+    pipeline = make_pipeline(config=load_config(overrides=["mapping.max_keyframe_interval=5"]))
+    pipeline()
+    return pipeline

@@ -1,11 +1,9 @@
-"""Culling of landmarks and keyframes against plain counting; poses of culled keyframes; keyframe database."""
+"""Culling of landmarks and keyframes against plain counting; poses of culled keyframes."""
 
 from __future__ import annotations
 
-import random
 from itertools import pairwise
 
-import pytest
 import torch
 from helpers.sparse_maps import CAMERA, EYE
 from helpers.sparse_maps import features as random_features
@@ -14,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.backend.keyframe_database import KeyframeDatabase
 from v3d_torch.config import Config, MappingConfig
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import invert, se3_exp
@@ -174,29 +171,3 @@ def test_landmarks_without_a_second_observation_are_culled_after_three_keyframes
     insert(sparse_map, {})
     sparse_map.cull_landmarks()
     assert sparse_map.landmarks["active"].tolist() == [False, True, False]
-
-
-# --- keyframe database
-
-
-@pytest.mark.parametrize("removed", [[3], [0, 1], [4, 0, 2], [0, 1, 2, 3, 4]])
-def test_removed_keyframes_do_not_influence_the_scores(removed: list[int]) -> None:
-    """Scores depend on the number of keyframes and on how many contain a descriptor: removed ones must not count."""
-    dice = random.Random(1)  # noqa: S311
-    common = torch.randint(0, 256, (40, 32), generator=torch.Generator().manual_seed(9), dtype=torch.uint8)
-    places = {
-        index: torch.cat([common[dice.sample(range(40), 25)], torch.randint(0, 256, (20, 32), dtype=torch.uint8)])
-        for index in range(5)
-    }
-    index, expected = KeyframeDatabase(), KeyframeDatabase()
-    for place, descriptors in places.items():
-        index.add(place, descriptors)
-        if place not in removed:
-            expected.add(place, descriptors)
-    index.remove([*removed[:1], 99])
-    index.remove(removed)
-    assert len(index) == len(expected) == 5 - len(removed)
-    assert index.query(common, k=5) == expected.query(common, k=5)
-    index.add(7, common)
-    expected.add(7, common)
-    assert index.query(common, k=5, exclude=[7]) == expected.query(common, k=5, exclude=[7])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.unpickled_code import CreatesFile
 from helpers.walls import CAMERA
 
 from v3d_torch.config.loading import load_config
@@ -126,25 +127,15 @@ def test_missing_file_and_folder_are_rejected(tmp_path: Path) -> None:
         load_map(tmp_path, CAMERA, CONFIG)
 
 
-class Exploit:
-    """Object that creates a file when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return (Path.touch, (self.path,))
-
-
 def test_foreign_files_are_rejected_without_unpickling(tmp_path: Path) -> None:
-    exploit = np.array([Exploit(tmp_path / "unpickled")], dtype=object)
+    exploit = np.array([CreatesFile(tmp_path / "unpickled")], dtype=object)
     np.savez(tmp_path / "objects.npz", about=exploit)
     np.savez(tmp_path / "other.npz", weights=np.zeros(3))
     np.savez(tmp_path / "json.npz", about=np.frombuffer(b"[1, 2]", dtype=np.uint8))
     np.save(tmp_path / "array.npy", np.zeros(3))
     (tmp_path / "text.txt").write_text("1 2 3\n")
     (tmp_path / "empty").write_bytes(b"")
-    (tmp_path / "pickled").write_bytes(pickle.dumps(Exploit(tmp_path / "unpickled")))
+    (tmp_path / "pickled").write_bytes(pickle.dumps(CreatesFile(tmp_path / "unpickled")))
     for path in sorted(tmp_path.iterdir()):
         with pytest.raises(InputError, match=rf"{path.name}: is not a map file or is damaged"):
             load_map(path, CAMERA, CONFIG)

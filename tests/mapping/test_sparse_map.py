@@ -1,4 +1,4 @@
-"""The sparse map: created landmarks, local map, edits, state; covisibility against plain sets."""
+"""The sparse map: created landmarks, local map, edits, readout, state; covisibility against plain sets."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import random
 
 import pytest
 import torch
+from helpers import rolling_camera
+from helpers.rolling_camera import KINECT, VELOCITY, observe_rolling, points_in_view
 from helpers.sparse_maps import CAMERA, EYE, features, make_map
 from torch import Tensor
 
@@ -15,7 +17,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
+from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, RollingShutterCompensation
 
 
 def insert(sparse_map: SparseMap, landmarks: list[int], T_cw: Tensor = EYE, seed: int = 0) -> Keyframe:
@@ -169,6 +171,53 @@ def test_landmarks_move_with_the_keyframe_that_created_them() -> None:
     directions = sparse_map.landmarks["direction"][20:] @ T_cw[:3, :3].T
     torch.testing.assert_close(directions, before[20:] / before[20:].norm(dim=1, keepdim=True), rtol=0, atol=1e-12)
     assert torch.equal(sparse_map.keyframes[1].T_cw, T_cw)
+
+
+# --- readout
+
+
+def map_of_two_keyframes(readout: Readout) -> SparseMap:
+    """Map of two keyframes that observed the same points while the camera moved."""
+    config = Config()
+    sparse_map = SparseMap(config.mapping, config.features, rolling_camera.CAMERA)
+    sparse_map.readout = readout
+    compensate = RollingShutterCompensation(rolling_camera.CAMERA)
+    observed = compensate(observe_rolling(points_in_view(), VELOCITY, KINECT.seconds), VELOCITY, readout)
+    first = sparse_map.insert_keyframe(0, 0.0, EYE, observed, unmatched(len(observed)))
+    sparse_map.insert_keyframe(1, 0.1, EYE, observed, first.landmarks)
+    return sparse_map
+
+
+def test_set_readout_moves_all_features_and_observations() -> None:
+    changed, expected = map_of_two_keyframes(Readout(0.010, 1.0)), map_of_two_keyframes(KINECT)
+    changed.set_readout(KINECT)
+    assert changed.readout == KINECT
+    torch.testing.assert_close(changed.observations["uv"], expected.observations["uv"], rtol=0, atol=1e-9)
+    for keyframe, expected_keyframe in zip(changed.keyframes, expected.keyframes, strict=True):
+        torch.testing.assert_close(keyframe.features.uv, expected_keyframe.features.uv, rtol=0, atol=1e-9)
+
+
+def test_update_features_moves_the_observations_of_that_keyframe_only() -> None:
+    sparse_map = map_of_two_keyframes(KINECT)
+    newest, others = sparse_map.keyframes[1], sparse_map.observations["keyframe"] == 0
+    before = sparse_map.observations["uv"].clone()
+    compensate = RollingShutterCompensation(rolling_camera.CAMERA)
+    sparse_map.update_features(newest, compensate(newest.features, VELOCITY / 2, KINECT))
+    assert torch.equal(sparse_map.observations["uv"][others], before[others])
+    feature = sparse_map.observations["feature"][~others]
+    assert torch.equal(sparse_map.observations["uv"][~others], newest.features.uv[feature])
+    assert torch.equal(sparse_map.observations["readout_jacobian"][~others], newest.features.readout_jacobian[feature])
+    assert not torch.equal(sparse_map.observations["uv"][~others], before[~others])
+
+
+def test_landmark_positions_are_those_of_active_landmarks() -> None:
+    sparse_map = map_of_two_keyframes(KINECT)
+    first = sparse_map.keyframes[0]
+    landmark_ids = torch.where(torch.arange(len(first.landmarks)) % 2 == 0, first.landmarks, -1)
+    sparse_map.landmarks["active"][landmark_ids[4]] = False
+    found, points = sparse_map.landmark_positions(landmark_ids)
+    assert found.tolist() == [i for i in range(0, len(landmark_ids), 2) if i != 4]
+    assert torch.equal(points, sparse_map.landmarks["point"][first.landmarks[found]])
 
 
 # --- state

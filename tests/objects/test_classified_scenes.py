@@ -293,11 +293,10 @@ def test_walker_missed_for_some_frames_keeps_id_and_mask(seed: int, missed: int)
 @SEEDS
 def test_missed_walker_is_predicted_for_the_maximum_time(seed: int) -> None:
     network = Network(missed=lambda thing, t: thing == 1 and 0.79 < t < 1.49)
-    nameless = (
-        "objects.free_space.min_unlabelled_area=100",
-    )  # otherwise the track continues as an unlabelled instance
+    # Without this minimum area, the track would continue as an unlabelled instance.
+    no_unlabelled = ("objects.free_space.min_unlabelled_area=100",)
     things = (RIGHT_CHAIR, person(walk(-0.8, 2.6, 0.9, 0.0), 0.2))
-    run = simulate(*things, seconds=1.8, seed=seed, network=network, overrides=nameless)
+    run = simulate(*things, seconds=1.8, seed=seed, network=network, overrides=no_unlabelled)
     (before,), (after,) = run.ids(1, until=0.8), run.ids(1, since=1.45)
     assert before != after
     last = max(frame.stamp for frame in run.frames for obj in frame.result.objects if obj.id == before)

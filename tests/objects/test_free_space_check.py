@@ -364,9 +364,9 @@ def test_disabled_check_compares_nothing() -> None:
 
 
 def test_view_with_guessed_pose_is_not_compared() -> None:
-    check, now = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
-    assert check(now, pose_known=False).appeared.numel() == 0
-    assert check(now).appeared.shape[0] == 2
+    check, current = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
+    assert check(current, pose_known=False).appeared.numel() == 0
+    assert check(current).appeared.shape[0] == 2
 
 
 @pytest.mark.parametrize("rate", [5, 10, 30])
@@ -375,15 +375,15 @@ def test_box_appears_for_the_time_of_each_baseline(rate: int) -> None:
     check = check_with()
     steps = {baseline: -(-round(baseline * 1000) * rate // 1000) for baseline in (0.3, 0.9)}  # whole frames
     for frame in range(4 * rate):
-        now = view(*[WITH_BOX] * (frame >= 2 * rate), at=frame / rate)
-        appeared = check(now).appeared
+        current = view(*[WITH_BOX] * (frame >= 2 * rate), at=frame / rate)
+        appeared = check(current).appeared
         for row, baseline in zip(appeared, (0.3, 0.9), strict=True):
             expected = 2 * rate <= frame < 2 * rate + steps[baseline]
             if frame < steps[baseline]:
                 assert row.isnan().all()
             else:
                 assert (box(row) == expected).all() and (around(row) == 0).all()
-        check.add_view(now)
+        check.add_view(current)
 
 
 def test_views_older_than_the_longest_baseline_are_dropped() -> None:
@@ -403,8 +403,8 @@ MOVES = [(0.3, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.5, 0.0, 0.0, 0.0), (0.1, -
 @pytest.mark.parametrize("twist", MOVES)
 def test_nothing_appears_in_a_static_room_under_camera_motion(twist: tuple[float, ...]) -> None:
     T_wc = se3_exp(torch.tensor(twist, dtype=torch.float64))
-    for then, now in ((HERE, T_wc), (T_wc, HERE)):
-        appeared = check_with(room(then, with_box=True, at=0.0))(room(now, with_box=True, at=0.3)).appeared[0]
+    for previous, current in ((HERE, T_wc), (T_wc, HERE)):
+        appeared = check_with(room(previous, with_box=True, at=0.0))(room(current, with_box=True, at=0.3)).appeared[0]
         assert not (appeared == 1).any()
         assert (appeared == 0).double().mean() > 0.6
 
@@ -412,9 +412,9 @@ def test_nothing_appears_in_a_static_room_under_camera_motion(twist: tuple[float
 @pytest.mark.parametrize("twist", MOVES)
 def test_new_box_appears_under_camera_motion(twist: tuple[float, ...]) -> None:
     T_wc = se3_exp(torch.tensor(twist, dtype=torch.float64))
-    now = room(T_wc, with_box=True, at=0.3)
-    appeared = check_with(room(HERE, with_box=False, at=0.0))(now).appeared[0]
-    on_box = now.depth[0, ::4, ::4] < 3.0
+    current = room(T_wc, with_box=True, at=0.3)
+    appeared = check_with(room(HERE, with_box=False, at=0.0))(current).appeared[0]
+    on_box = current.depth[0, ::4, ::4] < 3.0
     assert on_box.sum() > 80
     assert torch.equal(appeared == 1, on_box)
 

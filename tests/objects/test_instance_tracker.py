@@ -5,21 +5,17 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, replace
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import lstsq
 from torch import Tensor
 
 from v3d_torch.config import CloudConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.instance_tracker import InstanceTracker
-from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.track import Track
 from v3d_torch.types import Instances
 
@@ -245,38 +241,6 @@ def test_velocity_of_constant_motion_is_estimated() -> None:
     assert float((tracks[0].velocity - expected).norm()) < 0.2
 
 
-@settings(max_examples=20, deadline=None)
-@given(st.lists(st.tuples(st.floats(0.01, 0.5), st.floats(-0.3, 0.3), st.floats(0.02, 0.5)), min_size=1, max_size=8))
-def test_kalman_filter_equals_least_squares(steps: list[tuple[float, float, float]]) -> None:
-    """Oracle: SciPy solves for the states at all times at once, with whitened residuals."""
-    config = TrackerConfig(max_speed=1e6, acceleration_noise=1.5)
-    motion = ConstantVelocityKalmanFilter(config)
-    stamp = 7.0
-    motion.update(stamp, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), 0.1)
-    size = 2 * len(steps) + 2
-    rows, right = [np.eye(size)[0] / 0.1, np.eye(size)[1]], [1.0 / 0.1, 0.0]  # first position, first velocity
-    for k, (dt, error, sigma) in enumerate(steps):
-        stamp += dt
-        x = 1.0 + 0.8 * (stamp - 7.0) + error
-        motion.update(stamp, torch.tensor([x, 2.0, 3.0], dtype=torch.float64), sigma)
-        noise = 1.5**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        step = np.zeros((2, size))
-        step[:, 2 * k : 2 * k + 4] = [[-1, -dt, 1, 0], [0, -1, 0, 1]]
-        rows += [*np.linalg.inv(np.linalg.cholesky(noise)) @ step, np.eye(size)[2 * k + 2] / sigma]
-        right += [0.0, 0.0, x / sigma]
-    position, velocity = lstsq(np.stack(rows), np.array(right))[0][-2:]
-    expected = torch.tensor([position + 0.2 * velocity, 2.0, 3.0], dtype=torch.float64)
-    torch.testing.assert_close(motion.predict(stamp + 0.2), expected, rtol=0.0, atol=1e-7)
-    torch.testing.assert_close(motion.velocity, torch.tensor([velocity, 0.0, 0.0], dtype=torch.float64))
-
-
-def test_kalman_filter_limits_the_speed() -> None:
-    motion = ConstantVelocityKalmanFilter(TrackerConfig(max_speed=2.0))
-    for frame in range(10):
-        motion.update(0.1 * frame, torch.tensor([0.9, 0.0, 1.2], dtype=torch.float64) * frame, 0.05)
-    torch.testing.assert_close(motion.velocity, torch.tensor([1.2, 0.0, 1.6], dtype=torch.float64))
-
-
 def test_partial_view_changes_the_prediction_less() -> None:
     """Either the left half of a static board is visible, or the board has half the size: the same centroid."""
     half = Board(-0.1, width=0.2)
@@ -340,27 +304,6 @@ def test_object_emerging_from_occlusion_keeps_its_id() -> None:
     track_boards = BoardTracker()
     track_thrice(track_boards, part, cabinet)
     assert [(track.id, track.missed) for track in track_boards(whole)] == [(1, False)]
-
-
-def test_class_change_cost_decides_between_similar_overlaps() -> None:
-    """Track 0 overlaps instance 1 slightly more, but instance 1 has the class of track 1."""
-    unknown = torch.full((1, 2, 3), torch.nan)
-    overlap = torch.tensor([[[0.6, 0.7], [0.7, 0.6]]], dtype=torch.float64)
-    gate = torch.ones(1, 2, dtype=torch.float64)
-    same_class = torch.eye(2, dtype=torch.bool)[None]
-    assert match_instances(unknown, unknown, overlap, same_class, gate, 0.5).tolist() == [[0, 1]]
-    assert match_instances(unknown, unknown, overlap, same_class | True, gate, 0.5).tolist() == [[1, 0]]
-
-
-def test_distance_cost_is_limited_to_one_gate() -> None:
-    """Masks in position with centroids five gates away, against a swap that saves less than one gate in total."""
-    predicted = torch.tensor([[[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]], dtype=torch.float64)
-    observed = torch.tensor([[[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]]], dtype=torch.float64)
-    gate = torch.ones(1, 2, dtype=torch.float64)
-    everything = torch.ones(1, 2, 2, dtype=torch.bool)
-    overlap = torch.eye(2, dtype=torch.float64)[None] * 0.9
-    matched = match_instances(predicted, observed, overlap, ~everything, gate, 0.5)
-    assert matched.tolist() == [[0, 1]]
 
 
 @pytest.mark.parametrize("rate", [5.0, 30.0])
@@ -509,10 +452,10 @@ def test_detection_pair_spans_the_baseline() -> None:
         assert (pairs[0.0] is None) is (frame < 1)
         assert (pairs[0.3] is None) is (frame < 9)
     for baseline, span in ((0.0, 1 / 30), (0.3, 0.3)):
-        then, now = pairs[baseline] or (None, None)
-        assert now is track.newest
-        assert then is not None
-        assert now.stamp - then.stamp == pytest.approx(span)
+        previous, current = pairs[baseline] or (None, None)
+        assert current is track.newest
+        assert previous is not None
+        assert current.stamp - previous.stamp == pytest.approx(span)
 
 
 def test_detection_pair_needs_both_centroids() -> None:

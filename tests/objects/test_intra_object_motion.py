@@ -19,13 +19,13 @@ def body(raised: float = 0.0) -> Tensor:
 
 
 def test_convention_root_mean_nearest_neighbour_distance() -> None:
-    then = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
-    now = torch.tensor([[[0.0, 2.0, 0.0]]])
+    previous = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+    current = torch.tensor([[[0.0, 2.0, 0.0]]])
     # Mean squares (4 + 5) / 2 and 4 of the two directions; the root of half their sum.
-    distance, deforming = intra_object_motion(then, now, distance_threshold=2.0)
+    distance, deforming = intra_object_motion(previous, current, distance_threshold=2.0)
     assert distance.tolist() == pytest.approx([4.25**0.5]) and deforming.tolist() == [True]
-    assert intra_object_motion(then, now, 2.1).deforming.tolist() == [False]
-    at_the_threshold = intra_object_motion(now, now + torch.tensor([0.5, 0.0, 0.0]), 0.5)
+    assert intra_object_motion(previous, current, 2.1).deforming.tolist() == [False]
+    at_the_threshold = intra_object_motion(current, current + torch.tensor([0.5, 0.0, 0.0]), 0.5)
     assert at_the_threshold.deforming.tolist() == [True]
 
 
@@ -51,10 +51,10 @@ def test_camera_motion_is_compensated_by_the_transform() -> None:
 
 
 def test_equal_clouds_have_distance_0_and_empty_clouds_nan() -> None:
-    then = body().repeat(2, 1, 1).requires_grad_()
-    valid = torch.ones(then.shape[:2], dtype=torch.bool)
+    previous = body().repeat(2, 1, 1).requires_grad_()
+    valid = torch.ones(previous.shape[:2], dtype=torch.bool)
     valid[1] = False
-    distance, deforming = intra_object_motion(then, body().repeat(2, 1, 1), 0.025, valid)
+    distance, deforming = intra_object_motion(previous, body().repeat(2, 1, 1), 0.025, valid)
     assert distance[0] == 0 and distance[1].isnan() and not deforming.any()
     distance[0].backward()
-    assert then.grad is not None and not then.grad.any()  # the root has an infinite slope at 0
+    assert previous.grad is not None and not previous.grad.any()  # the root has an infinite slope at 0

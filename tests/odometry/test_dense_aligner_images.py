@@ -78,11 +78,9 @@ def test_motion_between_frames_of_the_demo(
 
 
 @pytest.fixture(scope="module")
-def fr1_rpy(v3d_data: Path) -> tuple[TUMSequence, Tensor]:
+def fr1_rpy(real_sequence: Callable[[str], Path]) -> tuple[TUMSequence, Tensor]:
     """TUM's fr1_rpy and the true pose T_wc of each frame; its colour stamps lag 12 ms behind the motion capture."""
-    if not (v3d_data / "fr1_rpy").is_dir():
-        pytest.skip(f"no real data: {v3d_data / 'fr1_rpy'} is missing")
-    sequence = TUMSequence(v3d_data / "fr1_rpy")
+    sequence = TUMSequence(real_sequence("fr1_rpy"))
     truth = sequence.groundtruth
     assert truth is not None
     true_stamps = truth.stamps.numpy()

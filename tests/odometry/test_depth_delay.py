@@ -15,9 +15,8 @@ from v3d_torch.odometry.depth_delay import DepthDelayCompensation
 
 CAMERA = PinholeCamera(525.0, 520.0, 320.0, 240.0)
 VELOCITY = torch.tensor([0.5, -0.4, 0.6, 0.9, -1.1, 1.3], dtype=torch.float64)  # m/s and rad/s
-WALL = torch.tensor(
-    [0.4, 0.3, 1.0, 3.0], dtype=torch.float64
-)  # plane 0.4 x + 0.3 y + z = 3 m in the frame of the colour image
+WALL = torch.tensor([0.4, 0.3, 1.0, 3.0], dtype=torch.float64)
+"""Plane 0.4 x + 0.3 y + z = 3 m in the frame of the colour image."""
 
 
 def wall_depth(T_depth_colour: Tensor) -> Tensor:

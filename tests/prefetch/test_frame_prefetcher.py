@@ -8,6 +8,7 @@ from contextlib import closing
 
 import pytest
 import torch
+from helpers.first_frames import FirstFrames
 
 from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
 from v3d_torch.config.loading import load_config
@@ -122,14 +123,8 @@ def test_closing_early_stops_the_thread(demo: RGBDSequence) -> None:
 
 
 def test_pipeline_prefetches_as_configured(demo: RGBDSequence) -> None:
-    class Short:
-        camera, name, groundtruth = demo.camera, "short", None
-
-        def __iter__(self) -> Iterator[RGBDFrame]:
-            return (demo[index] for index in range(3))
-
     for prefetch in (False, True):
         segmenter = RecordingSegmenter()
         config = NO_NETWORK.model_copy(update={"prefetch": prefetch})
-        Pipeline(Short(), V3DSLAM(demo.camera, segmenter, config))()
+        Pipeline(FirstFrames(demo, 3), V3DSLAM(demo.camera, segmenter, config))()
         assert (threading.current_thread().name in segmenter.threads) is not prefetch

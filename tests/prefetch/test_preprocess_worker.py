@@ -81,6 +81,23 @@ def test_worker_of_a_checked_system_gives_the_same_results(demo: StoredSequence)
     assert preprocessed is not None and are_identical(without_times(preprocessed), without_times(expected))
 
 
+class ShortIterator(FrameIterator):
+    """Iterator over the first frames of a sequence.
+
+    Args:
+        sequence: Sequence of the frames.
+        count: Number of frames.
+    """
+
+    def __init__(self, sequence: StoredSequence, count: int) -> None:
+        super().__init__(sequence, 0)
+        self._count = count
+
+    @property
+    def remaining(self) -> int:
+        return max(self._count - self.index, 0)
+
+
 @pytest.fixture
 def worker_for_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
     """Start a second process for any number of frames."""
@@ -101,12 +118,7 @@ def track_all(
 
 @pytest.mark.usefixtures("worker_for_any_length")
 def test_trajectory_with_a_worker_equals_that_without(demo: StoredSequence) -> None:
-    class Short(FrameIterator):
-        @property
-        def remaining(self) -> int:
-            return max(6 - self.index, 0)
-
-    slam, tracked = track_all(SMALL, Short(demo, 0), demo)
+    slam, tracked = track_all(SMALL, ShortIterator(demo, 6), demo)
     plain, _ = track_all(SMALL, (demo[index] for index in range(6)), demo)
     assert [preprocessed.frame.index for preprocessed in tracked] == list(range(6))
     assert torch.equal(slam.poses.trajectory().T_wc, plain.poses.trajectory().T_wc)
@@ -179,11 +191,6 @@ def test_close_ends_the_process(demo: StoredSequence) -> None:
 def test_no_worker_is_started_without_benefit(
     demo: StoredSequence, monkeypatch: pytest.MonkeyPatch, cores: int, ahead: bool, frames: int
 ) -> None:
-    class Short(FrameIterator):
-        @property
-        def remaining(self) -> int:
-            return max(frames - self.index, 0)
-
     def fail(slam: V3DSLAM, sequence: StoredSequence) -> PreprocessWorker:
         raise AssertionError
 
@@ -191,7 +198,7 @@ def test_no_worker_is_started_without_benefit(
     monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "_available_cores", lambda: cores)
     monkeypatch.setattr(v3d_torch.prefetch.frame_prefetcher, "PreprocessWorker", fail)
     slam = V3DSLAM(demo.camera, config=NO_NETWORK)
-    with closing(FramePrefetcher(Short(demo, 0), slam, ahead=ahead)) as prefetcher:
+    with closing(FramePrefetcher(ShortIterator(demo, frames), slam, ahead=ahead)) as prefetcher:
         for preprocessed in islice(prefetcher, 4):
             slam.track(preprocessed)
 

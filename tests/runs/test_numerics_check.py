@@ -231,9 +231,10 @@ def test_checked_demo_with_people_gives_the_same_results(moment: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["walkers_room", "crowd_rpy"])
-def test_checked_recorded_images_give_the_same_results(v3d_data: Path, name: str) -> None:
-    sequence = load_sequence(name, data_root=v3d_data)
-    plain, checked = (run_frames(system, sequence, v3d_data / name / "masks", 8) for system in (V3DSLAM, CheckedSLAM))
+def test_checked_recorded_images_give_the_same_results(real_sequence: Callable[[str], Path], name: str) -> None:
+    folder = real_sequence(name)
+    sequence = load_sequence(str(folder))
+    plain, checked = (run_frames(system, sequence, folder / "masks", 8) for system in (V3DSLAM, CheckedSLAM))
     assert plain == checked
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -87,8 +88,8 @@ def test_unusable_id_images_are_rejected_by_path(tmp_path: Path) -> None:
         MaskFolder(tmp_path)(frame(0, 0.0))
 
 
-def test_every_frame_of_a_real_sequence_has_an_id_image(v3d_data: Path) -> None:
-    folder = v3d_data / "crowd_static"
+def test_every_frame_of_a_real_sequence_has_an_id_image(real_sequence: Callable[[str], Path]) -> None:
+    folder = real_sequence("crowd_static")
     pairs = [line.split() for line in (folder / "associations.txt").read_text().splitlines() if line[:1] != "#"]
     masks = MaskFolder(folder / "masks")
     stamps = sorted(float(field) for pair in pairs for field in pair[:3:2])[::2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -154,10 +155,10 @@ def test_onnx_files_without_a_raw_head_are_rejected(tmp_path: Path) -> None:
         YOLOSegmenter(SegmentationConfig(), weights=tmp_path / "gone.onnx")
 
 
-def test_people_in_a_real_sequence_are_detected(v3d_data: Path) -> None:
+def test_people_in_a_real_sequence_are_detected(real_sequence: Callable[[str], Path]) -> None:
     """Recall of the pixels of walking people in the masks of the recording, every 20th frame."""
+    folder = real_sequence("crowd_static")
     segmenter = YOLOSegmenter(SegmentationConfig(threads=1))
-    folder = v3d_data / "crowd_static"
     masks = sorted((folder / "masks").glob("*.png"))[::20]
     images = sorted((folder / "rgb").glob("*"))[::20]
     detected = total = 0

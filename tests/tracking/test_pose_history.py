@@ -1,150 +1,18 @@
-"""Pose history and motion model: prediction, lost frames, poses relative to keyframes."""
+"""Pose history: lost frames, poses relative to keyframes, status."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from helpers.moving_camera import EYE, TWIST, Camera, frame_pose, keyframe, twists, walk
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from v3d_torch.features.features import Features
-from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.odometry.odometry import CameraMotion
-from v3d_torch.tracking.motion_model import MotionModel
-from v3d_torch.tracking.pose_history import PoseHistory
-from v3d_torch.types import FramePose, TrackingStatus, Trajectory
-
-EYE = torch.eye(4, dtype=torch.float64)
-TWIST = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.4, -0.3], dtype=torch.float64)  # m/s and rad/s
-
-twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(lambda v: torch.tensor(v, dtype=torch.float64))
-
-
-def keyframe(T_cw: Tensor = EYE, stamp: float = 0.0, landmarks: int = 0, disconnected: bool = False) -> Keyframe:
-    none = torch.zeros(0, dtype=torch.int64)
-    empty = Features(torch.zeros(0, 2), torch.zeros(0, 2).long(), none.double(), none, torch.zeros(0, 32).byte())
-    return Keyframe(0, 0, stamp, T_cw, empty, torch.arange(landmarks), disconnected)
-
-
-def frame_pose(
-    T_cw: Tensor, status: TrackingStatus = TrackingStatus.TRACKED, landmarks: tuple[int, ...] = ()
-) -> FramePose:
-    return FramePose(status, T_cw, torch.tensor(landmarks, dtype=torch.int64))
-
-
-class Camera:
-    """Pose history and motion model of one camera, updated together as `V3DSLAM.track` does."""
-
-    def __init__(self) -> None:
-        self.poses = PoseHistory()
-        self.model = MotionModel()
-
-    def predict(self, stamp: float) -> Tensor:
-        return self.model.predict(self.poses).pose_at(stamp)
-
-    def append(
-        self,
-        stamp: float,
-        pose: FramePose,
-        reference: Keyframe | None,
-        T_cp: Tensor | None = None,
-        new: Keyframe | None = None,
-    ) -> Tensor | None:
-        """Append a frame; ``T_cp`` is the measured motion since the previous one, None if it is not measured."""
-        predicted, pairs = self.model.predict(self.poses), torch.zeros(0, 2, dtype=torch.int64)
-        if T_cp is None:
-            motion = CameraMotion(predicted.motion_until(stamp), predicted.velocity, pairs, is_measured=False)
-        else:
-            motion = CameraMotion(T_cp, se3_log(T_cp) / (stamp - self.poses.stamp), pairs, is_measured=True)
-        self.model.update(self.poses, stamp, pose, motion)
-        return self.poses.append(stamp, pose, motion, reference, new)
-
-    def trajectory(self) -> Trajectory:
-        return self.poses.trajectory()
-
-
-def walk(stamps: list[float], lost: tuple[int, ...] = (), reference: Keyframe | None = None) -> Camera:
-    """Frames of a camera with constant twist; lost frames get their predicted poses."""
-    camera = Camera()
-    for index, stamp in enumerate(stamps):
-        if index in lost:
-            camera.append(stamp, frame_pose(camera.predict(stamp), TrackingStatus.LOST), reference)
-        else:
-            camera.append(stamp, frame_pose(se3_exp(TWIST * stamp)), reference)
-    return camera
-
-
-# --- prediction
-
-
-def test_history_without_frames_is_at_the_origin() -> None:
-    camera = Camera()
-    assert camera.poses.status is None and camera.poses.statuses == []
-    assert torch.equal(camera.poses.T_cw, EYE)
-    assert torch.equal(camera.predict(3.0), EYE)
-
-
-@settings(deadline=None, max_examples=30)
-@given(twists, st.floats(0.01, 0.1), st.floats(0.01, 0.2))
-def test_prediction_of_constant_velocity_is_exact(twist: Tensor, step: float, ahead: float) -> None:
-    camera = Camera()
-    for stamp in (0.0, step):
-        camera.append(stamp, frame_pose(se3_exp(twist * stamp)), None)
-    torch.testing.assert_close(camera.predict(step + ahead), se3_exp(twist * (step + ahead)), rtol=0, atol=1e-9)
-
-
-def test_convention_velocity_acts_in_the_camera_frame() -> None:
-    """A camera that rotates in place far from the origin is predicted to stay there."""
-    T_wc = EYE.clone()
-    T_wc[:3, 3] = torch.tensor([10.0, -5.0, 3.0])
-    turn = torch.tensor([0, 0, 0, 0, 0.5, 0], dtype=torch.float64)
-    camera = Camera()
-    for stamp in (0.0, 0.1):
-        camera.append(stamp, frame_pose(invert(T_wc @ se3_exp(turn * stamp))), None)
-    predicted = invert(camera.predict(0.2))
-    torch.testing.assert_close(predicted[:3, 3], T_wc[:3, 3], rtol=0, atol=1e-9)
-    torch.testing.assert_close(predicted, T_wc @ se3_exp(turn * 0.2), rtol=0, atol=1e-9)
-
-
-def test_prediction_extrapolates_at_most_a_fifth_of_a_second() -> None:
-    camera = walk([0.0, 0.1])
-    torch.testing.assert_close(camera.predict(5.0), se3_exp(TWIST * 0.3), rtol=0, atol=1e-9)
-
-
-def test_prediction_of_a_lost_camera_continues_shortly_and_then_stands_still() -> None:
-    stamps = [k / 30 for k in range(40)]
-    camera = walk(stamps[:10])
-    positions = []
-    for stamp in stamps[10:]:
-        positions.append(invert(camera.predict(stamp))[:3, 3])
-        camera.append(stamp, frame_pose(camera.predict(stamp), TrackingStatus.LOST), None)
-    steps = torch.stack(positions).diff(dim=0).norm(dim=1)
-    speed = float(TWIST[:3].norm())
-    assert steps[:4].min() > 0.9 * speed / 30  # continues
-    assert (steps[8:] < 1e-12).all()  # stands still
-    assert steps.sum() < 0.3 * speed
-
-
-def test_velocity_of_a_lost_camera_follows_measured_motions() -> None:
-    """The rolling shutter is compensated with this velocity."""
-    camera, step = walk([0.0, 0.1]), se3_exp(-0.1 * TWIST)
-    for k in range(2, 20):
-        camera.append(0.1 * k, frame_pose(step @ camera.poses.T_cw, TrackingStatus.LOST), None, step)
-        torch.testing.assert_close(camera.model.velocity, -TWIST, rtol=0, atol=1e-9)
-
-
-def test_jump_of_a_relocalised_camera_is_not_a_velocity() -> None:
-    camera = walk([0.0, 1 / 30], lost=())
-    for k in range(2, 20):
-        camera.append(k / 30, frame_pose(camera.poses.T_cw, TrackingStatus.LOST), None)
-    away = se3_exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64))
-    camera.append(20 / 30, frame_pose(away), None)
-    torch.testing.assert_close(camera.predict(21 / 30), away, rtol=0, atol=1e-12)
-
+from v3d_torch.types import TrackingStatus
 
 # --- lost frames
 

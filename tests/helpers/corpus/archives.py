@@ -99,6 +99,18 @@ def content_of(content: bytes) -> Damage:
     return all_of(lambda place: (place.root / "archive.tgz").write_bytes(content), SEQ)  # type: ignore[arg-type, return-value]
 
 
+UNSAFE = (
+    "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is not a"
+    " plain file (...); get it from another source"
+)
+NO_SEQUENCE = (
+    "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
+    " archive from another source"
+)
+INCOMPLETE = (
+    "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download it again"
+)
+
 CASES = [
     Case(name, make, ends, served)
     for name, make, ends in (
@@ -108,58 +120,37 @@ CASES = [
         (
             "file outside the folder, by ..",
             archive(member("../outside.txt")),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
-                " not a plain file (...); get it from another source"
-            ),
+            Fails(UNSAFE),
         ),
         (
             "file outside the folder, by an absolute path",
             archive(member("/outside.txt", size=3)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
-                " archive from another source"
-            ),
+            Fails(NO_SEQUENCE),
         ),
         (
             "symlink to outside the folder",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "../../..")),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
-                " not a plain file (...); get it from another source"
-            ),
+            Fails(UNSAFE),
         ),
         (
             "symlink to an absolute path",
             archive(member(f"{NAME}/masks", tarfile.SYMTYPE, "/etc")),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
-                " not a plain file (...); get it from another source"
-            ),
+            Fails(UNSAFE),
         ),
         (
             "hard link to outside the folder",
             archive(member(f"{NAME}/x", tarfile.LNKTYPE, "../../etc/passwd")),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
-                " not a plain file (...); get it from another source"
-            ),
+            Fails(UNSAFE),
         ),
         (
             "device file",
             archive(member(f"{NAME}/zero", tarfile.CHRTYPE)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
-                " not a plain file (...); get it from another source"
-            ),
+            Fails(UNSAFE),
         ),
         (
             "named pipe",
             archive(member(f"{NAME}/rgb.pipe", tarfile.FIFOTYPE)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is unsafe, a member leads outside or is"
-                " not a plain file (...); get it from another source"
-            ),
+            Fails(UNSAFE),
         ),
         (
             "member with a size of a petabyte",
@@ -180,82 +171,52 @@ CASES = [
         (
             "truncated gzip",
             all_of(archive(), changed(first_half)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "truncated xz",
             all_of(archive(kind="w:xz"), changed(first_half)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "truncated bzip2",
             all_of(archive(kind="w:bz2"), changed(first_half)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "wrong byte in gzip",
             all_of(archive(), changed(flip_byte)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "wrong byte in xz",
             all_of(archive(kind="w:xz"), changed(flip_byte)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "wrong byte in bzip2",
             all_of(archive(kind="w:bz2"), changed(flip_byte)),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "empty file",
             content_of(b""),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "web page",
             content_of(b"<html>404</html>" * 100),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "gzip of an empty file",
             content_of(gzip.compress(b"")),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: is not a complete tar archive (...); download"
-                " it again"
-            ),
+            Fails(INCOMPLETE),
         ),
         (
             "archive without a sequence",
             all_of(lambda p: shutil.rmtree(p.folder), lambda p: p.folder.mkdir(), archive()),
-            Fails(
-                "{root}/data/rgbd_dataset_freiburg3_walking_xyz.tgz: contains no rgb.txt and depth.txt; get the"
-                " archive from another source"
-            ),
+            Fails(NO_SEQUENCE),
         ),
     )
 ]

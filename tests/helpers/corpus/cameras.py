@@ -27,6 +27,9 @@ def bomb() -> str:
     return "\n".join(lines) + "\n"
 
 
+NO_CAMERA = "{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"
+INVALID_YAML = "{seq}/camera.yaml: is not valid YAML (...); repair it"
+
 CASES = [
     Case(
         "missing camera file",
@@ -39,38 +42,38 @@ CASES = [
     Case(
         "empty file",
         write(YAML, ""),
-        Fails("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Fails(NO_CAMERA),
     ),
-    Case("invalid YAML", write(YAML, "fx: {525.0\n"), Fails("{seq}/camera.yaml: is not valid YAML (...); repair it")),
+    Case("invalid YAML", write(YAML, "fx: {525.0\n"), Fails(INVALID_YAML)),
     Case(
         "YAML that runs a command",
         write(YAML, "!!python/object/apply:os.system ['touch /tmp/owned']\n"),
-        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "YAML with nested aliases",
         write(YAML, bomb() + "fx: *a8\n"),
-        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "YAML with an anchor",
         write(YAML, CAMERA.replace(f"fx: {FOCAL}", f"fx: &f {FOCAL}").replace(f"fy: {FOCAL}", "fy: *f")),
-        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "YAML with an invalid date",
         field("fx", "2024-99-99"),
-        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "deeply nested YAML",
         write(YAML, 3000 * "[" + 3000 * "]"),
-        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "list instead of fields",
         write(YAML, "- 525.0\n- 525.0\n"),
-        Fails("{seq}/camera.yaml: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"),
+        Fails(NO_CAMERA),
     ),
     Case(
         "missing field",
@@ -83,7 +86,7 @@ CASES = [
     Case(
         "duplicate field",
         edit(YAML, lambda content: content + b"fx: 100\n"),
-        Fails("{seq}/camera.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "unknown field",

@@ -73,6 +73,18 @@ class Fails:
         return re.fullmatch(".*".join(parts), text) is not None
 
 
+def fails_at_frame(frame: int, message: str) -> Fails:
+    """Return the expected end of a run that fails at a frame; the results of the frames before are written."""
+    resume = "; resume with --resume {out}" if frame else ""
+    end = f" (the results of the {frame} frames before are in {{out}}{resume})"
+    return Fails(message + end, saved_poses=frame)
+
+
+def fails_after_run(message: str) -> Fails:
+    """Return the expected end of a run that fails after its last frame; all results are written."""
+    return Fails(message + " (the results are in {out})", saved_poses=FRAMES)
+
+
 @dataclass(frozen=True)
 class Case:
     """A damaged sequence and the expected end of its run."""

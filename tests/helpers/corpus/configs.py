@@ -16,6 +16,8 @@ def setting(value: str) -> Damage:
     return add_options("--set", value)
 
 
+INVALID_YAML = "{seq}/own.yaml: is not valid YAML (...); repair it"
+
 CASES = [
     Case("empty file", config(""), Succeeds()),
     Case("comments only", config("# nothing\n"), Succeeds()),
@@ -64,52 +66,50 @@ CASES = [
         config("seed: 1\n".encode("utf-16")),
         Fails("{seq}/own.yaml: is not a UTF-8 text file; convert it to UTF-8 (a configuration is a YAML file)"),
     ),
-    Case("invalid YAML", config("objects: {voting\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")),
-    Case("tabs", config("objects:\n\tvoting: 1\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")),
+    Case("invalid YAML", config("objects: {voting\n"), Fails(INVALID_YAML)),
+    Case("tabs", config("objects:\n\tvoting: 1\n"), Fails(INVALID_YAML)),
     Case(
         "YAML tag that runs a command",
         config("!!python/object/apply:os.system ['touch /tmp/owned']\n"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "YAML tag that creates an object",
         config("seed: !!python/object:v3d_torch.config.schema.Config {}\n"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "unknown YAML tag",
         config("seed: !number 3\n"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "nested YAML aliases",
         config(bomb() + "seed: *a8\n"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "recursive YAML anchor",
         config("objects: &o\n  voting: *o\n"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "YAML nested 3000 times",
         config(3000 * "[" + 3000 * "]"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
     Case(
         "number with 5000 digits",
         config("seed: " + 5000 * "1"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
-    Case("invalid date", config("seed: 2024-99-99\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")),
+    Case("invalid date", config("seed: 2024-99-99\n"), Fails(INVALID_YAML)),
     Case(
         "invalid Boolean",
         config("seed: !!bool perhaps\n"),
-        Fails("{seq}/own.yaml: is not valid YAML (...); repair it"),
+        Fails(INVALID_YAML),
     ),
-    Case(
-        "two documents", config("seed: 1\n---\nseed: 2\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")
-    ),
+    Case("two documents", config("seed: 1\n---\nseed: 2\n"), Fails(INVALID_YAML)),
     Case(
         "list", config("- seed\n"), Fails("{seq}/own.yaml: contains a list; a configuration is a mapping of sections")
     ),
@@ -120,7 +120,7 @@ CASES = [
         Fails("{seq}/own.yaml: unknown key objects.voting.vote_treshold; did you mean objects.voting.vote_threshold?"),
     ),
     Case("key that is a number", config("1: 2\n"), Fails("{seq}/own.yaml: unknown key 1; did you mean tracking?")),
-    Case("key that is a list", config("? [a, b]\n: 2\n"), Fails("{seq}/own.yaml: is not valid YAML (...); repair it")),
+    Case("key that is a list", config("? [a, b]\n: 2\n"), Fails(INVALID_YAML)),
     Case(
         "value instead of a section",
         config("objects: 3\n"),

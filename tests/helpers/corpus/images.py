@@ -13,7 +13,18 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from helpers.corpus.base import HEIGHT, STAMPS, WIDTH, camera_position, colour, depth, png
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, all_of, edit, first_half, write
+from helpers.corpus.case import (
+    Case,
+    Damage,
+    Fails,
+    Succeeds,
+    Workspace,
+    all_of,
+    edit,
+    fails_at_frame,
+    first_half,
+    write,
+)
 
 RGB = [f"rgb/{stamp}.png" for stamp in STAMPS]
 DEPTH = [f"depth/{stamp}.png" for stamp in STAMPS]
@@ -103,65 +114,39 @@ CASES = [
     Case(
         "colour image truncated",
         edit(RGB[5], first_half),
-        Fails(
-            "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; resume with --resume {out})",
-            saved_poses=5,
-        ),
+        fails_at_frame(5, "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "depth image truncated",
         edit(DEPTH[5], first_half),
-        Fails(
-            "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; resume with --resume {out})",
-            saved_poses=5,
-        ),
+        fails_at_frame(5, "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "colour image with a flipped bit",
         edit(RGB[5], flip_bit),
-        Fails(
-            "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; resume with --resume {out})",
-            saved_poses=5,
-        ),
+        fails_at_frame(5, "{seq}/rgb/1305031102.500000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "depth image with a flipped bit",
         edit(DEPTH[5], flip_bit),
-        Fails(
-            "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again (the results"
-            " of the 5 frames before are in {out}; resume with --resume {out})",
-            saved_poses=5,
-        ),
+        fails_at_frame(5, "{seq}/depth/1305031102.500000.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "empty colour image",
         write(RGB[5], ""),
-        Fails(
-            "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results of the 5 frames before are in {out}; resume with --resume {out})",
-            saved_poses=5,
-        ),
+        fails_at_frame(5, "{seq}/rgb/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "empty depth image",
         write(DEPTH[5], ""),
-        Fails(
-            "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results of the 5 frames before are in {out}; resume with --resume {out})",
-            saved_poses=5,
+        fails_at_frame(
+            5, "{seq}/depth/1305031102.500000.png: is not a PNG, JPEG or TIFF image; copy or export it again"
         ),
     ),
     Case(
         "web page instead of an image",
         write(RGB[2], PAGE),
-        Fails(
-            "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results of the 2 frames before are in {out}; resume with --resume {out})",
-            saved_poses=2,
-        ),
+        fails_at_frame(2, "{seq}/rgb/1305031102.200000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
     Case(
         "colour and depth swapped in the lists",
@@ -174,21 +159,19 @@ CASES = [
     Case(
         "depth image instead of a colour image",
         write(RGB[4], png(depth())),
-        Fails(
+        fails_at_frame(
+            4,
             "{seq}/rgb/1305031102.400000.png: is a 16-bit depth image, expected a colour image; check that"
-            " colour and depth are not swapped (the results of the 4 frames before are in {out}; resume with"
-            " --resume {out})",
-            saved_poses=4,
+            " colour and depth are not swapped",
         ),
     ),
     Case(
         "colour image instead of a depth image",
         write(DEPTH[4], png(colour(0))),
-        Fails(
-            "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour"
-            " and depth are not swapped (the results of the 4 frames before are in {out}; resume with --resume"
-            " {out})",
-            saved_poses=4,
+        fails_at_frame(
+            4,
+            "{seq}/depth/1305031102.400000.png: is a colour image, expected a depth image; check that colour and"
+            " depth are not swapped",
         ),
     ),
     Case(
@@ -202,10 +185,10 @@ CASES = [
     Case(
         "8-bit depth in one frame",
         write(DEPTH[4], png((depth() >> 8).astype(np.uint8))),
-        Fails(
+        fails_at_frame(
+            4,
             "{seq}/depth/1305031102.400000.png: is an 8-bit image, depth needs 16 bits; export depth again"
-            " without rescaling (the results of the 4 frames before are in {out}; resume with --resume {out})",
-            saved_poses=4,
+            " without rescaling",
         ),
     ),
     Case(
@@ -284,49 +267,46 @@ CASES = [
     Case(
         "one colour image of another size",
         write(RGB[3], png(SMALL)),
-        Fails(
+        fails_at_frame(
+            3,
             "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
-            " that is registered to the colour image (the results of the 3 frames before are in {out}; resume"
-            " with --resume {out})",
-            saved_poses=3,
+            " that is registered to the colour image",
         ),
     ),
     Case(
         "one depth image of another size",
         write(DEPTH[3], png(depth()[::2, ::2])),
-        Fails(
+        fails_at_frame(
+            3,
             "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
-            " that is registered to the colour image (the results of the 3 frames before are in {out}; resume"
-            " with --resume {out})",
-            saved_poses=3,
+            " that is registered to the colour image",
         ),
     ),
     Case(
         "one rotated depth image",
         write(DEPTH[3], png(depth().T.copy())),
-        Fails(
+        fails_at_frame(
+            3,
             "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
-            " that is registered to the colour image (the results of the 3 frames before are in {out}; resume"
-            " with --resume {out})",
-            saved_poses=3,
+            " that is registered to the colour image",
         ),
     ),
     Case(
         "colour image with a header of 40000 x 40000 pixels",
         write(RGB[3], bomb(40000, 40000, 8, 2)),
-        Fails(
+        fails_at_frame(
+            3,
             "{seq}/rgb/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
-            " export it again (the results of the 3 frames before are in {out}; resume with --resume {out})",
-            saved_poses=3,
+            " export it again",
         ),
     ),
     Case(
         "depth image with a header of 40000 x 40000 pixels",
         write(DEPTH[3], bomb(40000, 40000, 16, 0)),
-        Fails(
-            "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy"
-            " or export it again (the results of the 3 frames before are in {out}; resume with --resume {out})",
-            saved_poses=3,
+        fails_at_frame(
+            3,
+            "{seq}/depth/1305031102.300000.png: has more than 64 million pixels according to its header; copy or"
+            " export it again",
         ),
     ),
     Case(

@@ -7,7 +7,19 @@ from collections.abc import Callable
 import numpy as np
 
 from helpers.corpus.base import CAMERA, FOCAL, FRAMES, HEIGHT, NOISE, STAMPS, WIDTH, camera_position, colour, depth, png
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half, write
+from helpers.corpus.case import (
+    Case,
+    Damage,
+    Fails,
+    Succeeds,
+    Workspace,
+    add_options,
+    all_of,
+    fails_after_run,
+    fails_at_frame,
+    first_half,
+    write,
+)
 
 MILLIMETRES = png((depth() // 5).astype(np.uint16))
 CAMERA_MATRIX = f"{FOCAL} 0 {(WIDTH - 1) / 2} 0\n0 {FOCAL} {(HEIGHT - 1) / 2} 0\n0 0 1 0\n0 0 0 1\n"
@@ -102,18 +114,12 @@ CASES = [
     Case(
         "ScanNet, truncated pose",
         changed(scannet(), "pose/3.txt", first_half),
-        Fails(
-            "{root}/take/pose/3.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run("{root}/take/pose/3.txt: is not a 3x3 or 4x4 matrix; copy it again"),
     ),
     Case(
         "ScanNet, pose that is not a rigid transform",
         changed(scannet(), "pose/3.txt", lambda content: 4 * b"1 2 3 4\n"),
-        Fails(
-            "{root}/take/pose/3.txt: is not a valid rigid transform; copy it again (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run("{root}/take/pose/3.txt: is not a valid rigid transform; copy it again"),
     ),
     Case(
         "ScanNet, truncated camera",
@@ -148,19 +154,12 @@ CASES = [
     Case(
         "7-Scenes, pose of words",
         changed(seven_scenes(), "frame-000003.pose.txt", lambda content: b"lost\n"),
-        Fails(
-            "{root}/take/frame-000003.pose.txt: is not a 3x3 or 4x4 matrix; copy it again (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run("{root}/take/frame-000003.pose.txt: is not a 3x3 or 4x4 matrix; copy it again"),
     ),
     Case(
         "7-Scenes, truncated image",
         changed(seven_scenes(), "frame-000003.depth.png", first_half),
-        Fails(
-            "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again (the"
-            " results of the 3 frames before are in {out}; resume with --resume {out})",
-            saved_poses=3,
-        ),
+        fails_at_frame(3, "{root}/take/frame-000003.depth.png: is truncated or damaged; copy or download it again"),
     ),
     Case(
         "7-Scenes, colour without depth",
@@ -170,10 +169,8 @@ CASES = [
     Case(
         "ICL-NUIM, truncated ground truth",
         icl_nuim("1 2 3\n"),
-        Fails(
-            "{seq}/traj0.gt.freiburg: line 1 is '1 2 3', expected timestamp tx ty tz qx qy qz qw; correct or"
-            " remove it (the results are in {out})",
-            saved_poses=8,
+        fails_after_run(
+            "{seq}/traj0.gt.freiburg: line 1 is '1 2 3', expected timestamp tx ty tz qx qy qz qw; correct or remove it"
         ),
     ),
     Case(

@@ -12,7 +12,18 @@ from pathlib import Path
 from unittest.mock import patch
 
 from helpers.corpus.base import STAMPS
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, write
+from helpers.corpus.case import (
+    Case,
+    Damage,
+    Fails,
+    Succeeds,
+    Workspace,
+    add_options,
+    all_of,
+    fails_after_run,
+    fails_at_frame,
+    write,
+)
 from helpers.corpus.privileges import without_root_rights
 from v3d_torch.datasets.tum import TUMSequence
 
@@ -181,31 +192,23 @@ CASES = [
     Case(
         "sequence removed during the run",
         lambda place: None,
-        Fails(
-            "{seq}/rgb/1305031102.400000.png: is listed but does not exist; copy the whole sequence again (the"
-            " results of the 4 frames before are in {out}; resume with --resume {out})",
-            saved_poses=4,
+        fails_at_frame(
+            4, "{seq}/rgb/1305031102.400000.png: is listed but does not exist; copy the whole sequence again"
         ),
         lambda place: at_frame(4, lambda: shutil.rmtree(place.folder)),
     ),
     Case(
         "bug in the program at a frame",
         lambda place: None,
-        Fails(
-            "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
-            " (the results of the 4 frames before are in {out}; resume with --resume {out})",
-            saved_poses=4,
+        fails_at_frame(
+            4, "the program failed with ZeroDivisionError: an error of the program; report it with the run.log"
         ),
         lambda place: at_frame(4, raise_bug),
     ),
     Case(
         "Ctrl-C",
         SERIAL,
-        Fails(
-            "interrupted after 5 of 8 frames (the results of the 5 frames before are in {out}; resume with --resume"
-            " {out})",
-            saved_poses=5,
-        ),
+        fails_at_frame(5, "interrupted after 5 of 8 frames"),
         lambda place: at_frame(4, lambda: os.kill(os.getpid(), signal.SIGINT)),
     ),
     Case(
@@ -217,11 +220,7 @@ CASES = [
     Case(
         "image without read permission",
         make_unreadable(f"rgb/{STAMPS[4]}.png"),
-        Fails(
-            "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check its permissions (the"
-            " results of the 4 frames before are in {out}; resume with --resume {out})",
-            saved_poses=4,
-        ),
+        fails_at_frame(4, "{seq}/rgb/1305031102.400000.png: cannot be read (Permission denied); check its permissions"),
         lambda place: without_root_rights(),
     ),
     Case(
@@ -245,20 +244,14 @@ CASES = [
     Case(
         "ground truth without read permission",
         make_unreadable("groundtruth.txt"),
-        Fails(
-            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file, and its"
-            " permissions (the results are in {out})",
-            saved_poses=8,
+        fails_after_run(
+            "{seq}/groundtruth.txt: cannot be read (Permission denied); check that it is a file, and its permissions"
         ),
         lambda place: without_root_rights(),
     ),
     Case(
         "damaged true mask",
         write(f"masks/{STAMPS[3]}.png", b"\x89PNG\r\n\x1a\n"),
-        Fails(
-            "{seq}/masks/1305031102.300000.png: is not a PNG, JPEG or TIFF image; copy or export it again (the"
-            " results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run("{seq}/masks/1305031102.300000.png: is not a PNG, JPEG or TIFF image; copy or export it again"),
     ),
 ]

@@ -9,7 +9,18 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from helpers.corpus.base import FRAMES, HEIGHT, STAMPS, WIDTH, png
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, add_options, all_of, replace_options, write
+from helpers.corpus.case import (
+    Case,
+    Damage,
+    Fails,
+    Succeeds,
+    add_options,
+    all_of,
+    fails_after_run,
+    fails_at_frame,
+    replace_options,
+    write,
+)
 
 MASKS = ("--segmenter", "masks", "--masks", "{seq}/ids")
 
@@ -71,83 +82,73 @@ CASES = [
     Case(
         "people in the whole image",
         masks(lambda i: ids(1, 1.0)),
-        Fails(
+        fails_after_run(
             "seq: the camera was not found in any of the 8 frames, masked objects cover the images; see"
-            " figures/masks.png, and try --segmenter none (the results are in {out})",
-            saved_poses=8,
+            " figures/masks.png, and try --segmenter none"
         ),
     ),
     Case(
         "a mask for every other frame",
         masks(lambda i: ids(1), STAMPS[::2]),
-        Fails(
+        fails_at_frame(
+            1,
             "{seq}/ids: has no id image for frame 1 at 1305031102.100000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 1 frames before are in {out}; resume with --resume {out})",
-            saved_poses=1,
+            " belongs to this sequence",
         ),
     ),
     Case(
         "too few numbered id images",
         masks(lambda i: ids(1), ["0", "1", "2"]),
-        Fails(
+        fails_at_frame(
+            3,
             "{seq}/ids: has no id image for frame 3 at 1305031102.300000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 3 frames before are in {out}; resume with --resume {out})",
-            saved_poses=3,
+            " belongs to this sequence",
         ),
     ),
     Case(
         "id images of another time",
         masks(lambda i: ids(1), [f"{i}.5" for i in range(FRAMES)]),
-        Fails(
+        fails_at_frame(
+            0,
             "{seq}/ids: has no id image for frame 0 at 1305031102.000000 s; add it, or name the folder that"
-            " belongs to this sequence (the results of the 0 frames before are in {out})",
-            saved_poses=0,
+            " belongs to this sequence",
         ),
     ),
     Case(
         "masks of another size",
         masks(lambda i: png(np.zeros((HEIGHT * 2, WIDTH * 2), np.uint8))),
-        Fails(
-            "{seq}/ids/1305031102.000000.png: has 160x120 pixels, its frame 80x60; write id images of the"
-            " size of the frames (the results of the 0 frames before are in {out})",
-            saved_poses=0,
+        fails_at_frame(
+            0,
+            "{seq}/ids/1305031102.000000.png: has 160x120 pixels, its frame 80x60; write id images of the size"
+            " of the frames",
         ),
     ),
     Case(
         "masks in colour",
         masks(lambda i: png(np.zeros((HEIGHT, WIDTH, 3), np.uint8))),
-        Fails(
-            "{seq}/ids/1305031102.000000.png: has 3 channels, expected one 8- or 16-bit channel; write it"
-            " with one channel (the results of the 0 frames before are in {out})",
-            saved_poses=0,
+        fails_at_frame(
+            0,
+            "{seq}/ids/1305031102.000000.png: has 3 channels, expected one 8- or 16-bit channel; write it with"
+            " one channel",
         ),
     ),
     Case(
         "a truncated id image",
         masks(lambda i: ids(1)[: 60 if i == 3 else None]),
-        Fails(
-            "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again (the results of"
-            " the 3 frames before are in {out}; resume with --resume {out})",
-            saved_poses=3,
-        ),
+        fails_at_frame(3, "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again"),
     ),
     Case(
         "an id image that is not an image",
         masks(lambda i: b"masks" if i == 3 else ids(1)),
-        Fails(
-            "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again (the results of"
-            " the 3 frames before are in {out}; resume with --resume {out})",
-            saved_poses=3,
-        ),
+        fails_at_frame(3, "{seq}/ids/1305031102.300000.png: is not a readable PNG image; write it again"),
     ),
     Case(
         "depth images in place of id images",
         masks(lambda i: png(np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH))),
-        Fails(
-            "{seq}/ids/1305031102.000000.png: has 4799 different ids, more than 255; an id image has"
-            " one value for each instance and 0 for the background, name the folder of such images with --masks (the"
-            " results of the 0 frames before are in {out})",
-            saved_poses=0,
+        fails_at_frame(
+            0,
+            "{seq}/ids/1305031102.000000.png: has 4799 different ids, more than 255; an id image has one value"
+            " for each instance and 0 for the background, name the folder of such images with --masks",
         ),
     ),
     Case(
@@ -237,20 +238,12 @@ CASES = [
     Case(
         "ONNX with NaN in its output",
         head(float("nan")),
-        Fails(
-            "{seq}/own.onnx: network output contains NaN or infinity; train or export it again (the results of the 0"
-            " frames before are in {out})",
-            saved_poses=0,
-        ),
+        fails_at_frame(0, "{seq}/own.onnx: network output contains NaN or infinity; train or export it again"),
     ),
     Case(
         "ONNX with infinity in its output",
         head(float("inf")),
-        Fails(
-            "{seq}/own.onnx: network output contains NaN or infinity; train or export it again (the results of the 0"
-            " frames before are in {out})",
-            saved_poses=0,
-        ),
+        fails_at_frame(0, "{seq}/own.onnx: network output contains NaN or infinity; train or export it again"),
     ),
     Case(
         "a .pt file with another checksum",

@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from helpers.corpus.base import CAMERA, FRAMES, NOISE, camera_position, colour, depth
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, first_half
+from helpers.corpus.case import (
+    Case,
+    Damage,
+    Fails,
+    Succeeds,
+    Workspace,
+    add_options,
+    all_of,
+    fails_at_frame,
+    first_half,
+)
 
 
 def save(path: Path, images: list[NDArray[np.generic]]) -> None:
@@ -53,11 +63,7 @@ CASES = [
     Case(
         "truncated colour",
         change_bytes("colour.mkv", first_half),
-        Fails(
-            "{root}/take/colour.mkv: is truncated at 0.2 of 0.7 s; copy it again (the results of the 3 frames"
-            " before are in {out}; resume with --resume {out})",
-            saved_poses=3,
-        ),
+        fails_at_frame(3, "{root}/take/colour.mkv: is truncated at 0.2 of 0.7 s; copy it again"),
     ),
     Case(
         "truncated depth",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from helpers.corpus.base import HEIGHT, WIDTH, camera_position, colour, depth, png
-from helpers.corpus.case import Case, Fails, Succeeds, Workspace, all_of, edit, replace_text, write
+from helpers.corpus.case import Case, Fails, Succeeds, Workspace, all_of, edit, fails_after_run, replace_text, write
 from helpers.corpus.images import DEPTH, RGB, every
 from helpers.corpus.lists import lines
 
@@ -37,51 +37,39 @@ def covered(place: Workspace) -> None:
     (place.folder / "groundtruth.txt").unlink()
 
 
+UNIFORM = (
+    "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
+    " again, with light and an uncovered lens"
+)
+NO_DEPTH = (
+    "seq: the camera was not found in any of the 8 frames, the depth images are empty; record or export them again"
+)
+
 CASES = [
     Case(
         "all black",
         every(RGB, lambda i: plain(0)),
-        Fails(
-            "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
-            " again, with light and an uncovered lens (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run(UNIFORM),
     ),
     Case(
         "all white",
         every(RGB, lambda i: plain(255)),
-        Fails(
-            "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
-            " again, with light and an uncovered lens (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run(UNIFORM),
     ),
     Case(
         "no depth",
         every(DEPTH, lambda i: png(depth(0.0))),
-        Fails(
-            "seq: the camera was not found in any of the 8 frames, the depth images are empty; record or"
-            " export them again (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run(NO_DEPTH),
     ),
     Case(
         "saturated depth",
         every(DEPTH, lambda i: png(np.full((HEIGHT, WIDTH), 65535, np.uint16))),
-        Fails(
-            "seq: the camera was not found in any of the 8 frames, the depth images are empty; record or"
-            " export them again (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run(NO_DEPTH),
     ),
     Case(
         "black without depth",
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
-        Fails(
-            "seq: the camera was not found in any of the 8 frames, the colour images are uniform; record it"
-            " again, with light and an uncovered lens (the results are in {out})",
-            saved_poses=8,
-        ),
+        fails_after_run(UNIFORM),
     ),
     Case(
         "depth in metres",

@@ -1,0 +1,75 @@
+"""Columns of the tables that benchmarks print and the page shows: headings by the cell of a row."""
+
+from __future__ import annotations
+
+GROWTH = {
+    "sequence": "sequence",
+    "frames": "frames",
+    "cpu_ms": "CPU ms per frame",
+    "memory_mb": "memory, MB",
+    "memory_kb_per_frame": "growth, kB per frame",
+    "keyframes": "keyframes",
+    "loops": "loops",
+}
+
+KEYFRAMES = {
+    "keyframes": "keyframes",
+    "add_ms": "add one, ms",
+    "query_ms": "query, ms",
+    "pose_graph_s": "pose graph, s",
+    "error_before": "error before, m",
+    "error_after": "error after, m",
+}
+
+LOST = {
+    "sequence": "sequence",
+    "interruption": "interruption",
+    "recovery": "frames to recover",
+    "unflagged": "covered but tracked",
+    "found": "reliable poses",
+    "ate": "ATE, m",
+    "ratio": "relative to uninterrupted",
+    "worst": "worst error, m",
+    "reference_worst": "uninterrupted, m",
+    "passes": "passes",
+}
+
+SEGMENTATION = {
+    "network": "network",
+    "ms": "ms",
+    "people_found": "people's pixels found",
+    "moving_masked": "moving masked",
+    "static_masked": "static masked",
+    "id_switches": "ID switches",
+    "ate": "ATE, m",
+}
+
+MAPS = {
+    "sequence": "sequence",
+    "pixels": "pixels in the map",
+    "points_before": "points",
+    "people_before": "people",
+    "points_after": "points with check",
+    "people_after": "people with check",
+    "static_lost": "static points lost",
+}
+
+MAP_COSTS = {
+    "sequence": "sequence",
+    "keyframes": "keyframes",
+    "points": "points",
+    "triangles": "triangles",
+    "saving": "saving",
+    "loading": "loading",
+}
+
+PRIMITIVES = {
+    "primitive": "primitive",
+    "size": "size",
+    "threads": "threads",
+    "competitor": "competitor",
+    "ms": "ms",
+    "ratio": "ratio",
+}
+
+DESIGN_CHOICES = {"choice": "choice", "sequence": "sequence", "result": "result", "commit": "commit"}

@@ -1,0 +1,44 @@
+"""Constant-velocity Kalman filter against least squares, and its speed limit."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import lstsq
+
+from v3d_torch.config import TrackerConfig
+from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.tuples(st.floats(0.01, 0.5), st.floats(-0.3, 0.3), st.floats(0.02, 0.5)), min_size=1, max_size=8))
+def test_kalman_filter_equals_least_squares(steps: list[tuple[float, float, float]]) -> None:
+    """Oracle: SciPy solves for the states at all times at once, with whitened residuals."""
+    config = TrackerConfig(max_speed=1e6, acceleration_noise=1.5)
+    motion = ConstantVelocityKalmanFilter(config)
+    stamp = 7.0
+    motion.update(stamp, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), 0.1)
+    size = 2 * len(steps) + 2
+    rows, right = [np.eye(size)[0] / 0.1, np.eye(size)[1]], [1.0 / 0.1, 0.0]  # first position, first velocity
+    for k, (dt, error, sigma) in enumerate(steps):
+        stamp += dt
+        x = 1.0 + 0.8 * (stamp - 7.0) + error
+        motion.update(stamp, torch.tensor([x, 2.0, 3.0], dtype=torch.float64), sigma)
+        noise = 1.5**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        step = np.zeros((2, size))
+        step[:, 2 * k : 2 * k + 4] = [[-1, -dt, 1, 0], [0, -1, 0, 1]]
+        rows += [*np.linalg.inv(np.linalg.cholesky(noise)) @ step, np.eye(size)[2 * k + 2] / sigma]
+        right += [0.0, 0.0, x / sigma]
+    position, velocity = lstsq(np.stack(rows), np.array(right))[0][-2:]
+    expected = torch.tensor([position + 0.2 * velocity, 2.0, 3.0], dtype=torch.float64)
+    torch.testing.assert_close(motion.predict(stamp + 0.2), expected, rtol=0.0, atol=1e-7)
+    torch.testing.assert_close(motion.velocity, torch.tensor([velocity, 0.0, 0.0], dtype=torch.float64))
+
+
+def test_kalman_filter_limits_the_speed() -> None:
+    motion = ConstantVelocityKalmanFilter(TrackerConfig(max_speed=2.0))
+    for frame in range(10):
+        motion.update(0.1 * frame, torch.tensor([0.9, 0.0, 1.2], dtype=torch.float64) * frame, 0.05)
+    torch.testing.assert_close(motion.velocity, torch.tensor([1.2, 0.0, 1.6], dtype=torch.float64))

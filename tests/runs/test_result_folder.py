@@ -1,0 +1,44 @@
+"""Result folders named by time, and the link to the newest."""
+
+from __future__ import annotations
+
+import errno
+from datetime import datetime, tzinfo
+from pathlib import Path
+
+import pytest
+
+from v3d_torch.errors import OutputError
+from v3d_torch.runs import result_folder
+
+
+def test_runs_started_in_the_same_second_have_separate_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class FixedTime(datetime):
+        @classmethod
+        def now(cls, tz: tzinfo | None = None) -> FixedTime:
+            return cls(2026, 1, 2, 3, 4, 5, tzinfo=tz)
+
+    monkeypatch.setattr(result_folder, "datetime", FixedTime)
+    monkeypatch.chdir(tmp_path)
+    folders = [result_folder.make_result_folder(None, "fr3/w/xyz") for _ in range(3)]
+    assert [folder.name for folder in folders] == [f"2026-01-02_03-04-05{suffix}" for suffix in ("", "_2", "_3")]
+    assert (tmp_path / "results" / "fr3_w_xyz" / "latest").resolve() == folders[-1].resolve()
+
+
+def test_make_result_folder_without_symlink_permission_makes_no_latest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "A required privilege is not held by the client")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    monkeypatch.chdir(tmp_path)
+    folder = result_folder.make_result_folder(None, "demo")
+    assert folder.is_dir() and [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_make_result_folder_that_fails_raises_output_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "results").symlink_to("nowhere")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match=r"demo: cannot be made \(.*\); choose another folder with --out"):
+        result_folder.make_result_folder(None, "demo")

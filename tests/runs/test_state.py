@@ -1,0 +1,72 @@
+"""`save_state` and `load_state`: a loaded system continues like the saved one, to the bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.differences import differences
+from helpers.walk_run import CAMERA, CONFIG, Walk, interrupt_after, make_pipeline, segment_red
+
+from v3d_torch import V3DSLAM, load_state, save_state
+from v3d_torch.config.loading import load_config
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.io.state_file import write_state
+from v3d_torch.runs.checkpoint import CHECKPOINT, write_checkpoint
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
+
+
+def test_loaded_system_equals_the_saved_one(tmp_path: Path) -> None:
+    config = load_config(overrides=["segmentation.source=none", "features.count=300"])
+    walk, uninterrupted, saved = Walk(), V3DSLAM(CAMERA, config=config), V3DSLAM(CAMERA, config=config)
+    for frame in (walk[0], walk[1], walk[2]):
+        uninterrupted(frame), saved(frame)
+    save_state(tmp_path / "slam.state", saved)
+    loaded = load_state(tmp_path / "slam.state")
+    assert loaded.camera == CAMERA
+    for frame in (walk[3], walk[4]):
+        assert torch.equal(loaded(frame).T_wc, uninterrupted(frame).T_wc)
+    assert loaded.config == config and list(differences(uninterrupted, loaded, "slam", {})) == []
+
+
+@pytest.mark.parametrize("saved_after", [0, 1, 14, 24, 38])
+def test_loaded_system_gives_the_same_next_results(saved_after: int, tmp_path: Path) -> None:
+    """With objects, a stateful segmenter, a lost camera and a pending keyframe."""
+    config, walk = CONFIG.model_copy(update={"prefetch": False}), Walk()
+    slam = V3DSLAM(CAMERA, UprightSegmenter(segment_red), config)
+    for index in range(saved_after):
+        slam(walk[index])
+    save_state(tmp_path / "slam.state", slam)
+    loaded = load_state(tmp_path / "slam.state", UprightSegmenter(segment_red))
+    assert list(differences(slam.state_dict(), loaded.state_dict(), "state", {})) == []
+    for index in range(saved_after, saved_after + 8):
+        assert list(differences(slam(walk[index]), loaded(walk[index]), f"frame {index}", {})) == []
+    slam.flush(), loaded.flush()
+    assert list(differences(slam, loaded, "slam", {})) == []
+
+
+@pytest.mark.parametrize("stage", ["mapper", "classify_motion", "free_space_check"])
+def test_system_with_a_replaced_stage_without_state_is_not_saved(stage: str, tmp_path: Path) -> None:
+    slam = V3DSLAM(CAMERA, NoSegmentation(), CONFIG)
+    setattr(slam, stage, lambda *_: None)
+    with pytest.raises(ConfigError, match=f"^{stage} was replaced by a stage without state_dict; its state cannot be"):
+        save_state(tmp_path / "slam.state", slam)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checkpoint_is_not_loaded_as_the_state_of_a_system(tmp_path: Path) -> None:
+    pipeline = make_pipeline(prefetch=False)
+    pipeline(interrupt_after(1))
+    write_checkpoint(tmp_path, pipeline, RunRequest("walk", CONFIG))
+    with pytest.raises(InputError, match=rf"{CHECKPOINT}: is "):
+        load_state(tmp_path / CHECKPOINT)
+
+
+def test_file_without_the_state_of_a_system_is_rejected(tmp_path: Path) -> None:
+    write_state(tmp_path / "slam.state", {"about": "a test"}, {"value": 1})
+    with pytest.raises(
+        InputError, match=r"slam\.state: is not the state of a system; give a file that save_state wrote"
+    ):
+        load_state(tmp_path / "slam.state")

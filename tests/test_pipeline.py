@@ -1,0 +1,87 @@
+"""The pipeline: its results, callback and record; runs that end early; mask images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.wall_run import FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
+
+from v3d_torch.config.loading import load_config
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.runs.results import write_results
+from v3d_torch.types import RGBDFrame, TrackingStatus
+
+
+def test_run_along_the_wall_is_accurate() -> None:
+    run = run_along_wall()
+    assert run.slam.poses.statuses == [TrackingStatus.TRACKED] * FRAMES
+    truth = run.sequence.groundtruth
+    assert truth is not None
+    error = (run.slam.poses.trajectory().T_wc - truth.T_wc)[:, :3, 3].norm(dim=1)
+    assert error.max() < 0.01
+    assert run.record.failure is None and run.record.seconds > 0
+
+
+def test_callback_and_record_have_every_frame_and_object() -> None:
+    reported: list[tuple[int, int, TrackingStatus]] = []
+
+    def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
+        reported.append((frame.index, len(result.objects), result.status))
+
+    pipeline = make_pipeline()
+    record = pipeline(on_frame)
+    assert reported == [(index, 1, TrackingStatus.TRACKED) for index in range(FRAMES)]
+    assert [row["frame"] for row in record.dynamics] == list(range(FRAMES))
+    assert {row["class"] for row in record.dynamics} == {"person"}
+    assert record.dynamics[-1]["z"] == pytest.approx(WALL, abs=0.02)
+    assert (stamps := [snapshot.frame.stamp for snapshot in record.snapshots]) == sorted(stamps)
+    assert len(record.snapshots) == 6
+    assert set(pipeline.slam.timer.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
+    assert max(pipeline.slam.timer.seconds.values()) <= record.seconds
+
+
+@pytest.mark.parametrize("broken", [0, 1, 5])
+def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_path: Path) -> None:
+    pipeline = make_pipeline(Wall(broken=broken))
+    record = pipeline()
+    assert record.failure is not None and "truncated" in record.failure
+    evaluation = write_results(tmp_path, pipeline)
+    lines = (tmp_path / "trajectory.txt").read_text().splitlines()
+    assert len(lines) == broken
+    assert (evaluation is not None) == (broken >= 3)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["processed"], metrics["frames"]) == (broken, FRAMES)
+    assert metrics["failure"] == record.failure
+    assert (tmp_path / "map.ply").is_file() and (tmp_path / "dynamics.parquet").is_file()
+
+
+def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> None:
+    pipeline = make_pipeline(Wall(interrupted=4))
+    assert pipeline().failure == f"interrupted after 4 of {FRAMES} frames"
+    write_results(tmp_path, pipeline)
+    assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
+
+
+def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
+    no_margins = [
+        *("objects.clouds.stride=1", "objects.static_mask.depth_margin=0", "objects.static_mask.dilation=0"),
+        "objects.free_space.enabled=false",
+    ]
+    config = load_config(overrides=[*no_margins, "objects.static_mask.confirm_static_time=100"])
+    make_pipeline(masks=tmp_path / "masks", config=config)()
+    paths = sorted((tmp_path / "masks").iterdir())
+    assert [path.name for path in paths] == [f"{index / 10:.6f}.png" for index in range(FRAMES)]
+    for path in paths:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.uint8
+        assert np.array_equal(image, np.where(square(Wall()[0]).masks[0].numpy(), 255, 0))
+
+
+def test_masks_that_cannot_be_written_end_the_run_with_a_message(tmp_path: Path) -> None:
+    (tmp_path / "masks").write_text("")
+    failure = make_pipeline(masks=tmp_path / "masks")().failure
+    assert failure is not None and "masks" in failure and "cannot be written" in failure
