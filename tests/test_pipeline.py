@@ -13,6 +13,7 @@ from helpers.wall_run import FRAMES, WALL, Wall, make_pipeline, run_along_wall, 
 from v3d_torch.config.loading import load_config
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.runs.results import write_results
+from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
 
@@ -35,9 +36,9 @@ def test_callback_and_record_have_every_frame_and_object() -> None:
     pipeline = make_pipeline()
     record = pipeline(on_frame)
     assert reported == [(index, 1, TrackingStatus.TRACKED) for index in range(FRAMES)]
-    assert [row["frame"] for row in record.dynamics] == list(range(FRAMES))
-    assert {row["class"] for row in record.dynamics} == {"person"}
-    assert record.dynamics[-1]["z"] == pytest.approx(WALL, abs=0.02)
+    assert record.dynamics["frame"].tolist() == list(range(FRAMES))
+    assert set(record.dynamics["label"].tolist()) == {PERSON}
+    assert float(record.dynamics["centroid"][-1, 2]) == pytest.approx(WALL, abs=0.02)
     assert (stamps := [snapshot.frame.stamp for snapshot in record.snapshots]) == sorted(stamps)
     assert len(record.snapshots) == 6
     assert set(pipeline.slam.timer.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}

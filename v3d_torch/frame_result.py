@@ -9,6 +9,7 @@ from torch import Tensor
 
 from v3d_torch.features.features import Features
 from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
 
@@ -21,7 +22,7 @@ class PreprocessedFrame:
         instances: Instances of the segmentation; None if it leaves this frame out.
         depth: Re-estimated depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
         features: Features of the whole image.
-        seconds: Time that each stage took, seconds.
+        times: Time that each stage took.
         segmenter_state: State of the segmenter after this frame; None if it has no state.
     """
 
@@ -29,7 +30,7 @@ class PreprocessedFrame:
     instances: Instances | None
     depth: Tensor
     features: Features
-    seconds: dict[str, float]
+    times: dict[str, StageTime]
     segmenter_state: dict[str, Any] | None
 
 

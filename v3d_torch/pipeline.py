@@ -26,6 +26,7 @@ from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
 from v3d_torch.runtime.process import trim_memory
+from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
@@ -45,14 +46,16 @@ FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 class Viewer(Protocol):
     """Viewer of a run. A viewer never changes the state of the SLAM system."""
 
-    def show(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_seconds: Mapping[str, float]) -> None:
+    def show(
+        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
+    ) -> None:
         """Show a tracked frame.
 
         Args:
             frame: Images of the frame.
             objects: Objects of the frame, and its static mask.
             slam: SLAM system after it tracked the frame; its last pose is the pose of the frame.
-            stage_seconds: Time that each stage spent on the frame, seconds.
+            stage_times: Time that each stage spent on the frame.
         """
 
     def finish(self, slam: V3DSLAM) -> None:
@@ -69,7 +72,9 @@ class Viewer(Protocol):
 class NullViewer:
     """Viewer that shows nothing."""
 
-    def show(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_seconds: Mapping[str, float]) -> None:
+    def show(
+        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
+    ) -> None:
         """Do nothing."""
 
     def finish(self, slam: V3DSLAM) -> None:
@@ -95,6 +100,21 @@ class Snapshot:
     result: FrameResult
 
 
+@dataclass(frozen=True)
+class FrameTimes:
+    """Time spent on one frame.
+
+    Attributes:
+        frame: Index of the frame.
+        stamp: Timestamp of the frame, seconds.
+        stages: Time of each stage that ran.
+    """
+
+    frame: int
+    stamp: float
+    stages: Mapping[str, StageTime]
+
+
 def _dynamics_table() -> TensorTable:
     # Tensors take a tenth of the memory of a dictionary for each row.
     return TensorTable(
@@ -115,7 +135,7 @@ class RunRecord:
     """Records of a run in addition to the trajectory.
 
     Attributes:
-        frames: One row per frame: index, timestamp and seconds of each stage.
+        frames: Times of each frame.
         dynamics: One row per frame and object: index and timestamp of the frame, id, COCO class, centroid (world frame,
             metres), votes, Chamfer distance, position of the motion state in `MotionState`, and whether it was missed.
         snapshots: Frames for the figure of masks.
@@ -128,7 +148,7 @@ class RunRecord:
         save_error: Reason why a checkpoint could not be written; None if there is none.
     """
 
-    frames: list[dict[str, float]] = field(default_factory=list)
+    frames: list[FrameTimes] = field(default_factory=list)
     dynamics: TensorTable = field(default_factory=_dynamics_table)
     snapshots: list[Snapshot] = field(default_factory=list)
     most_dynamic_snapshot: Snapshot | None = None
@@ -208,10 +228,10 @@ class Pipeline:
                 for preprocessed in prefetcher:
                     self.between_frames = False
                     frame, result = preprocessed.frame, self.slam.track(preprocessed)
-                    seconds = self.slam.timer.lap()
-                    record.frames.append({"frame": frame.index, "stamp": frame.stamp, **seconds})
+                    times = self.slam.timer.lap()
+                    record.frames.append(FrameTimes(frame.index, frame.stamp, times))
                     self._record_frame(frame, result)
-                    self._viewer.show(frame, result, self.slam, seconds)
+                    self._viewer.show(frame, result, self.slam, times)
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)

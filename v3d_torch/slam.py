@@ -154,7 +154,7 @@ class V3DSLAM:
             depth = self.smooth_depth(frame.depth[None])[0]
         with timer("features"):  # III-A: ORB
             features = self.detect_features(frame.image, depth)
-        return PreprocessedFrame(frame, instances, depth, features, timer.seconds, segmenter_state_of(self.segment))
+        return PreprocessedFrame(frame, instances, depth, features, timer.times, segmenter_state_of(self.segment))
 
     def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         """Track the camera and the objects in the next frame, and extend the map.
@@ -165,7 +165,7 @@ class V3DSLAM:
         frame, instances, depth = preprocessed.frame, preprocessed.instances, preprocessed.depth
         check_order(frame, self.poses.stamp)
         self._segmenter_state = preprocessed.segmenter_state
-        self.timer.add(preprocessed.seconds)
+        self.timer.add(preprocessed.times)
         with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
             velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
@@ -212,7 +212,7 @@ class V3DSLAM:
         result = self.back_end.result()
         if result is None:
             return
-        self.timer.add(result.seconds)
+        self.timer.add(result.times)
         with self.timer("mapping"):
             self._apply_world_correction(self.back_end.apply(result))
             previous = None if self._previous is None else self._previous.landmarks

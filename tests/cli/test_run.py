@@ -111,15 +111,24 @@ def test_run_prints_scores_and_result_folder(
 
 def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     out, done = first_run
-    frames = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").to_numpy() * 1e3
+    frames = 1e3 * pd.read_parquet(out / "frames.parquet").filter(like="seconds_")
+    wall, cpu = frames.filter(regex="^seconds_"), frames.filter(regex="^cpu_seconds_")
+    stages = wall.columns.str.removeprefix("seconds_")
     rows = [line.strip("│ ").split() for line in done.stdout.partition("time per frame, ms")[2].splitlines()]
-    shown_rows = {row[0]: row[2::2] for row in rows if len(row) == 9 and row[-1].endswith("%")}
-    stages = pd.read_parquet(out / "frames.parquet").filter(like="seconds_").columns.str.removeprefix("seconds_")
-    assert list(shown_rows) == [*stages, "all"]
-    for figures, taken in zip(shown_rows.values(), [*frames.T, frames.sum(axis=1)], strict=True):
-        expected = [taken.mean(), np.median(taken), np.quantile(taken, 0.95)]
-        assert list(map(float, figures[:3])) == pytest.approx(expected, abs=0.06)  # printed with one decimal
-        assert float(figures[3].rstrip("%")) == pytest.approx(100 * taken.sum() / frames.sum(), abs=0.6)
+    shown = {" ".join(row[:-10]): row[-9::2] for row in rows if len(row) > 10 and row[-1].endswith("%")}
+    preprocessing = stages.isin(["read", "segmentation", "depth", "features"])
+    back_end = stages.isin(["bundle", "loop"])
+    expected = {stage: stages == stage for stage in stages}
+    expected |= {"preprocessing": preprocessing, "tracking": ~preprocessing & ~back_end, "back end": back_end}
+    expected |= {"all": np.ones(len(stages), np.bool_)}
+    assert list(shown) == list(expected)
+    for name, members in expected.items():
+        taken, used = wall.loc[:, members].sum(axis=1), cpu.loc[:, members].sum(axis=1)
+        figures = [taken.mean(), np.median(taken), np.quantile(taken, 0.95), used.mean()]
+        assert list(map(float, shown[name][:4])) == pytest.approx(figures, abs=0.06)  # printed with one decimal
+        assert float(shown[name][4].rstrip("%")) == pytest.approx(100 * used.sum() / cpu.to_numpy().sum(), abs=0.6)
+    slowest = max(("preprocessing", "tracking", "back end"), key=lambda name: wall.loc[:, expected[name]].sum().sum())
+    assert f"the rate is {slowest}" in " ".join(done.stdout.split())
 
 
 def test_saved_masks_are_binary_and_named_by_timestamp(first_out: Path, sequence: Path) -> None:

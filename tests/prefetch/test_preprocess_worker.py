@@ -68,7 +68,7 @@ def test_worker_gives_the_same_results_as_this_process(demo: StoredSequence) -> 
             assert preprocessed is not None
             assert are_identical(without_times(preprocessed), without_times(expected))
             assert are_identical(segmenter_state_of(slam.segment), expected.segmenter_state)
-            assert set(preprocessed.seconds) == {"read", "segmentation", "depth", "features"}
+            assert set(preprocessed.times) == {"read", "segmentation", "depth", "features"}
             assert preprocessed.frame.camera is demo.camera
 
 

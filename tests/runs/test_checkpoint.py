@@ -9,9 +9,11 @@ import torch
 from helpers.differences import differences
 from helpers.walk_run import CONFIG, Walk, interrupt_after, make_pipeline
 
+from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import describe_change, read_checkpoint, write_checkpoint
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.types import TrackingStatus, segmenter_state_of
 
 STOPS = (0, 1, 7, 8, 19, 22, 31, 32, 33, 45, 53)
@@ -26,13 +28,13 @@ def uninterrupted() -> Pipeline:
 
 
 def test_sequence_exercises_all_state(uninterrupted: Pipeline) -> None:
-    slam, rows = uninterrupted.slam, uninterrupted.record.dynamics
+    slam, record = uninterrupted.slam, uninterrupted.record
     assert {TrackingStatus.TRACKED, TrackingStatus.LOST} <= set(slam.poses.statuses)
     assert slam.loop_closer.loop_count > 0 and len(slam.map.keyframes) > 10
     assert not slam.map.landmarks["active"].all()
-    assert {"person", "unlabelled"} <= {str(row["class"]) for row in rows}
-    assert {"dynamic", "static"} <= {str(row["motion_state"]) for row in rows}
-    assert any(row["missed"] for row in rows) and any(row["votes"] for row in rows)
+    assert {PERSON, UNLABELLED} <= set(record.dynamics["label"].tolist())
+    assert {MotionState.DYNAMIC, MotionState.STATIC} <= record.motion_state_counts.keys()
+    assert record.dynamics["missed"].any() and record.dynamics["votes"].any()
     state = segmenter_state_of(slam.segment)
     assert state is not None and state["calls"] > 10 and state["up"].norm() > 1
 
@@ -65,7 +67,7 @@ def test_run_resumed_many_times_equals_an_uninterrupted_run(uninterrupted: Pipel
     slam, expected = pipeline.slam, uninterrupted.slam
     assert torch.equal(slam.poses.trajectory().T_wc, expected.poses.trajectory().T_wc)
     assert set(slam.timer.seconds) == set(expected.timer.seconds)
-    assert [row["frame"] for row in pipeline.record.frames] == list(range(len(Walk())))
+    assert [row.frame for row in pipeline.record.frames] == list(range(len(Walk())))
     # The database of loop closing is rebuilt and gives the same candidates.
     query = expected.map.keyframes[3].features.descriptors
     assert slam.loop_closer._database.query(query, 9) == expected.loop_closer._database.query(query, 9)

@@ -257,9 +257,8 @@ def test_ground_truth_is_aligned_at_first_pose(recorded: tuple[Recording, RunLog
 def test_curves_summaries_and_events(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
     recording, log, pipeline = recorded
     for index, row in enumerate(pipeline.record.frames):
-        for stage, seconds in row.items():
-            if stage not in ("frame", "stamp"):
-                assert recording.at(f"/seconds/{stage}")[index]["scalars"][0] == pytest.approx(seconds)
+        for stage, spent in row.stages.items():
+            assert recording.at(f"/seconds/{stage}")[index]["scalars"][0] == pytest.approx(spent.wall)
     for index, result in enumerate(log.results):
         text = recording.at("/frame_summary")[index]["text"][0]
         assert f"**frame {index}** at {index / 10:.3f} s: tracked" in text

@@ -23,7 +23,7 @@ from v3d_torch.mapping.culling import cull_redundant_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.runtime.stage_timer import StageTimer
+from v3d_torch.runtime.stage_timer import StageTime, StageTimer
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class BackEndResult:
         keyframe: Keyframe that this result belongs to.
         adjustment: Local bundle adjustment around the keyframe; None if there was nothing to adjust.
         loop_correction: Loop that ends at the keyframe, with corrected poses; None if no loop was detected.
-        seconds: Computation time of each stage, by name of the stage.
+        times: Computation time of each stage, by name of the stage.
     """
 
     keyframe: Keyframe
     adjustment: LocalAdjustment | None
     loop_correction: LoopCorrection | None
-    seconds: dict[str, float]
+    times: dict[str, StageTime]
 
 
 class BackEnd:
@@ -116,4 +116,4 @@ class BackEnd:
             with timer("loop"):
                 T_cw = self._map.T_cw if adjustment is None else adjustment.T_cw
                 loop_correction = self._loop_closer.detect_loop(keyframe, self._map, T_cw)
-        return BackEndResult(keyframe, adjustment, loop_correction, timer.seconds)
+        return BackEndResult(keyframe, adjustment, loop_correction, timer.times)

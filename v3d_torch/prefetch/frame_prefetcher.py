@@ -91,7 +91,7 @@ class FramePrefetcher:
             return None
         with torch.inference_mode(inference):
             preprocessed = self._slam.preprocess(frame, prediction)
-        return replace(preprocessed, seconds={**timer.seconds, **preprocessed.seconds})
+        return replace(preprocessed, times={**timer.times, **preprocessed.times})
 
     def _receive(
         self, worker: PreprocessWorker, frames: FrameIterator, preprocess_here: PendingFrame

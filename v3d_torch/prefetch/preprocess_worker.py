@@ -150,5 +150,5 @@ def serve(connection: int, memory: int | None = None) -> None:
         with timer("read"):
             frame = sequence[index]
         preprocessed = slam.preprocess(frame, prediction)
-        seconds = {**timer.seconds, **preprocessed.seconds}
-        channel.send(replace(preprocessed, frame=replace(preprocessed.frame, camera=None), seconds=seconds))
+        times = {**timer.times, **preprocessed.times}
+        channel.send(replace(preprocessed, frame=replace(preprocessed.frame, camera=None), times=times))

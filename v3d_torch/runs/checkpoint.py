@@ -19,7 +19,7 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.static_views import StaticView
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
-from v3d_torch.pipeline import Pipeline, RunRecord, Snapshot
+from v3d_torch.pipeline import FrameTimes, Pipeline, RunRecord, Snapshot
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.state import STATE_CLASSES
 from v3d_torch.runs.stored_run import read_metrics, suggest_folder
@@ -29,7 +29,18 @@ CHECKPOINT = "checkpoint.v3d"
 
 _CLASSES = (
     *STATE_CLASSES,
-    *(RunRecord, Snapshot, FrameObjects, FrameResult, TrackedObject, MotionState, MaskEvaluation, StaticView, set),
+    *(
+        RunRecord,
+        FrameTimes,
+        Snapshot,
+        FrameObjects,
+        FrameResult,
+        TrackedObject,
+        MotionState,
+        MaskEvaluation,
+        StaticView,
+        set,
+    ),
 )
 """Classes that a checkpoint can contain."""
 

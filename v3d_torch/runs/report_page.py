@@ -32,7 +32,7 @@ _FIGURES = {
 
 
 @dataclass(frozen=True)
-class StageTime:
+class StageSummary:
     """Time of a stage, seconds; ``median`` and ``max`` are None if the times of the frames were not stored."""
 
     name: str
@@ -160,11 +160,11 @@ def _object_plot(run: StoredRun) -> dict[str, Any] | None:
     return {"count": len({row.id for row in table}), "omitted": omitted, "plot": embed_svg(figure, "objects")}
 
 
-def _stage_times(run: StoredRun) -> list[StageTime]:
+def _stage_times(run: StoredRun) -> list[StageSummary]:
     frames = max(run.metrics.processed, 1)
     per_frame = _seconds_per_frame(run)
     return [
-        StageTime(
+        StageSummary(
             name=name,
             total=total,
             mean=total / frames,
@@ -175,7 +175,7 @@ def _stage_times(run: StoredRun) -> list[StageTime]:
     ]
 
 
-def _stage_plots(run: StoredRun, stages: list[StageTime]) -> list[str]:
+def _stage_plots(run: StoredRun, stages: list[StageSummary]) -> list[str]:
     plots = [embed_svg(draw_stage_bars({stage.name: stage.mean for stage in stages}), "stages")] if stages else []
     if run.frames is not None and (per_frame := _seconds_per_frame(run)):
         stamps = run.frames.column("stamp").to_pylist()

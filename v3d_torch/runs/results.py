@@ -28,6 +28,7 @@ from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import fuse_points
+from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -115,24 +116,26 @@ def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | No
 
 
 def _frame_table(pipeline: Pipeline) -> pa.Table:
-    """Return the table of frames: status, keyframe, and seconds of each stage, 0 if it did not run."""
+    """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
     slam, rows = pipeline.slam, pipeline.record.frames
-    stages = list(slam.timer.seconds)
+    stages = list(slam.timer.times)
     columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
     keyframes = {keyframe.frame for keyframe in slam.map.active_keyframes}
     table = [
         {
             **{
-                "frame": row["frame"],
-                "stamp": row["stamp"],
+                "frame": row.frame,
+                "stamp": row.stamp,
                 "status": status.value,
-                "keyframe": row["frame"] in keyframes,
+                "keyframe": row.frame in keyframes,
             },
-            **{f"seconds_{stage}": row.get(stage, 0.0) for stage in stages},
+            **{f"seconds_{stage}": row.stages.get(stage, StageTime()).wall for stage in stages},
+            **{f"cpu_seconds_{stage}": row.stages.get(stage, StageTime()).cpu for stage in stages},
         }
         for row, status in zip(rows, slam.poses.statuses, strict=False)  # one row less if a frame was interrupted
     ]
-    schema = pa.schema([*columns, *((f"seconds_{stage}", pa.float64()) for stage in stages)])
+    columns += [(f"{kind}_{stage}", pa.float64()) for kind in ("seconds", "cpu_seconds") for stage in stages]
+    schema = pa.schema(columns)
     return pa.Table.from_pylist(table, schema=schema)
 
 

@@ -3,30 +3,52 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from v3d_torch.pipeline import RunRecord
+from v3d_torch.runtime.stage_timer import StageTime
+
+_PREPROCESSING = ("read", "segmentation", "depth", "features")
+_BACK_END = ("bundle", "loop")
+"""Stages that run beside the tracking of a frame; all other stages of a frame run one after the other."""
 
 
 def stage_table(run: RunRecord) -> Table:
-    """Return the milliseconds per frame of each stage; a stage counts as 0 on frames on which it did not run.
+    """Return the milliseconds per frame of each stage, and of each chain of stages that run one after the other.
+
+    The slowest chain limits the frame rate, whatever the number of processors. A stage counts as 0 on frames on which
+    it did not run.
 
     Args:
         run: Record of a finished run with at least one frame.
     """
-    stages = list(dict.fromkeys(name for row in run.frames for name in row if name not in ("frame", "stamp")))
-    times = 1e3 * np.array([[row.get(stage, 0.0) for stage in stages] for row in run.frames])  # frames x stages, ms
-    totals = times.sum(axis=1)
-    table = Table(title="time per frame, ms", show_footer=True)
-    columns = zip(("stage", "mean", "median", "95%", "fraction"), ("all", *_summary(totals, totals)), strict=True)
-    for heading, total in columns:
-        table.add_column(heading, footer=total, justify="left" if heading == "stage" else "right")
-    for stage, column in zip(stages, times.T, strict=True):
-        table.add_row(stage, *_summary(column, totals))
-    table.caption = f"{1e3 * run.seconds / len(run.frames):.1f} ms of wall time, because stages overlap"
+    stages = list(dict.fromkeys(stage for row in run.frames for stage in row.stages))
+    # Wall and CPU time, 2 x frames x stages, ms
+    times = 1e3 * np.array([[row.stages.get(stage, StageTime()) for stage in stages] for row in run.frames])
+    wall, cpu = times.transpose(2, 0, 1)
+    table = Table(title="time per frame, ms")
+    for heading in ("stage", "wall", "median", "95%", "CPU", "fraction"):
+        table.add_column(heading, justify="left" if heading == "stage" else "right")
+    for index, stage in enumerate(stages):
+        table.add_row(stage, *_summary(wall[:, index], cpu[:, index], cpu.sum()))
+    table.add_section()
+    preprocessing, back_end = np.isin(stages, _PREPROCESSING), np.isin(stages, _BACK_END)
+    chains = {"preprocessing": preprocessing, "tracking": ~preprocessing & ~back_end, "back end": back_end}
+    for name, members in chains.items():
+        table.add_row(name, *_summary(wall[:, members].sum(axis=1), cpu[:, members].sum(axis=1), cpu.sum()))
+    table.add_section()
+    table.add_row("all", *_summary(wall.sum(axis=1), cpu.sum(axis=1), cpu.sum()))
+    slowest = max(chains, key=lambda name: wall[:, chains[name]].sum())
+    table.caption = (
+        f"{1e3 * run.seconds / len(run.frames):.1f} ms of wall time, because stages overlap; the chain that limits the"
+        f" rate is {slowest}"
+    )
     return table
 
 
-def _summary(times: np.ndarray, totals: np.ndarray) -> tuple[str, str, str, str]:
-    mean, median, percentile = times.mean(), np.median(times), np.quantile(times, 0.95)
-    return f"{mean:.1f}", f"{median:.1f}", f"{percentile:.1f}", f"{times.sum() / totals.sum():.0%}"
+def _summary(wall: NDArray[np.float64], cpu: NDArray[np.float64], total: float) -> tuple[str, ...]:
+    """Return mean, median and 95th percentile of the wall time, mean CPU time, and its fraction of the total."""
+    percentile = np.quantile(wall, 0.95)
+    fraction = cpu.sum() / total if total else 0.0
+    return f"{wall.mean():.1f}", f"{np.median(wall):.1f}", f"{percentile:.1f}", f"{cpu.mean():.1f}", f"{fraction:.0%}"

@@ -20,6 +20,7 @@ from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
+from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.tracking.pose_history import PoseEntry
@@ -27,7 +28,7 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 
 STATE_CLASSES: tuple[type, ...] = (
     *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus),
-    *(Keyframe, Loop, TensorTable, Readout),
+    *(Keyframe, Loop, TensorTable, Readout, StageTime),
     *(DepthView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig),
 )
 """Classes of the package that a saved state can contain; others are not read."""

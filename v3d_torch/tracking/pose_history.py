@@ -15,7 +15,7 @@ from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PoseEntry:
     """Pose of one frame.
 

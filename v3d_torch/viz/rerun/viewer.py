@@ -19,6 +19,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
 from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 from v3d_torch.viz.rerun.layout import layout
@@ -82,7 +83,9 @@ class RerunViewer:
         )
         stream.log("world/camera/image", pinhole, static=True)
 
-    def show(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_seconds: Mapping[str, float]) -> None:
+    def show(
+        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
+    ) -> None:
         """Log a frame. The time this takes is recorded as the stage ``viewer``."""
         with slam.timer("viewer"):
             self._stream.set_time("frame", sequence=frame.index)
@@ -99,8 +102,8 @@ class RerunViewer:
             self._pending_keyframe = slam.back_end.keyframe
             self._stream.log("world/trajectory/newest", _lines([np.array(self._newest)], "tab:blue"))
             self._log_groundtruth(frame.stamp, T_wc, slam.poses.status)
-            for stage, seconds in stage_seconds.items():
-                self._stream.log(f"seconds/{stage}", rr.Scalars(seconds))
+            for stage, spent in stage_times.items():
+                self._stream.log(f"seconds/{stage}", rr.Scalars(spent.wall))
             self._log_text(frame, objects, slam, is_keyframe)
 
     def finish(self, slam: V3DSLAM) -> None:
