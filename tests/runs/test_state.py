@@ -67,6 +67,6 @@ def test_checkpoint_is_not_loaded_as_the_state_of_a_system(tmp_path: Path) -> No
 def test_file_without_the_state_of_a_system_is_rejected(tmp_path: Path) -> None:
     write_state(tmp_path / "slam.state", {"about": "a test"}, {"value": 1})
     with pytest.raises(
-        InputError, match=r"slam\.state: is not the state of a system; give a file that save_state wrote"
+        InputError, match=r"slam\.state: is not the state of a system; pass a file that save_state wrote"
     ):
         load_state(tmp_path / "slam.state")
