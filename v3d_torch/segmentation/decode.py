@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from functools import cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from v3d_torch.kernels import mask_upsampling as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.segmentation.inference import NetworkOutput
 from v3d_torch.segmentation.letterbox import CELL, Window
 from v3d_torch.segmentation.suppression import non_maximum_suppression
@@ -60,6 +64,32 @@ def decode(
     return Instances(masks=masks, labels=labels, scores=scores, boxes=boxes)[not_empty]
 
 
+def _assemble_masks_compiled(
+    coefficients: Tensor, prototypes: Tensor, boxes: Tensor, window: Window, *, first: tuple[int, int] = (0, 0)
+) -> Tensor:
+    if coefficients.dtype != torch.float32 or prototypes.dtype != torch.float32:
+        return NotImplemented
+    size = (window.image_height, window.image_width)
+    if min(window.height, window.width) < 2 * CELL:
+        return NotImplemented
+    row_cells, row_weights = _interpolation(window.height // CELL, size[0])
+    column_cells, column_weights = _interpolation(window.width // CELL, size[1])
+    logits = (coefficients @ prototypes.flatten(1)).unflatten(1, prototypes.shape[1:])
+    masks = torch.zeros(len(boxes), *size, dtype=torch.bool)
+    kernels.upsample_masks(
+        to_array(logits),
+        to_array(boxes.ceil().long()),
+        (first[0] - window.top // CELL, first[1] - window.left // CELL),
+        row_cells,
+        row_weights,
+        np.searchsorted(column_cells, np.arange(window.width // CELL)),
+        column_weights,
+        masks.numpy(),
+    )
+    return masks
+
+
+@compiled_by(_assemble_masks_compiled)
 def assemble_masks(
     coefficients: Tensor, prototypes: Tensor, boxes: Tensor, window: Window, *, first: tuple[int, int] = (0, 0)
 ) -> Tensor:
@@ -117,6 +147,14 @@ def _inside(boxes: Tensor) -> list[list[int]]:
 def _upsampling_matrix(cells: int, pixels: int) -> Tensor:
     """Linear interpolation from cells to pixels of the same extent, as a matrix, shape (pixels, cells)."""
     return functional.interpolate(torch.eye(cells)[None], pixels, mode="linear")[0].T
+
+
+@cache
+def _interpolation(cells: int, pixels: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Non-zero elements of `_upsampling_matrix`: first of two cells, shape (pixels,), and weights, (pixels, 2)."""
+    upsampling = _upsampling_matrix(cells, pixels).numpy()
+    first = np.minimum((upsampling > 0).argmax(axis=1), cells - 2)
+    return first, np.take_along_axis(upsampling, np.stack([first, first + 1], axis=1), axis=1)
 
 
 def _cell_range(first: int, last: int, upsampling: Tensor) -> slice:
