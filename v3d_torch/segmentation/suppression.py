@@ -64,8 +64,8 @@ def suppress_duplicates(instances: Instances, max_overlap: float) -> Instances:
     """
     if len(instances) < 2:
         return instances
-    cells = np.packbits(instances.masks[:, ::_STRIDE, ::_STRIDE].numpy().reshape(len(instances), -1), axis=1)
-    intersection = _count_common_bits(cells)
+    rows = np.ascontiguousarray(instances.masks.numpy()[:, ::_STRIDE])  # faster than both strides at once
+    intersection = _count_common_bits(np.packbits(rows[:, :, ::_STRIDE].reshape(len(instances), -1), axis=1))
     area = intersection.diagonal()
     contained = intersection / area[:, None].clamp(min=1)  # [i, j]: fraction of i that lies within j
     same_label = instances.labels[:, None] == instances.labels
