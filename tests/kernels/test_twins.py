@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from v3d_torch import V3DSLAM, load_sequence
+from v3d_torch.config import SegmentationConfig
 from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
+from v3d_torch.segmentation import YOLOSegmenter
 from v3d_torch.segmentation.mask_files import MaskFolder
 
 pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
@@ -24,6 +26,9 @@ Call = tuple[tuple[Any, ...], dict[str, Any]]
 
 FRAMES = range(40, 64)
 """Frames of the demo in which people walk through the image, and some of which become keyframes."""
+
+SEGMENTED = 6
+"""Every n-th of these frames is also segmented by the network; the run itself reads masks from files."""
 
 MAX_CALLS = 8
 """Calls of each function that are replayed, spread over the run."""
@@ -51,6 +56,9 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         for frame in sequence:
             slam(frame)
         slam.flush()
+        segmenter = YOLOSegmenter(SegmentationConfig())
+        for frame in list(sequence)[::SEGMENTED]:
+            segmenter(frame)
     return recorded
 
 

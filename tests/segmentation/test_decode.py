@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from v3d_torch.segmentation.decode import assemble_masks, decode
+from v3d_torch.segmentation.inference import WholeOutput
 from v3d_torch.segmentation.letterbox import Window
 
 HEIGHT, WIDTH = 96, 128
@@ -28,8 +29,7 @@ def raw_output(boxes: Tensor, labels: list[int], scores: list[float]) -> tuple[T
 
 def decode_whole(predictions: Tensor, prototypes: Tensor, iou_threshold: float | None = 0.7, max_instances: int = 32):
     return decode(
-        predictions,
-        prototypes,
+        WholeOutput(predictions, prototypes),
         WHOLE,
         score_threshold=0.25,
         iou_threshold=iou_threshold,

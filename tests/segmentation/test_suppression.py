@@ -15,7 +15,7 @@ from kornia.geometry.bbox import nms
 from torch import Tensor
 
 from v3d_torch.config import SegmentationConfig
-from v3d_torch.segmentation import yolo
+from v3d_torch.segmentation import inference, yolo
 from v3d_torch.segmentation.suppression import non_maximum_suppression, suppress_duplicates
 from v3d_torch.types import Instances
 
@@ -199,8 +199,8 @@ def test_segmenter_suppresses_duplicates(monkeypatch: pytest.MonkeyPatch) -> Non
     predictions[0, :4, 1], predictions[0, 4, 1] = (32, 16, 32, 32), 0.8
     predictions[0, 84] = 1.0  # each mask fills its box
     session = SimpleNamespace(get_inputs=lambda: [SimpleNamespace(name="in")], run=lambda *_: (predictions, prototypes))
-    monkeypatch.setattr(yolo, "_open_session", lambda *_: session)
-    monkeypatch.setattr(yolo, "_check_layout", lambda *_: (96, 128))
+    monkeypatch.setattr(inference, "open_session", lambda *_: session)
+    monkeypatch.setattr(inference, "_check_layout", lambda *_: (96, 128))
     image = torch.zeros(3, 96, 128, dtype=torch.uint8)
     for max_overlap, scores in ((MAX_OVERLAP, [0.9]), (1.0, [0.9, 0.8])):
         segmenter = yolo.YOLOSegmenter(SegmentationConfig(duplicate_overlap=max_overlap), Path("network.onnx"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -12,18 +13,20 @@ from torch import Tensor, nn
 from v3d_torch.errors import WeightsError
 from v3d_torch.io.download import cache_dir
 from v3d_torch.io.files import atomic_write, file_lock
-from v3d_torch.segmentation.networks import one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
+from v3d_torch.segmentation.networks import LayerGraph, one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
+from v3d_torch.segmentation.networks.head import Segment, boxes_from_distances, cell_grid
+from v3d_torch.segmentation.parts import INNER_TENSORS, OUTPUTS
 from v3d_torch.segmentation.pt_weights import read_pt_weights
 from v3d_torch.segmentation.weights import REGISTRY
 
-_VERSION = 3
+_VERSION = 4
 """Version of the exported files, part of their name: increase it when the export changes, so that files of earlier
 versions in the cache are not used."""
 
 _OPSET = 17
 """ONNX operator set of the exported files."""
 
-_BUILDERS: dict[str, Callable[[], nn.Module]] = {
+_BUILDERS: dict[str, Callable[[], LayerGraph]] = {
     "yolov8n-seg": yolov8n_seg,
     "yolo11n-seg": yolo11n_seg,
     "yolo26n-seg": yolo26n_seg,
@@ -58,7 +61,7 @@ def exported_path(model: str, weights: Path, height: int, width: int) -> Path:
     return target
 
 
-def build(model: str, tensors: dict[str, Tensor]) -> nn.Module:
+def build(model: str, tensors: dict[str, Tensor]) -> LayerGraph:
     """Build a network with given weights, in evaluation mode.
 
     Args:
@@ -78,11 +81,27 @@ def build(model: str, tensors: dict[str, Tensor]) -> nn.Module:
     return network.eval()
 
 
-def export(network: nn.Module, height: int, width: int, path: Path) -> None:
+class _Exported(nn.Module):
+    """A network that also returns the tensors named in `INNER_TENSORS`."""
+
+    def __init__(self, network: LayerGraph) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
+        head = cast("Segment", self.network.model[-1])
+        pyramid = self.network.pyramid(image)
+        distances, scores, coefficients = head.distances(pyramid), head.scores(pyramid), head.coefficients(pyramid)
+        boxes = boxes_from_distances(distances, *cell_grid([level.shape[2:] for level in pyramid]))
+        predictions = torch.cat([boxes, scores, coefficients], dim=1)
+        return predictions, head.proto(pyramid), *pyramid, scores, distances, coefficients
+
+
+def export(network: LayerGraph, height: int, width: int, path: Path) -> None:
     """Write a network as an ONNX file.
 
     The input ``images`` has the shape (1, 3, H, W); the outputs ``output0`` (predictions) and ``output1`` (prototypes)
-    are those of `LayerGraph`.
+    are those of `LayerGraph`. Inside the file, the tensors at which `split` cuts it have the names `INNER_TENSORS`.
 
     Args:
         network: Network in evaluation mode.
@@ -90,15 +109,20 @@ def export(network: nn.Module, height: int, width: int, path: Path) -> None:
         width: Columns of the input, a multiple of 32.
         path: File to write.
     """
+    import onnx  # a slow import, needed only for files that are not in the cache
+
     with warnings.catch_warnings(), torch.inference_mode():
         # Ignore the deprecation warning of this exporter: its successor needs an additional package.
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            network,
+            _Exported(network).eval(),
             (torch.zeros(1, 3, height, width),),
             path,
             input_names=["images"],
-            output_names=["output0", "output1"],
+            output_names=[*OUTPUTS, *INNER_TENSORS],
             opset_version=_OPSET,
             dynamo=False,
         )
+    model = onnx.load(path)
+    del model.graph.output[len(OUTPUTS) :]  # the inner tensors keep their names
+    onnx.save(model, path)

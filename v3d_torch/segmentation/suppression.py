@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.types import Instances
@@ -60,12 +62,22 @@ def suppress_duplicates(instances: Instances, max_overlap: float) -> Instances:
     Returns:
         The remaining instances, in the same order.
     """
-    masks = instances.masks[:, ::_STRIDE, ::_STRIDE].flatten(1).to(torch.float32)
-    area = masks.sum(dim=1)
-    contained = (masks @ masks.T) / area[:, None].clamp(min=1)  # [i, j]: fraction of i that lies within j
+    if len(instances) < 2:
+        return instances
+    rows = np.ascontiguousarray(instances.masks.numpy()[:, ::_STRIDE])  # faster than both strides at once
+    intersection = _count_common_bits(np.packbits(rows[:, :, ::_STRIDE].reshape(len(instances), -1), axis=1))
+    area = intersection.diagonal()
+    contained = intersection / area[:, None].clamp(min=1)  # [i, j]: fraction of i that lies within j
     same_label = instances.labels[:, None] == instances.labels
     duplicates = (contained > max_overlap) & (same_label | (max_overlap < contained.T))
-    keep = torch.zeros(len(instances), dtype=torch.bool)
-    for i in range(len(instances)):  # sequential: each decision depends on those before it
-        keep[i] = not (duplicates[i] & keep).any()
-    return instances[keep]
+    keep: list[bool] = []
+    for row in duplicates.tolist():  # sequential: each decision depends on those before it
+        keep.append(not any(is_duplicate and kept for is_duplicate, kept in zip(row, keep, strict=False)))
+    return instances[torch.tensor(keep)]
+
+
+def _count_common_bits(rows: NDArray[np.uint8]) -> Tensor:
+    """Number of bits that are set in both of two rows, for all pairs, float32, shape (N, N)."""
+    words = np.zeros((len(rows), -(-rows.shape[1] // 8)), np.uint64)
+    words.view(np.uint8)[:, : rows.shape[1]] = rows
+    return torch.from_numpy(np.stack([np.bitwise_count(row & words).sum(axis=1, dtype=np.float32) for row in words]))

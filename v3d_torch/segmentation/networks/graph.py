@@ -12,7 +12,7 @@ output of the previous layer alone, without a list."""
 
 
 class LayerGraph(nn.Module):
-    """Layers that run in order; the output of the last layer is the output of the network.
+    """Layers that run in order; the last layer is the head, and its output is the output of the network.
 
     Args:
         layers: Sources and module of each layer.
@@ -33,9 +33,14 @@ class LayerGraph(nn.Module):
             Output of the head: predictions, shape :math:`(B, 116, N)`, and prototypes, shape
             :math:`(B, 32, H/4, W/4)`; see `Segment`.
         """
+        predictions, prototypes = self.model[-1](self.pyramid(image))
+        return predictions, prototypes
+
+    def pyramid(self, image: Tensor) -> list[Tensor]:
+        """Run all layers except the head; returns the feature maps that are its input, finest first."""
         outputs: list[Any] = []
         x: Any = image
-        for sources, layer in zip(self.sources, self.model, strict=True):
+        for sources, layer in zip(self.sources[:-1], self.model[:-1], strict=True):
             x = layer([outputs[index] for index in sources] if sources else x)
             outputs.append(x)
-        return x
+        return [outputs[index] for index in self.sources[-1]]

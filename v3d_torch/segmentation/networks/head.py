@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -33,10 +33,9 @@ class DFL(nn.Module):
 
     def forward(self, logits: Tensor) -> Tensor:
         """Convert logits of shape :math:`(B, 4 bins, N)` to distances of shape :math:`(B, 4, N)`."""
-        batch, _, cells = logits.shape
         # The bins are the last dimension, because onnxruntime is slow for a softmax over any other. It is also slow for
         # the product of a matrix and a short vector, hence the explicit sum.
-        distribution = logits.view(batch, 4, self.bins, cells).transpose(2, 3).softmax(dim=3)
+        distribution = logits.unflatten(1, (4, self.bins)).transpose(2, 3).softmax(dim=3)
         return (distribution * self.conv.weight.view(self.bins)).sum(dim=3)
 
 
@@ -88,29 +87,55 @@ class Segment(nn.Module):
             Predictions, shape :math:`(B, 4 + 80 + 32, N)`: centre and size of the box in pixels of the network input,
             class scores in [0, 1], mask coefficients; and prototypes, shape :math:`(B, 32, H/4, W/4)`.
         """
-        # Distances from the cell centre to the left, top, right and bottom edge of the box, in strides.
-        distances = self.dfl(_apply_branches(self.cv2, pyramid))  # B x 4 x N
-        scores = _apply_branches(self.cv3, pyramid).sigmoid()
-        coefficients = _apply_branches(self.cv4, pyramid)
-        centres, strides = _cell_grid(pyramid)
-        to_left_top, to_right_bottom = distances.chunk(2, dim=1)
-        boxes = torch.cat([centres + (to_right_bottom - to_left_top) / 2, to_left_top + to_right_bottom], dim=1)
-        boxes = boxes * strides
-        return torch.cat([boxes, scores, coefficients], dim=1), self.proto(pyramid)
+        boxes = boxes_from_distances(self.distances(pyramid), *cell_grid([level.shape[2:] for level in pyramid]))
+        return torch.cat([boxes, self.scores(pyramid), self.coefficients(pyramid)], dim=1), self.proto(pyramid)
+
+    def distances(self, pyramid: list[Tensor]) -> Tensor:
+        """Distances from the cell centre to the left, top, right and bottom edge, in strides, shape (B, 4, N)."""
+        distances: Tensor = self.dfl(_apply_branches(self.cv2, pyramid))
+        return distances
+
+    def scores(self, pyramid: list[Tensor]) -> Tensor:
+        """Class scores in [0, 1], shape (B, 80, N)."""
+        return _apply_branches(self.cv3, pyramid).sigmoid()
+
+    def coefficients(self, pyramid: list[Tensor]) -> Tensor:
+        """Mask coefficients, shape (B, 32, N)."""
+        return _apply_branches(self.cv4, pyramid)
+
+
+def boxes_from_distances(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
+    """Centre and size of boxes, pixels of the network input.
+
+    Args:
+        distances: Distances from the cell centre to the left, top, right and bottom edge, in strides, shape
+            :math:`(B, 4, N)`.
+        centres: Centres (x, y) of the cells in units of their stride, shape :math:`(2, N)`.
+        strides: Strides of the cells, pixels, shape :math:`(N,)`.
+
+    Returns:
+        Centre x, centre y, width and height, shape :math:`(B, 4, N)`.
+    """
+    to_left_top, to_right_bottom = distances.chunk(2, dim=1)
+    boxes = torch.cat([centres + (to_right_bottom - to_left_top) / 2, to_left_top + to_right_bottom], dim=1)
+    return boxes * strides
+
+
+def cell_grid(sizes: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
+    """Centres (x, y) of all cells in units of their stride, shape (2, N), and the strides in pixels, shape (N,).
+
+    Args:
+        sizes: Rows and columns of each pyramid level, finest first.
+    """
+    centres, strides = [], []
+    for size, stride in zip(sizes, STRIDES, strict=True):
+        height, width = map(int, size)  # Python numbers become constants in the export
+        y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        centres.append(torch.stack([x, y]).flatten(1))
+        strides.append(torch.full((height * width,), float(stride)))
+    return torch.cat(centres, dim=1), torch.cat(strides)
 
 
 def _apply_branches(branches: nn.ModuleList, pyramid: list[Tensor]) -> Tensor:
     """Apply to each level its branch and join the cells of all levels, shape (B, C, N)."""
     return torch.cat([branch(level).flatten(2) for branch, level in zip(branches, pyramid, strict=True)], dim=2)
-
-
-def _cell_grid(pyramid: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Centres (x, y) of all cells in units of their stride, shape (2, N), and the strides in pixels, shape (N,)."""
-    centres, strides = [], []
-    for level, stride in zip(pyramid, STRIDES, strict=True):
-        height, width = (int(size) for size in level.shape[2:])  # Python numbers become constants in the export
-        rows, columns = torch.arange(height, dtype=level.dtype), torch.arange(width, dtype=level.dtype)
-        y, x = torch.meshgrid(rows + 0.5, columns + 0.5, indexing="ij")
-        centres.append(torch.stack([x, y]).flatten(1))
-        strides.append(torch.full((height * width,), float(stride), dtype=level.dtype))
-    return torch.cat(centres, dim=1), torch.cat(strides)
