@@ -48,7 +48,7 @@ def test_part_of_an_image_is_smoothed_like_a_copy() -> None:
     assert torch.equal(TWIN.compiled(depth), TWIN.compiled(depth.clone()))
 
 
-@pytest.mark.parametrize("shape", [(2, 1, 8, 8), (1, 2, 8, 8), (8, 8)])
+@pytest.mark.parametrize("shape", [(1, 2, 8, 8), (8, 8)])
 def test_other_shapes_are_left_to_torch(shape: tuple[int, ...]) -> None:
     assert TWIN.compiled(torch.ones(shape)) is NotImplemented
     assert TWIN.compiled(torch.ones(1, 1, 8, 8, dtype=torch.float64)) is NotImplemented

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.filters import get_gaussian_kernel1d
@@ -21,12 +22,14 @@ _STRIP_HEIGHT = 120
 
 
 def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> Tensor:
-    is_one_image = depth.dtype == torch.float32 and depth.ndim == 4 and depth.shape[:2] == (1, 1)
-    if not is_one_image or kernel_size < 1 or kernel_size % 2 == 0:
+    is_image = depth.dtype == torch.float32 and depth.ndim == 4 and depth.shape[1] == 1
+    if not is_image or kernel_size < 1 or kernel_size % 2 == 0:
         return NotImplemented
-    taps = torch.tensor(_gaussian(kernel_size, sigma), dtype=torch.float32)
-    smoothed = kernels.smooth_depth(to_array(depth[0, 0]), to_array(taps), edge_ratio, _MAX_VALID_DEPTH)
-    return torch.from_numpy(smoothed)[None, None]
+    taps = np.array(_gaussian(kernel_size, sigma), np.float32)
+    smoothed = torch.empty(depth.shape)
+    for image, result in zip(depth[:, 0], smoothed[:, 0], strict=True):
+        kernels.smooth_depth(to_array(image), taps, edge_ratio, _MAX_VALID_DEPTH, result.numpy())
+    return smoothed
 
 
 @compiled_by(_smooth_depth_compiled)

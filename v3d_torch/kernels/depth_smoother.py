@@ -29,8 +29,8 @@ def _accumulate(
         weights[x] += gate * weight[x]
 
 
-@kernel("(f4[:,::1], f4[::1], f4, f4)")
-def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: np.float32) -> Image:
+@kernel("(f4[:,::1], f4[::1], f4, f4, f4[:,::1])")
+def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: np.float32, smoothed: Image) -> None:
     """Smooth a depth image in one sweep: rows first, then columns as soon as all rows of a window are summed.
 
     Args:
@@ -38,9 +38,7 @@ def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: n
         taps: Weights of the Gaussian from the centre outwards, (R + 1,).
         edge_ratio: Largest accepted difference from the centre's depth, as a fraction of the centre's depth.
         max_depth: Depth beyond this counts as missing, metres.
-
-    Returns:
-        Smoothed depth, metres, (H, W); 0 for pixels without measurement.
+        smoothed: Result: smoothed depth, metres, (H, W); 0 for pixels without measurement.
     """
     height, width = depth.shape
     radius, size = len(taps) - 1, 2 * len(taps) - 1
@@ -51,7 +49,6 @@ def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: n
     totals, weights = np.empty((size, width), np.float32), np.empty((size, width), np.float32)
     zeros, ones = np.zeros(width, np.float32), np.ones(width, np.float32)
     total, weight = np.empty(width, np.float32), np.empty(width, np.float32)
-    smoothed = np.empty((height, width), np.float32)
     inside = slice(radius, radius + width)
     for row in range(height + radius):
         if row < height:
@@ -89,4 +86,3 @@ def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: n
         for x in range(width):
             mean = centre[x] + total[x] / weight[x]
             result[x] = mean if centre[x] > 0 else zero
-    return smoothed
