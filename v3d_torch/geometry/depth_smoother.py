@@ -26,9 +26,10 @@ def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1
     if not is_image or kernel_size < 1 or kernel_size % 2 == 0:
         return NotImplemented
     taps = np.array(_gaussian(kernel_size, sigma), np.float32)
+    limits = np.float32(edge_ratio), np.float32(_MAX_VALID_DEPTH)
     smoothed = torch.empty(depth.shape)
     for image, result in zip(depth[:, 0], smoothed[:, 0], strict=True):
-        kernels.smooth_depth(to_array(image), taps, edge_ratio, _MAX_VALID_DEPTH, result.numpy())
+        kernels.smooth_depth(to_array(image), taps, *limits, result.numpy())
     return smoothed
 
 
