@@ -60,16 +60,17 @@ def _neighbouring_cells(keys: Ints, side_y: int, side_z: int) -> Ints:
 
 @device
 def _find_core_points(points: Points, begins: Ints, pairs: Ints, squared_radius: float, min_samples: int) -> Mask:
-    """Core points, shape (N,). Counts are not complete in cells that have enough points themselves."""
+    """Core points, shape (N,). Neighbours of a point are counted only until it is a core point."""
     sizes = begins[1:] - begins[:-1]
     neighbours = np.repeat(sizes, sizes)
     for a, b in pairs:
         if sizes[a] < min_samples or sizes[b] < min_samples:
             for i in range(begins[a], begins[a + 1]):
                 for j in range(begins[b], begins[b + 1]):
-                    near = _is_near(points, i, j, squared_radius)
-                    neighbours[i] += near
-                    neighbours[j] += near
+                    is_open = neighbours[i] < min_samples or neighbours[j] < min_samples
+                    if is_open and _is_near(points, i, j, squared_radius):
+                        neighbours[i] += 1
+                        neighbours[j] += 1
     return neighbours >= min_samples
 
 
@@ -132,8 +133,12 @@ def dbscan(points: Points, eps: float, min_samples: int) -> Ints:
                 clusters[root] = next_cluster
                 next_cluster += 1
             clusters[cells[k]] = clusters[root]
-    found = clusters[cells]
-    for a, b in pairs:  # border points
+    found, has_border = clusters[cells], np.zeros(len(parents), np.bool_)
+    for k in range(count):
+        has_border[cells[k]] |= not core[k]
+    for a, b in pairs:
+        if not (has_border[a] or has_border[b]):
+            continue
         for i in range(begins[a], begins[a + 1]):
             for j in range(begins[b], begins[b + 1]):
                 if core[i] != core[j] and _is_near(points, i, j, squared):

@@ -83,7 +83,8 @@ def _compute_clouds_compiled(
     points, valid = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.bool_)
     for i, (cloud, selected) in enumerate(clouds):
         points[i, : len(cloud)], valid[i, : len(cloud)] = cloud, selected
-    return _with_centroids(*map(torch.from_numpy, (points, valid, cloud_pixels)), config.min_points)
+    pixels = torch.from_numpy(cloud_pixels)
+    return _with_centroids(torch.from_numpy(points), torch.from_numpy(valid), pixels, config.min_points)
 
 
 @compiled_by(_compute_clouds_compiled)
