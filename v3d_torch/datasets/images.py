@@ -117,8 +117,13 @@ def depth_to_metres(units: NDArray[Any], depth_scale: float) -> Tensor:
     Returns:
         Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
     """
-    invalid = torch.from_numpy((units < 0) | (units >= SATURATED_DEPTH))
-    return torch.from_numpy(units.astype(np.float32)).div_(depth_scale).masked_fill_(invalid, 0.0).unsqueeze(0)
+    invalid = units >= SATURATED_DEPTH
+    if units.dtype.kind != "u":
+        invalid |= units < 0
+    metres = np.divide(units, np.float32(depth_scale), dtype=np.float32, order="C")
+    if invalid.any():
+        metres[invalid] = 0
+    return torch.from_numpy(metres).unsqueeze(0)
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from kornia.filters import get_gaussian_kernel1d
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
+from v3d_torch.kernels import depth_smoother as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _MAX_VALID_DEPTH = 1e5
 """Depth beyond this counts as missing, metres. Missing pixels get a placeholder that differs from any depth by more."""
@@ -16,6 +21,19 @@ _STRIP_HEIGHT = 120
 """Rows filtered at a time. The intermediate results of a strip stay in the processor's cache."""
 
 
+def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> Tensor:
+    is_image = depth.dtype == torch.float32 and depth.ndim == 4 and depth.shape[1] == 1
+    if not is_image or kernel_size < 1 or kernel_size % 2 == 0:
+        return NotImplemented
+    taps = np.array(_gaussian(kernel_size, sigma), np.float32)
+    limits = np.float32(edge_ratio), np.float32(_MAX_VALID_DEPTH)
+    smoothed = torch.empty(depth.shape)
+    for image, result in zip(depth[:, 0], smoothed[:, 0], strict=True):
+        kernels.smooth_depth(to_array(image), taps, *limits, result.numpy())
+    return smoothed
+
+
+@compiled_by(_smooth_depth_compiled)
 def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> Tensor:
     r"""Smooth a depth image without filling holes and without blurring across depth edges.
 
@@ -48,8 +66,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     if kernel_size < 1 or kernel_size % 2 == 0:
         raise ConfigError(f"depth.kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
     radius = kernel_size // 2
-    gaussian = get_gaussian_kernel1d(kernel_size, torch.tensor([[sigma]], dtype=torch.float64))[0]
-    taps, height = gaussian[radius:].tolist(), depth.shape[-2]
+    taps, height = _gaussian(kernel_size, sigma), depth.shape[-2]
     strips = []
     for top in range(0, height, _STRIP_HEIGHT):
         margin = min(radius, top)
@@ -58,7 +75,14 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     return torch.cat(strips, dim=-2)
 
 
-def _smooth(depth: Tensor, taps: list[float], edge_ratio: float) -> Tensor:
+@cache
+def _gaussian(kernel_size: int, sigma: float) -> tuple[float, ...]:
+    """Return the weights of a Gaussian from the centre outwards."""
+    gaussian: Tensor = get_gaussian_kernel1d(kernel_size, torch.tensor([[sigma]], dtype=torch.float64))[0]
+    return tuple(gaussian[kernel_size // 2 :].tolist())
+
+
+def _smooth(depth: Tensor, taps: tuple[float, ...], edge_ratio: float) -> Tensor:
     """Smooth an image with a Gaussian, given by its weights from the centre outwards.
 
     The filter averages differences to the centre, not depths. So no quotient is 0 / 0, because the centre always has
@@ -74,7 +98,7 @@ def _smooth(depth: Tensor, taps: list[float], edge_ratio: float) -> Tensor:
 
 
 def _convolve(
-    total: Tensor, weight: Tensor, z: Tensor, max_difference: Tensor, taps: list[float], dim: int
+    total: Tensor, weight: Tensor, z: Tensor, max_difference: Tensor, taps: tuple[float, ...], dim: int
 ) -> tuple[Tensor, Tensor]:
     """Accumulate weighted depth differences along one dimension.
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.kernels import voxel as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _MAX_VOXELS = 2**62
 """Largest bounding box, voxels. Larger boxes cannot be numbered with 64-bit integers."""
@@ -33,6 +35,24 @@ class Voxels(NamedTuple):
     voxel_index: Tensor
 
 
+def _voxel_pool_compiled(points: Tensor, valid: Tensor, size: float) -> Voxels:
+    is_cloud = points.dtype == torch.float32 and points.ndim == 3 and points.shape[2] == 3
+    if not is_cloud or points.shape[:2] != valid.shape or size <= 0:
+        return NotImplemented
+    mask, coordinates = valid.numpy(), to_array(points)
+    limits = np.float32(size), float(_MAX_VOXELS)
+    pooled = [kernels.pool_voxels(cloud[present], *limits) for cloud, present in zip(coordinates, mask, strict=True)]
+    if any(len(index) > 0 and len(means) == 0 for means, _, index in pooled):
+        return NotImplemented
+    shape = len(pooled), max((len(means) for means, _, _ in pooled), default=0)
+    means, counts, voxel_index = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.int64), np.full(mask.shape, -1)
+    for i, (cloud_means, cloud_counts, index) in enumerate(pooled):
+        means[i, : len(cloud_means)], counts[i, : len(cloud_means)] = cloud_means, cloud_counts
+        voxel_index[i, mask[i]] = index
+    return Voxels(*map(torch.from_numpy, (means, counts > 0, counts, voxel_index)))
+
+
+@compiled_by(_voxel_pool_compiled)
 def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     """Replace the points of each voxel by their mean.
 

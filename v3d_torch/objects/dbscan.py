@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.kernels import dbscan as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _MAX_PAIRS = 2**25
 """Upper bound on the number of neighbour pairs that are listed at once. It bounds memory."""
@@ -33,6 +35,22 @@ Ints = NDArray[np.signedinteger]
 Pairs = tuple[Ints, Ints]
 
 
+def _dbscan_compiled(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape or eps <= 0 or min_samples < 1:
+        return NotImplemented
+    mask, coordinates = valid.numpy(), to_array(points)
+    labels = np.full(mask.shape, -1)
+    for cloud, present, found in zip(coordinates, mask, labels, strict=True):
+        selected = cloud[present].astype(np.float64)
+        if not np.isfinite(selected).all():
+            return NotImplemented
+        if len(selected) and np.ptp(selected, axis=0).max() > kernels.MAX_CELLS * eps / 2:
+            return NotImplemented
+        found[present] = kernels.dbscan(selected, eps, min_samples)
+    return torch.from_numpy(labels)
+
+
+@compiled_by(_dbscan_compiled)
 def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
     """Label the density-connected clusters of every cloud of a batch.
 

@@ -6,11 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.voxel import voxel_pool
+from v3d_torch.kernels import instance_clouds as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.dbscan import MAX_CELLS
 from v3d_torch.objects.dbscan import dbscan
 from v3d_torch.objects.largest_clusters import largest_clusters
 from v3d_torch.objects.mask_ops import upsample_nearest
@@ -59,37 +63,70 @@ class InstanceBackProjector:
         Returns:
             Clouds in the order of the instances.
         """
-        config = self._config
-        points, valid, pixel = self._back_project(depth, instances)
-        points, valid, _, voxel = voxel_pool(points, valid, config.voxel_size)
-        labels = dbscan(points, valid, config.eps, config.min_samples)
-        # The paper keeps as many clusters as there are instances. Here each instance has its own cloud and keeps one.
-        valid = largest_clusters(labels, valid, 1)
-        count = valid.sum(dim=1)
-        centroid = (points * valid[..., None]).sum(dim=1) / count.clamp(min=1)[:, None]
-        centroid[count < config.min_points] = torch.nan
-        return InstanceClouds(points, valid, centroid, self._cloud_pixels(instances.masks, valid, voxel, pixel))
+        return _compute_clouds(depth[0], instances.masks, self._rays, self._config)
 
-    def _cloud_pixels(self, masks: Tensor, valid: Tensor, voxel: Tensor, pixel: Tensor) -> Tensor:
-        """Return the pixels of each mask whose point lies in a valid voxel, bool, shape (N, H, W)."""
-        step = self._config.stride
-        cells = torch.zeros_like(masks[:, ::step, ::step])
-        instance, point = torch.nonzero(voxel >= 0, as_tuple=True)
-        cells.flatten(1)[instance, pixel[instance, point]] = valid[instance, voxel[instance, point]]
-        return upsample_nearest(cells.numpy(), step, masks.shape[-2:]) & masks
 
-    def _back_project(self, depth: Tensor, instances: Instances) -> tuple[Tensor, Tensor, Tensor]:
-        """Back-project every n-th masked pixel with depth.
+def _compute_clouds_compiled(
+    depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig
+) -> InstanceClouds:
+    # No cloud is wider than this, and the kernels number only that many cells.
+    max_width = 2 * config.max_depth * max(float(np.abs(rays).max()), 1.0)
+    if depth.dtype != torch.float32 or max_width > MAX_CELLS / 2 * min(config.eps, config.voxel_size):
+        return NotImplemented
+    parameters = np.float32(config.max_depth), np.float32(config.voxel_size), config.eps, config.min_samples
+    z, cloud_pixels = to_array(depth), np.zeros(masks.shape, np.bool_)
+    clouds = [
+        kernels.instance_cloud(z, mask, rays, config.stride, *parameters, pixels)
+        for mask, pixels in zip(to_array(masks), cloud_pixels, strict=True)
+    ]
+    shape = len(clouds), max((len(points) for points, _ in clouds), default=0)
+    points, valid = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.bool_)
+    for i, (cloud, selected) in enumerate(clouds):
+        points[i, : len(cloud)], valid[i, : len(cloud)] = cloud, selected
+    pixels = torch.from_numpy(cloud_pixels)
+    return _with_centroids(torch.from_numpy(points), torch.from_numpy(valid), pixels, config.min_points)
 
-        Returns:
-            Points :math:`(N, P, 3)`, their validity :math:`(N, P)`, and their row-major pixel indices :math:`(N, P)`.
-        """
-        step = self._config.stride
-        z = depth[0, ::step, ::step].numpy()
-        masks = instances.masks.numpy()[:, ::step, ::step] & ((z > 0) & (z <= self._config.max_depth))
-        count = np.count_nonzero(masks, axis=(1, 2))
-        valid = np.arange(max(count.max(initial=0), 1)) < count[:, None]
-        pixel = np.flatnonzero(masks) % z.size
-        pixels, points = np.zeros(valid.shape, np.int64), np.zeros((*valid.shape, 3), np.float32)
-        pixels[valid], points[valid] = pixel, self._rays[pixel] * z.ravel()[pixel, None]
-        return torch.from_numpy(points), torch.from_numpy(valid), torch.from_numpy(pixels)
+
+@compiled_by(_compute_clouds_compiled)
+def _compute_clouds(depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig) -> InstanceClouds:
+    """Compute the clouds of masks (N, H, W) of a depth image (H, W); ``rays`` are those of every n-th pixel, (R, 3)."""
+    points, valid, pixel = _back_project(depth, masks, rays, config)
+    points, valid, _, voxel = voxel_pool(points, valid, config.voxel_size)
+    labels = dbscan(points, valid, config.eps, config.min_samples)
+    # The paper keeps as many clusters as there are instances. Here each instance has its own cloud and keeps one.
+    valid = largest_clusters(labels, valid, 1)
+    return _with_centroids(points, valid, _cloud_pixels(masks, valid, voxel, pixel, config.stride), config.min_points)
+
+
+def _with_centroids(points: Tensor, valid: Tensor, cloud_pixels: Tensor, min_points: int) -> InstanceClouds:
+    count = valid.sum(dim=1)
+    centroid = (points * valid[..., None]).sum(dim=1) / count.clamp(min=1)[:, None]
+    centroid[count < min_points] = torch.nan
+    return InstanceClouds(points, valid, centroid, cloud_pixels)
+
+
+def _cloud_pixels(masks: Tensor, valid: Tensor, voxel: Tensor, pixel: Tensor, step: int) -> Tensor:
+    """Return the pixels of each mask whose point lies in a valid voxel, bool, shape (N, H, W)."""
+    cells = torch.zeros_like(masks[:, ::step, ::step])
+    instance, point = torch.nonzero(voxel >= 0, as_tuple=True)
+    cells.flatten(1)[instance, pixel[instance, point]] = valid[instance, voxel[instance, point]]
+    return upsample_nearest(cells.numpy(), step, masks.shape[-2:]) & masks
+
+
+def _back_project(
+    depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Back-project every n-th masked pixel with depth.
+
+    Returns:
+        Points :math:`(N, P, 3)`, their validity :math:`(N, P)`, and their row-major pixel indices :math:`(N, P)`.
+    """
+    step = config.stride
+    z = depth[::step, ::step].numpy()
+    selected = masks.numpy()[:, ::step, ::step] & ((z > 0) & (z <= config.max_depth))
+    count = np.count_nonzero(selected, axis=(1, 2))
+    valid = np.arange(max(count.max(initial=0), 1)) < count[:, None]
+    pixel = np.flatnonzero(selected) % z.size
+    pixels, points = np.zeros(valid.shape, np.int64), np.zeros((*valid.shape, 3), np.float32)
+    pixels[valid], points[valid] = pixel, rays[pixel] * z.ravel()[pixel, None]
+    return torch.from_numpy(points), torch.from_numpy(valid), torch.from_numpy(pixels)

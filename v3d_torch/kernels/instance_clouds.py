@@ -1,0 +1,66 @@
+"""Kernel of the instance clouds; see `v3d_torch.objects.instance_clouds`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.dbscan import dbscan
+from v3d_torch.kernels.radix_sort import Ints
+from v3d_torch.kernels.voxel import Points, pool_voxels
+
+Depth = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+
+@device
+def _select_largest(labels: Ints) -> Mask:
+    """Points of the largest cluster, shape (N,); of two of the same size, the one with the lower label."""
+    sizes = np.zeros(len(labels) + 1, np.int64)
+    for label in labels:
+        sizes[label] += label >= 0
+    return labels == (sizes.argmax() if sizes.max() > 0 else len(labels))
+
+
+@kernel("(f4[:,::1], b1[:,::1], f4[:,::1], i8, f4, f4, f8, i8, b1[:,::1])")
+def instance_cloud(
+    depth: Depth, mask: Mask, rays: Points, step: int, max_depth: np.float32, voxel_size: np.float32, eps: float,
+    min_samples: int, cloud_pixels: Mask,
+) -> tuple[Points, Mask]:  # fmt: skip
+    """Back-project one instance, pool its points, and select the largest cluster.
+
+    Args:
+        depth: Depth, metres, (H, W); 0 = no measurement.
+        mask: Pixels of the instance, (H, W).
+        rays: Ray of every n-th pixel, in row-major order, (R, 3).
+        step: Distance of two pixels with a ray, pixels.
+        max_depth: Largest depth of a point, metres.
+        voxel_size: Side of a voxel, metres.
+        eps: Radius of DBSCAN, metres.
+        min_samples: Number of points in a neighbourhood that makes its centre a core point.
+        cloud_pixels: Result: pixels of the mask whose point belongs to the largest cluster, (H, W); False before.
+
+    Returns:
+        Mean point of each voxel, metres, (M, 3), and mask of the voxels in the largest cluster, (M,).
+    """
+    height, width = depth.shape
+    points, pixels, count, ray = np.empty((len(rays), 3), np.float32), np.empty((len(rays), 2), np.int64), 0, 0
+    for row in range(0, height, step):
+        for column in range(0, width, step):
+            z = depth[row, column]
+            if mask[row, column] and z > 0 and z <= max_depth:
+                for axis in range(3):
+                    points[count, axis] = rays[ray, axis] * z
+                pixels[count, 0], pixels[count, 1] = row, column
+                count += 1
+            ray += 1
+    means, _, voxels = pool_voxels(points[:count], voxel_size, np.inf)
+    selected = _select_largest(dbscan(means.astype(np.float64), eps, min_samples))
+    for i in range(count):
+        if selected[voxels[i]]:
+            row, column = pixels[i]
+            for v in range(row, min(row + step, height)):
+                for u in range(column, min(column + step, width)):
+                    cloud_pixels[v, u] = mask[v, u]
+    return means, selected

@@ -1,0 +1,54 @@
+"""Kernel of the voxel pooling; see `v3d_torch.geometry.voxel`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels.compiler import kernel
+from v3d_torch.kernels.radix_sort import Ints, argsort
+
+Points = NDArray[np.float32]
+
+
+@kernel("(f4[:,::1], f4, f8)")
+def pool_voxels(points: Points, size: np.float32, max_voxels: float) -> tuple[Points, Ints, Ints]:
+    """Mean point of each occupied voxel of one cloud, sorted by x, then y, then z.
+
+    Args:
+        points: Points, metres, (N, 3).
+        size: Side of a voxel, metres.
+        max_voxels: Upper bound of the bounding box, voxels.
+
+    Returns:
+        Means (M, 3), number of points in each voxel (M,), index of each point's voxel (N,). No voxels if the bounding
+        box is too large or a point is not finite.
+    """
+    count = len(points)
+    cells = np.empty((count, 3), np.float32)
+    low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+    finite = True
+    for i in range(count):
+        for axis in range(3):
+            cell = np.floor(points[i, axis] / size)
+            finite &= np.isfinite(cell)
+            cells[i, axis], low[axis], high[axis] = cell, min(low[axis], cell), max(high[axis], cell)
+    means, sizes, voxels = np.zeros((count, 3), np.float32), np.zeros(count, np.int64), np.empty(count, np.int64)
+    sides = high.astype(np.float64) - low + 1
+    if count == 0 or not finite or not sides[0] * sides[1] * sides[2] < max_voxels:
+        return means[:0], sizes[:0], voxels
+    keys, (side_y, side_z) = np.empty(count, np.int64), (np.int64(sides[1]), np.int64(sides[2]))
+    for i in range(count):
+        x, y, z = cells[i, 0] - low[0], cells[i, 1] - low[1], cells[i, 2] - low[2]
+        keys[i] = (np.int64(x) * side_y + np.int64(y)) * side_z + np.int64(z)
+    last, voxel = np.int64(-1), -1
+    for i in argsort(keys, keys.max()):
+        voxel += keys[i] != last
+        last, voxels[i] = keys[i], voxel
+        sizes[voxel] += 1
+        for axis in range(3):
+            means[voxel, axis] += points[i, axis]
+    for k in range(voxel + 1):
+        for axis in range(3):
+            means[k, axis] /= np.float32(sizes[k])
+    return means[: voxel + 1], sizes[: voxel + 1], voxels
