@@ -9,16 +9,21 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
+from v3d_torch.kernels import bundle_adjustment as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
 from v3d_torch.optim.reprojection import (
+    MIN_DEPTH,
     Measurements,
     WhitenedMeasurements,
     chi_square,
@@ -26,7 +31,7 @@ from v3d_torch.optim.reprojection import (
     perspective_jacobian,
     whiten,
 )
-from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations
+from v3d_torch.optim.schur import REGULARISATION, NormalEquations, gather_columns, solve_normal_equations
 
 _NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -60,7 +65,6 @@ class BundleResult:
         cost_before: Sum of the robust squared errors at the start.
         cost_after: Sum of the robust squared errors at the result.
         iterations: Number of steps tried.
-        residuals: Residuals at the result.
     """
 
     T_cw: Tensor
@@ -69,7 +73,12 @@ class BundleResult:
     cost_before: float
     cost_after: float
     iterations: int
-    residuals: BundleResiduals
+    _residuals: Callable[[], BundleResiduals]
+
+    @property
+    def residuals(self) -> BundleResiduals:
+        """Residuals at the result."""
+        return self._residuals()
 
 
 @dataclass(frozen=True)
@@ -125,7 +134,46 @@ class BundleResiduals:
         return 2 * first, 2 * second
 
 
+def _bundle_adjust_compiled(
+    T_cw: Tensor,
+    points: Tensor,
+    observations: Observations,
+    camera: PinholeCamera,
+    fixed: Tensor,
+    iterations: int = 10,
+    tolerance: float = 1e-6,
+) -> BundleResult:
+    if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
+        return NotImplemented
+    point, target = to_array(observations.point), whiten(observations, camera)
+    order = np.argsort(point, kind="stable")
+    *state, squared, cost_before, cost_after, steps = kernels.bundle_adjust(
+        to_array(T_cw),
+        to_array(points),
+        to_array(target.scale)[:, order],
+        to_array(target.offset)[:, order],
+        to_array(observations.chi2_threshold)[order],
+        to_array(observations.pose)[order],
+        np.searchsorted(point[order], np.arange(len(points) + 1)),
+        np.flatnonzero(~to_array(fixed)),
+        iterations,
+        tolerance,
+        REGULARISATION,
+        MIN_DEPTH,
+        DAMPING_SCHEDULE,
+    )
+    chi2 = np.empty_like(squared)
+    chi2[order] = squared
+    T_cw, points = map(torch.from_numpy, state)
+
+    def residuals() -> BundleResiduals:
+        return BundleProblem(observations, camera, fixed, len(points)).residuals_at((T_cw, points))[1]
+
+    return BundleResult(T_cw, points, torch.from_numpy(chi2), cost_before, cost_after, steps, residuals)
+
+
 @torch.no_grad()
+@compiled_by(_bundle_adjust_compiled)
 def bundle_adjust(
     T_cw: Tensor,
     points: Tensor,
@@ -154,7 +202,7 @@ def bundle_adjust(
     found = levenberg_marquardt((T_cw, points), problem.residuals_at, problem.step, iterations, tolerance)
     T_cw, points = found.state
     chi2 = problem.in_input_order(chi_square(found.system.in_camera.T, found.system.whitened.T))
-    return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, found.system)
+    return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, lambda: found.system)
 
 
 class BundleProblem:
