@@ -67,6 +67,14 @@ def _linearise(
                 U[row[m], k, 6] += j0 * J[0, 9] + j1 * J[1, 9] + j2 * J[2, 9]
 
 
+@device
+def _find_rows(pose: Index, free: Index, count: int) -> Index:
+    """Index of each observation's pose among the free poses; -1 for fixed poses."""
+    row = np.full(count, -1, np.int64)
+    row[free] = np.arange(len(free))
+    return row[pose]
+
+
 @kernel(
     "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], i8, f8, f8, f8,"
     " UniTuple(f8, 4))"
@@ -97,9 +105,7 @@ def bundle_adjust(
         Poses (K, 4, 4), points (P, 3), squared residuals (M,), cost before and after, number of steps.
     """
     damping, min_damping, max_damping, factor = damping_schedule
-    F, P, M, row_of = len(free), len(points), len(pose), np.full(len(T_cw), -1, np.int64)
-    row_of[free] = np.arange(len(free))
-    row = row_of[pose]
+    F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
     U, V, W = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((M, 3, 6))
     r, weights, chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
     new_r, new_weights, new_chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
@@ -125,3 +131,43 @@ def bundle_adjust(
             r, new_r, weights, new_weights, chi2, new_chi2 = new_r, r, new_weights, weights, new_chi2, chi2
             damping = max(damping / factor, min_damping)
     return T_cw, points, chi2, cost_before, cost, iteration
+
+
+@kernel("(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)")
+def reduced_cost_derivatives(
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, pose: Index, first: Index,
+    free: Index, j: Array, damping: float, regularisation: float, min_depth: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
+
+    Args:
+        T_cw: Poses at the minimum, (K, 4, 4).
+        points: Points at the minimum, world frame, (P, 3).
+        scale: Scale of the whitened residuals, (3, M).
+        offset: Offset of the whitened residuals, (3, M).
+        chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
+        pose: Pose of each observation, sorted by point, (M,).
+        first: First observation of each point, and M, (P + 1,).
+        free: Indices of the poses that move, (F,).
+        j: Derivative of the whitened residuals by the parameter, (M, 3).
+        damping: Damping of the step that follows a change of the parameter.
+        regularisation: Added to the diagonal of the normal equations.
+        min_depth: Smallest depth of a projected point, metres.
+
+    Returns:
+        First and second derivative.
+    """
+    F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
+    r, weights, chi2, W = np.empty((M, 3)), np.empty(M), np.empty(M), np.empty((M, 3, 6))
+    U, V, j_U, j_V = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((F, 6, 7)), np.empty((P, 3, 4))
+    _compute_residuals(T_cw, points, scale, offset, chi2_thresholds, pose, first, min_depth, r, weights, chi2)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, j, weights, j_U, j_V, W)
+    xi, delta = solve_normal_equations(j_U, j_V, W, row, first, damping, regularisation)
+    slope = (xi * U[:, :, 6]).sum() + (delta * V[:, :, 3]).sum()
+    curvature = (xi * j_U[:, :, 6]).sum() + (delta * j_V[:, :, 3]).sum()
+    for m in range(M):
+        for i in range(3):
+            slope += weights[m] * j[m, i] * r[m, i]
+            curvature += weights[m] * j[m, i] * j[m, i]
+    return 2 * slope, 2 * curvature

@@ -61,9 +61,9 @@ def solve_normal_equations(
                 for i in range(3):
                     for k in range(6):
                         h[p, i] += Y[m, i, k] * xi[row[m], k]
-        delta[p, 2] = -h[p, 2] / L[p, 2, 2]
-        delta[p, 1] = (-h[p, 1] - L[p, 2, 1] * delta[p, 2]) / L[p, 1, 1]
-        delta[p, 0] = (-h[p, 0] - L[p, 1, 0] * delta[p, 1] - L[p, 2, 0] * delta[p, 2]) / L[p, 0, 0]
+        delta[p, 2] = -h[p, 2] * L[p, 2, 2]
+        delta[p, 1] = (-h[p, 1] - L[p, 2, 1] * delta[p, 2]) * L[p, 1, 1]
+        delta[p, 0] = (-h[p, 0] - L[p, 1, 0] * delta[p, 1] - L[p, 2, 0] * delta[p, 2]) * L[p, 0, 0]
     return xi, delta
 
 
@@ -78,19 +78,19 @@ def _subtract_product(A: Array, B: Array, S: Array, row: int, column: int) -> No
 
 @device
 def _cholesky(V: Array, damping: float, regularisation: float, L: Array) -> None:
-    """Write the Cholesky factor of a damped (3, 3) block, the first columns of V, to L."""
+    """Write the Cholesky factor of a damped (3, 3) block, the first columns of V, to L, with an inverted diagonal."""
     for i in range(3):
         for k in range(i + 1):
             rest = V[i, k] if i != k else V[i, i] * (1 + damping) + regularisation
             for j in range(k):
                 rest -= L[i, j] * L[k, j]
-            L[i, k] = math.sqrt(rest) if i == k else rest / L[k, k]
+            L[i, k] = 1 / math.sqrt(rest) if i == k else rest * L[k, k]
 
 
 @device
 def _forward(L: Array, B: Array, X: Array) -> None:
-    """Solve ``L X = B`` with a lower triangular (3, 3) matrix and (3, n) matrices B and X."""
+    """Solve ``L X = B`` with a factor of `_cholesky` and (3, n) matrices B and X."""
     for k in range(B.shape[1]):
-        X[0, k] = B[0, k] / L[0, 0]
-        X[1, k] = (B[1, k] - L[1, 0] * X[0, k]) / L[1, 1]
-        X[2, k] = (B[2, k] - L[2, 0] * X[0, k] - L[2, 1] * X[1, k]) / L[2, 2]
+        x = B[0, k] * L[0, 0]
+        y = (B[1, k] - L[1, 0] * x) * L[1, 1]
+        X[0, k], X[1, k], X[2, k] = x, y, (B[2, k] - L[2, 0] * x - L[2, 1] * y) * L[2, 2]
