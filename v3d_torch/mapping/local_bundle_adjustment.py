@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -123,9 +124,12 @@ def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: Rolli
 
 def _select_observations(sparse_map: SparseMap, window: Tensor) -> Tensor:
     """Rows of all observations of active landmarks that the window observes and that have at least two observations."""
-    table = sparse_map.observations
-    usable = table["valid"] & sparse_map.landmarks["active"][table["landmark"]]
-    observed = torch.zeros(len(sparse_map.landmarks), dtype=torch.bool)
-    observed[table["landmark"][usable & torch.isin(table["keyframe"], window)]] = True
-    times = torch.bincount(table["landmark"][usable], minlength=len(sparse_map.landmarks))
-    return torch.nonzero(usable & (observed & (times > 1))[table["landmark"]])[:, 0]
+    # NumPy is faster than torch here.
+    table, count = sparse_map.observations, len(sparse_map.landmarks)
+    keyframe, landmark, valid = (table[name].numpy() for name in ("keyframe", "landmark", "valid"))
+    usable = valid & sparse_map.landmarks["active"].numpy().take(landmark)
+    in_window, observed = np.zeros(len(sparse_map.keyframes), np.bool_), np.zeros(count, np.bool_)
+    in_window[window.numpy()] = True
+    observed[landmark[usable & in_window.take(keyframe)]] = True
+    times = np.bincount(landmark[usable], minlength=count)
+    return torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -174,10 +175,13 @@ class SparseMap(MapTables):
         T_cw[culled] = orthonormalise(
             previous[culled] @ invert(previous[references[culled]]) @ T_cw[references[culled]]
         )
-        T_new_old = (invert(T_cw) @ previous)[self.landmarks["keyframe"]]
-        R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
-        self.landmarks["point"][:] = (R @ self.landmarks["point"][..., None])[..., 0] + t
-        self.landmarks["direction"][:] = (R @ self.landmarks["direction"][..., None])[..., 0]
+        T_new_old = (invert(T_cw) @ previous)[:, :3].permute(1, 2, 0)
+        # One element of the matrices for all landmarks at a time: faster than a small matrix product for each.
+        elements = np.ascontiguousarray(T_new_old.numpy()).take(self.landmarks["keyframe"].numpy(), axis=2)
+        for name, translation in (("point", True), ("direction", False)):
+            x, y, z = self.landmarks[name].numpy().T.copy()
+            moved = elements[:, 0] * x + elements[:, 1] * y + elements[:, 2] * z
+            self.landmarks[name][:] = torch.from_numpy(moved + elements[:, 3] if translation else moved).T
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
@@ -256,15 +260,17 @@ class SparseMap(MapTables):
 
     def _add_observations(self, keyframe: Keyframe, indices: Tensor, landmarks: Tensor) -> None:
         """Add observations by some features of a keyframe, given the landmark IDs of all its features."""
-        features = keyframe.features[indices]
+        if len(indices) == 0:
+            return
+        features = keyframe.features
         keyframe.landmarks[indices] = landmarks[indices]
         self.observations.append(
             keyframe=torch.full_like(indices, keyframe.index),
             landmark=landmarks[indices],
             feature=indices,
-            uv=features.uv,
-            readout_jacobian=features.readout_jacobian,
-            inverse_depth=features.inverse_depth,
-            octave=features.octave,
+            uv=features.uv[indices],
+            readout_jacobian=features.readout_jacobian[indices],
+            inverse_depth=features.inverse_depth[indices],
+            octave=features.octave[indices],
             valid=torch.ones_like(indices, dtype=torch.bool),
         )
