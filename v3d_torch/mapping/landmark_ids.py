@@ -42,31 +42,35 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
     if len(kept) == 0:
         return
     # NumPy is faster than torch for these small arrays; they share the memory of the tables.
-    observations = {name: column.numpy() for name, column in tables.observations.columns.items()}
-    landmarks = {name: column.numpy() for name, column in tables.landmarks.columns.items()}
+    keyframes, observed, features, valid = (
+        tables.observations[name].numpy() for name in ("keyframe", "landmark", "feature", "valid")
+    )
     own, other, count = kept.numpy(), merged.numpy(), len(tables.landmarks)
     new_id, affected = np.arange(count), np.zeros(count, dtype=np.bool_)
     new_id[other] = own
     affected[own] = affected[other] = True
-    rows = np.flatnonzero(observations["valid"] & affected[observations["landmark"]])
-    keyframe, landmark = observations["keyframe"][rows], observations["landmark"][rows]
+    rows = np.flatnonzero(valid & affected.take(observed))
+    keyframe, landmark = keyframes[rows], observed[rows]
 
     # Two observations by one keyframe: the two landmarks of the pair are distinct points.
-    keys, times = np.unique(keyframe * count + new_id[landmark], return_counts=True)
-    distinct = np.isin(own, keys[times > 1] % count)
+    keys = np.sort(keyframe * count + new_id[landmark])
+    is_distinct = np.zeros(count, dtype=np.bool_)
+    is_distinct[keys[1:][keys[1:] == keys[:-1]] % count] = True
+    distinct = is_distinct[own]
     new_id[other[distinct]] = other[distinct]
     own, other = own[~distinct], other[~distinct]
 
     changed = new_id[landmark] != landmark
     rows, keyframe, landmark = rows[changed], keyframe[changed], new_id[landmark[changed]]
-    observations["landmark"][rows] = landmark
-    feature = observations["feature"][rows]
-    for index in np.unique(keyframe):
+    observed[rows] = landmark
+    feature = features[rows]
+    for index in np.flatnonzero(np.bincount(keyframe)):
         of_keyframe = keyframe == index
         tables.keyframes[index].landmarks.numpy()[feature[of_keyframe]] = landmark[of_keyframe]
     for counter in ("found", "visible"):
-        landmarks[counter][own] += landmarks[counter][other]
-    landmarks["active"][other] = False
+        matches = tables.landmarks[counter].numpy()
+        matches[own] += matches[other]
+    tables.landmarks["active"].numpy()[other] = False
 
 
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:

@@ -175,13 +175,16 @@ class SparseMap(MapTables):
         T_cw[culled] = orthonormalise(
             previous[culled] @ invert(previous[references[culled]]) @ T_cw[references[culled]]
         )
-        T_new_old = (invert(T_cw) @ previous)[:, :3].permute(1, 2, 0)
+        T_new_old = (invert(T_cw) @ previous)[:, :3].flatten(1).T.numpy()
         # One element of the matrices for all landmarks at a time: faster than a small matrix product for each.
-        elements = np.ascontiguousarray(T_new_old.numpy()).take(self.landmarks["keyframe"].numpy(), axis=2)
-        for name, translation in (("point", True), ("direction", False)):
-            x, y, z = self.landmarks[name].numpy().T.copy()
-            moved = elements[:, 0] * x + elements[:, 1] * y + elements[:, 2] * z
-            self.landmarks[name][:] = torch.from_numpy(moved + elements[:, 3] if translation else moved).T
+        owner = self.landmarks["keyframe"].numpy()
+        elements = np.stack([element.take(owner) for element in T_new_old]).reshape(3, 4, -1)
+        x, y, z = self.landmarks["point"].numpy().T.copy()
+        point = elements[:, 0] * x + elements[:, 1] * y + elements[:, 2] * z + elements[:, 3]
+        x, y, z = self.landmarks["direction"].numpy().T.copy()
+        direction = elements[:, 0] * x + elements[:, 1] * y + elements[:, 2] * z
+        self.landmarks["point"].numpy()[:] = point.T
+        self.landmarks["direction"].numpy()[:] = direction.T
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
