@@ -37,7 +37,7 @@ def _linearise(
     T_cw: Array, points: Array, scale: Array, pose: Index, first: Index, row: Index, min_depth: float,
     r: Array, weights: Array, U: Array, V: Array, W: Array,
 ) -> None:  # fmt: skip
-    """Write the blocks of the normal equations, with the gradients as last columns of U and V."""
+    """Write the blocks of the normal equations, with the gradients as last columns of U and V; W only of free poses."""
     U[:], V[:] = 0.0, 0.0
     J = np.empty((3, 10))  # derivatives of a residual by pose and by point, and the residual
     for p in range(len(points)):
@@ -54,10 +54,10 @@ def _linearise(
                 J[i, 9] = r[m, i]
             for k in range(3):
                 j0, j1, j2 = weights[m] * J[0, 6 + k], weights[m] * J[1, 6 + k], weights[m] * J[2, 6 + k]
-                for i in range(6):
-                    W[m, k, i] = j0 * J[0, i] + j1 * J[1, i] + j2 * J[2, i]
                 for i in range(4):
                     V[p, k, i] += j0 * J[0, 6 + i] + j1 * J[1, 6 + i] + j2 * J[2, 6 + i]
+                for i in range(6 if row[m] >= 0 else 0):
+                    W[m, k, i] = j0 * J[0, i] + j1 * J[1, i] + j2 * J[2, i]
             if row[m] < 0:
                 continue
             for k in range(6):

@@ -22,7 +22,7 @@ def solve_normal_equations(
     Args:
         U: Diagonal blocks of the poses, with the gradient as last column, (F, 6, 7).
         V: Diagonal blocks of the points, with the gradient as last column, (P, 3, 4).
-        W: Point-by-pose block of each observation, sorted by point, (M, 3, 6).
+        W: Point-by-pose block of each observation by a free pose, sorted by point, (M, 3, 6).
         row: Index of the pose of each observation among the F poses; -1 for fixed poses, (M,).
         first: First observation of each point, and M, (P + 1,).
         damping: Factor of the diagonal that is added to the diagonal.
@@ -58,8 +58,8 @@ def solve_normal_equations(
     for p in range(P):
         for m in range(first[p], first[p + 1]):
             if row[m] >= 0:
-                for i in range(3):
-                    for k in range(6):
+                for k in range(6):
+                    for i in range(3):
                         h[p, i] += Y[m, i, k] * xi[row[m], k]
         delta[p, 2] = -h[p, 2] * L[p, 2, 2]
         delta[p, 1] = (-h[p, 1] - L[p, 2, 1] * delta[p, 2]) * L[p, 1, 1]

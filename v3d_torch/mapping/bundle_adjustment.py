@@ -38,6 +38,12 @@ from v3d_torch.optim.schur import REGULARISATION, NormalEquations, gather_column
 _NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
 
+_Array = NDArray[Any]
+
+_SortedProblem = tuple[_Array, _Array, _Array, _Array, _Array, _Array]
+"""Scale, offset, chi-square threshold and pose of the observations sorted by point; first observation of each point;
+free poses."""
+
 State = tuple[Tensor, Tensor]
 """Poses ``T_cw``, shape :math:`(K, 4, 4)`, and points, shape :math:`(P, 3)`."""
 
@@ -138,7 +144,7 @@ class BundleResiduals:
 
 def _sort_by_point(
     observations: Observations, camera: PinholeCamera, fixed: Tensor, point_count: int
-) -> tuple[NDArray[np.int64], tuple[NDArray[Any], ...]]:
+) -> tuple[NDArray[np.int64], _SortedProblem]:
     """Order of observations that sorts them by point, and a problem in that order, as arguments of the kernels."""
     point, target = to_array(observations.point), whiten(observations, camera)
     order = np.argsort(point, kind="stable")
