@@ -51,7 +51,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         camera = replace(sequence.camera, readout=None)  # so that the map calibrates the readout
         slam = V3DSLAM(camera, MaskFolder(folder / "masks"))
         for frame in sequence:
-            slam(frame)
+            slam(replace(frame, camera=camera))
         slam.flush()
     return recorded
 
