@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,9 +53,10 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         folder = tmp_path_factory.mktemp("demo")
         write_sequence(folder, FRAMES)
         sequence = load_sequence(str(folder))
-        slam = V3DSLAM(sequence.camera, MaskFolder(folder / "masks"))
+        camera = replace(sequence.camera, readout=None)  # so that the map calibrates the readout
+        slam = V3DSLAM(camera, MaskFolder(folder / "masks"))
         for frame in sequence:
-            slam(frame)
+            slam(replace(frame, camera=camera))
         slam.flush()
         segmenter = YOLOSegmenter(SegmentationConfig())
         for frame in list(sequence)[::SEGMENTED]:
@@ -95,5 +97,7 @@ def assert_same(found: Any, expected: Any, where: str) -> None:
         assert len(found) == len(expected), where
         for index, (a, b) in enumerate(zip(found, expected, strict=True)):
             assert_same(a, b, f"{where}[{index}]")
+    elif isinstance(expected, float):
+        assert math.isclose(found, expected, rel_tol=1e-9, abs_tol=1e-9), where
     else:
         assert found == expected, where

@@ -9,16 +9,23 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
+from v3d_torch.kernels import bundle_adjustment as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
 from v3d_torch.optim.reprojection import (
+    MIN_DEPTH,
     Measurements,
     WhitenedMeasurements,
     chi_square,
@@ -26,10 +33,16 @@ from v3d_torch.optim.reprojection import (
     perspective_jacobian,
     whiten,
 )
-from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations
+from v3d_torch.optim.schur import REGULARISATION, NormalEquations, gather_columns, solve_normal_equations
 
 _NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
+
+_Array = NDArray[Any]
+
+_SortedProblem = tuple[_Array, _Array, _Array, _Array, _Array, _Array]
+"""Scale, offset, chi-square threshold and pose of the observations sorted by point; first observation of each point;
+free poses."""
 
 State = tuple[Tensor, Tensor]
 """Poses ``T_cw``, shape :math:`(K, 4, 4)`, and points, shape :math:`(P, 3)`."""
@@ -60,7 +73,6 @@ class BundleResult:
         cost_before: Sum of the robust squared errors at the start.
         cost_after: Sum of the robust squared errors at the result.
         iterations: Number of steps tried.
-        residuals: Residuals at the result.
     """
 
     T_cw: Tensor
@@ -69,7 +81,12 @@ class BundleResult:
     cost_before: float
     cost_after: float
     iterations: int
-    residuals: BundleResiduals
+    _residuals: Callable[[], BundleResiduals]
+
+    @property
+    def residuals(self) -> BundleResiduals:
+        """Residuals at the result."""
+        return self._residuals()
 
 
 @dataclass(frozen=True)
@@ -125,7 +142,56 @@ class BundleResiduals:
         return 2 * first, 2 * second
 
 
+def _sort_by_point(
+    observations: Observations, camera: PinholeCamera, fixed: Tensor, point_count: int
+) -> tuple[NDArray[np.int64], _SortedProblem]:
+    """Order of observations that sorts them by point, and a problem in that order, as arguments of the kernels."""
+    point, target = to_array(observations.point), whiten(observations, camera)
+    order = np.argsort(point, kind="stable")
+    return order, (
+        to_array(target.scale).take(order, axis=1),
+        to_array(target.offset).take(order, axis=1),
+        to_array(observations.chi2_threshold)[order],
+        to_array(observations.pose)[order],
+        np.searchsorted(point[order], np.arange(point_count + 1)),
+        np.flatnonzero(~to_array(fixed)),
+    )
+
+
+def _bundle_adjust_compiled(
+    T_cw: Tensor,
+    points: Tensor,
+    observations: Observations,
+    camera: PinholeCamera,
+    fixed: Tensor,
+    iterations: int = 10,
+    tolerance: float = 1e-6,
+) -> BundleResult:
+    if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
+        return NotImplemented
+    order, problem = _sort_by_point(observations, camera, fixed, len(points))
+    *state, squared, cost_before, cost_after, steps = kernels.bundle_adjust(
+        to_array(T_cw),
+        to_array(points),
+        *problem,
+        iterations,
+        tolerance,
+        REGULARISATION,
+        MIN_DEPTH,
+        DAMPING_SCHEDULE,
+    )
+    chi2 = np.empty_like(squared)
+    chi2[order] = squared
+    T_cw, points = map(torch.from_numpy, state)
+
+    def residuals() -> BundleResiduals:
+        return BundleProblem(observations, camera, fixed, len(points)).residuals_at((T_cw, points))[1]
+
+    return BundleResult(T_cw, points, torch.from_numpy(chi2), cost_before, cost_after, steps, residuals)
+
+
 @torch.no_grad()
+@compiled_by(_bundle_adjust_compiled)
 def bundle_adjust(
     T_cw: Tensor,
     points: Tensor,
@@ -154,28 +220,78 @@ def bundle_adjust(
     found = levenberg_marquardt((T_cw, points), problem.residuals_at, problem.step, iterations, tolerance)
     T_cw, points = found.state
     chi2 = problem.in_input_order(chi_square(found.system.in_camera.T, found.system.whitened.T))
-    return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, found.system)
+    return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, lambda: found.system)
 
 
+def _reduced_cost_derivatives_compiled(
+    T_cw: Tensor,
+    points: Tensor,
+    observations: Observations,
+    camera: PinholeCamera,
+    fixed: Tensor,
+    uv_jacobian: Tensor,
+) -> tuple[float, float]:
+    if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
+        return NotImplemented
+    order, problem = _sort_by_point(observations, camera, fixed, len(points))
+    derivative = np.zeros((len(order), 3))
+    derivative[:, :2] = to_array(-uv_jacobian / observations.pixel_sigma[:, None])[order]
+    return kernels.reduced_cost_derivatives(
+        to_array(T_cw), to_array(points), *problem, derivative, _NEGLIGIBLE_DAMPING, REGULARISATION, MIN_DEPTH
+    )
+
+
+@torch.no_grad()
+@compiled_by(_reduced_cost_derivatives_compiled)
+def reduced_cost_derivatives(
+    T_cw: Tensor,
+    points: Tensor,
+    observations: Observations,
+    camera: PinholeCamera,
+    fixed: Tensor,
+    uv_jacobian: Tensor,
+) -> tuple[float, float]:
+    """Derivatives of the minimum cost of a bundle adjustment; see `BundleResiduals.reduced_cost_derivatives`.
+
+    Args:
+        T_cw: World-to-camera poses at the minimum, float64, shape :math:`(K, 4, 4)`.
+        points: Positions of the landmarks at the minimum, world frame, metres, float64, shape :math:`(P, 3)`.
+        observations: Observations of the points by the poses.
+        camera: Intrinsics.
+        fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`.
+        uv_jacobian: Derivative of the measured pixels with respect to a parameter, float64, shape :math:`(M, 2)`.
+
+    Returns:
+        First and second derivative of the minimum cost with respect to the parameter.
+    """
+    problem = BundleProblem(observations, camera, fixed, len(points))
+    return problem.residuals_at((T_cw, points))[1].reduced_cost_derivatives(uv_jacobian)
+
+
+@dataclass
 class BundleProblem:
     """Least-squares problem of a bundle adjustment. Its observations are sorted by pose, those of fixed poses last.
 
-    Args:
+    Attributes:
         observations: Observations of the points by the poses.
         camera: Intrinsics.
         fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`.
         point_count: Number of points.
     """
 
-    def __init__(self, observations: Observations, camera: PinholeCamera, fixed: Tensor, point_count: int) -> None:
-        self._point_count = point_count
-        self._free = torch.nonzero(~fixed)[:, 0]
-        row = torch.full((len(fixed),), len(self._free))
+    observations: Observations
+    camera: PinholeCamera
+    fixed: Tensor
+    point_count: int
+
+    def __post_init__(self) -> None:
+        observations, self._free = self.observations, torch.nonzero(~self.fixed)[:, 0]
+        row = torch.full((len(self.fixed),), len(self._free))
         row[self._free] = torch.arange(len(self._free))
         self._row, self._order = row[observations.pose].sort(stable=True)
         self._counts = torch.bincount(self._row, minlength=len(self._free))[: len(self._free)].tolist()
         self._pose, self._point = observations.pose[self._order], observations.point[self._order]
-        target = whiten(observations, camera)
+        target = whiten(observations, self.camera)
         self._target = WhitenedMeasurements(target.scale[:, self._order], target.offset[:, self._order])
         self._limit, self._sigma = observations.chi2_threshold[self._order], observations.pixel_sigma[self._order]
 
@@ -214,7 +330,7 @@ class BundleProblem:
         index = self._point.expand(12, -1)
         return NormalEquations(
             U=torch.cat([V.new_zeros(0, 6, 7), *U]),
-            V=V.new_zeros(12, self._point_count).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, 4)),
+            V=V.new_zeros(12, self.point_count).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, 4)),
             W=_inner(by_point[..., :free], by_pose),
             pose=self._row[:free],
             point=self._point[:free],

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from v3d_torch.config import MappingConfig
 from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.map_tables import MapTables
-from v3d_torch.mapping.tensor_table import unique_ids
 
 _MIN_FOUND_RATIO = 0.25
 """Minimum ratio of frames that matched a landmark to frames that should have matched it (ORB-SLAM2)."""
@@ -36,11 +36,13 @@ def cull_landmarks(tables: MapTables) -> None:
         tables: Data of the map.
     """
     landmarks, observations = tables.landmarks, tables.observations
-    age = len(tables.keyframes) - 1 - landmarks["keyframe"]
-    observers = torch.bincount(observations["landmark"][observations["valid"]], minlength=len(landmarks))
-    low_found_ratio = landmarks["found"] < _MIN_FOUND_RATIO * landmarks["visible"]
+    age = len(tables.keyframes) - 1 - landmarks["keyframe"].numpy()
+    observed = observations["landmark"].numpy()[observations["valid"].numpy()]
+    observers = np.bincount(observed, minlength=len(landmarks))
+    found, visible = landmarks["found"].numpy(), landmarks["visible"].numpy()
+    low_found_ratio = found < _MIN_FOUND_RATIO * visible
     unconfirmed = (age == _CONFIRMATION_KEYFRAMES) & (observers < _MIN_OBSERVATIONS)
-    landmarks["active"][(low_found_ratio & (age > 0)) | unconfirmed] = False
+    landmarks["active"].numpy()[(low_found_ratio & (age > 0)) | unconfirmed] = False
 
 
 def cull_keyframes(tables: MapTables, references: Mapping[int, int]) -> None:
@@ -94,33 +96,30 @@ class _Neighbourhood:
     """All observations of the landmarks that some keyframes observe."""
 
     def __init__(self, tables: MapTables, keyframes: list[int]) -> None:
-        observations = tables.observations
-        usable = observations["valid"] & tables.landmarks["active"][observations["landmark"]]
-        by_keyframes = usable & torch.isin(observations["keyframe"], torch.tensor(keyframes))
-        observed = torch.zeros(len(tables.landmarks), dtype=torch.bool)
-        observed[observations["landmark"][by_keyframes]] = True
-        rows = usable & observed[observations["landmark"]]
-        self._keyframe, self._octave = observations["keyframe"][rows], observations["octave"][rows]
-        landmarks, self._landmark = unique_ids(observations["landmark"][rows], len(tables.landmarks))
-        self._landmark_count = len(landmarks)
-        self._keyframe_count = len(tables.keyframes)
+        names = "keyframe", "landmark", "octave", "valid"
+        keyframe, landmark, octave, valid = (tables.observations[name].numpy() for name in names)
+        self._keyframe_count, self._landmark_count = len(tables.keyframes), len(tables.landmarks)
+        usable = valid & tables.landmarks["active"].numpy()[landmark]
+        by_keyframes = usable & _contains(keyframes, keyframe, self._keyframe_count)
+        rows = usable & _contains(landmark[by_keyframes], landmark, self._landmark_count)
+        self._keyframe, self._octave, self._landmark = keyframe[rows], octave[rows], landmark[rows]
         self._levels = int(self._octave.max()) + 1 if len(self._octave) else 1
 
-    def redundant_ratios(self, min_views: int) -> Tensor:
+    def redundant_ratios(self, min_views: int) -> NDArray[np.float64]:
         """Ratio of each keyframe's landmarks that enough others observe at the same, the next or a finer octave."""
         cell = self._landmark * self._levels + self._octave
-        counts = torch.bincount(cell, minlength=self._landmark_count * self._levels)
-        up_to_octave = counts.view(-1, self._levels).cumsum(dim=1)
-        others = up_to_octave[self._landmark, (self._octave + 1).clamp(max=self._levels - 1)] - 1
-        redundant = torch.bincount(self._keyframe[others >= min_views], minlength=self._keyframe_count)
-        return redundant / torch.bincount(self._keyframe, minlength=self._keyframe_count).clamp(min=1)
+        counts = np.bincount(cell, minlength=self._landmark_count * self._levels)
+        up_to_octave = counts.reshape(-1, self._levels).cumsum(axis=1)
+        others = up_to_octave[self._landmark, np.minimum(self._octave + 1, self._levels - 1)] - 1
+        redundant = np.bincount(self._keyframe[others >= min_views], minlength=self._keyframe_count)
+        return redundant / np.bincount(self._keyframe, minlength=self._keyframe_count).clip(min=1)
 
     def most_covisible(self, keyframe: int) -> int:
         """The other keyframe that shares most landmarks with the given one; the newest, if several share as many."""
-        others = self._keyframe[torch.isin(self._landmark, self._landmark[self._keyframe == keyframe])]
-        shared = torch.bincount(others)
+        own = self._landmark[self._keyframe == keyframe]
+        shared = np.bincount(self._keyframe[_contains(own, self._landmark, self._landmark_count)])
         shared[keyframe] = 0
-        return int((shared * len(shared) + torch.arange(len(shared))).argmax())
+        return int((shared * len(shared) + np.arange(len(shared))).argmax())
 
     def remove(self, keyframe: int) -> None:
         """Remove the observations of a keyframe."""
@@ -130,3 +129,10 @@ class _Neighbourhood:
             self._octave[others],
             self._landmark[others],
         )
+
+
+def _contains(ids: NDArray[np.int64] | list[int], queries: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Check which integers in [0, count) are in a set."""
+    table = np.zeros(count, dtype=np.bool_)
+    table[ids] = True
+    return table[queries]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -38,30 +39,38 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
         merged: ID of the landmark of each pair that becomes inactive, int64, shape :math:`(L,)`. No ID occurs twice
             in ``kept`` and ``merged``.
     """
-    observations, landmarks = tables.observations, tables.landmarks
-    new_id = torch.arange(len(landmarks))
-    new_id[merged] = kept
-    affected = torch.zeros_like(new_id, dtype=torch.bool)
-    affected[kept] = affected[merged] = True
-    rows = torch.nonzero(observations["valid"] & affected[observations["landmark"]])[:, 0]
-    keyframe, landmark = observations["keyframe"][rows], observations["landmark"][rows]
+    if len(kept) == 0:
+        return
+    # NumPy is faster than torch for these small arrays; they share the memory of the tables.
+    keyframes, observed, features, valid = (
+        tables.observations[name].numpy() for name in ("keyframe", "landmark", "feature", "valid")
+    )
+    own, other, count = kept.numpy(), merged.numpy(), len(tables.landmarks)
+    new_id, affected = np.arange(count), np.zeros(count, dtype=np.bool_)
+    new_id[other] = own
+    affected[own] = affected[other] = True
+    rows = np.flatnonzero(valid & affected.take(observed))
+    keyframe, landmark = keyframes[rows], observed[rows]
 
     # Two observations by one keyframe: the two landmarks of the pair are distinct points.
-    keys, times = (keyframe * len(new_id) + new_id[landmark]).unique(return_counts=True)
-    distinct = contains(keys[times > 1] % len(new_id), kept, len(landmarks))
-    new_id[merged[distinct]] = merged[distinct]
-    kept, merged = kept[~distinct], merged[~distinct]
+    keys = np.sort(keyframe * count + new_id[landmark])
+    is_distinct = np.zeros(count, dtype=np.bool_)
+    is_distinct[keys[1:][keys[1:] == keys[:-1]] % count] = True
+    distinct = is_distinct[own]
+    new_id[other[distinct]] = other[distinct]
+    own, other = own[~distinct], other[~distinct]
 
     changed = new_id[landmark] != landmark
     rows, keyframe, landmark = rows[changed], keyframe[changed], new_id[landmark[changed]]
-    observations["landmark"][rows] = landmark
-    feature = observations["feature"][rows]
-    for index in keyframe.unique().tolist():
-        own = keyframe == index
-        tables.keyframes[index].landmarks[feature[own]] = landmark[own]
+    observed[rows] = landmark
+    feature = features[rows]
+    for index in np.flatnonzero(np.bincount(keyframe)):
+        of_keyframe = keyframe == index
+        tables.keyframes[index].landmarks.numpy()[feature[of_keyframe]] = landmark[of_keyframe]
     for counter in ("found", "visible"):
-        landmarks[counter][kept] += landmarks[counter][merged]
-    landmarks["active"][merged] = False
+        matches = tables.landmarks[counter].numpy()
+        matches[own] += matches[other]
+    tables.landmarks["active"].numpy()[other] = False
 
 
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from v3d_torch.config import Config
+from v3d_torch.config import Config, RollingShutterConfig
 from v3d_torch.features.features import pixel_sigma
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
-from v3d_torch.mapping.bundle_adjustment import BundleResult, Observations, bundle_adjust
+from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust, reduced_cost_derivatives
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.readout_calibration import calibrate_readout
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -105,28 +106,30 @@ def local_bundle_adjust(
         iterations=_MAX_ITERATIONS,
         tolerance=_COST_TOLERANCE,
     )
-    readout = _calibrated_readout(sparse_map, keyframe, result, rows, config)
+    readout = sparse_map.readout
+    if _is_calibration_due(sparse_map, keyframe, config.rolling_shutter):
+        uv_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, rows)
+        readout = calibrate_readout(
+            readout, *reduced_cost_derivatives(result.T_cw, result.points, observations, camera, fixed, uv_jacobian)
+        )
     T_cw[poses[~fixed]] = orthonormalise(result.T_cw[~fixed])
     return LocalAdjustment(T_cw, landmarks, result.points, rows[result.chi2 > observations.chi2_threshold], readout)
 
 
-def _calibrated_readout(
-    sparse_map: SparseMap, keyframe: Keyframe, result: BundleResult, rows: Tensor, config: Config
-) -> Readout:
-    """The readout of the camera after an adjustment of some rows of the table of observations."""
-    readout, index = sparse_map.readout, keyframe.index
-    is_due = index <= config.rolling_shutter.calibration_keyframes or index % _LATE_CALIBRATION_INTERVAL == 0
-    if not is_due or not config.rolling_shutter.enabled or readout.is_certain:
-        return readout
-    uv_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, rows)
-    return calibrate_readout(readout, *result.residuals.reduced_cost_derivatives(uv_jacobian))
+def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: RollingShutterConfig) -> bool:
+    """Check whether the adjustment of a new keyframe calibrates the readout."""
+    is_due = keyframe.index <= config.calibration_keyframes or keyframe.index % _LATE_CALIBRATION_INTERVAL == 0
+    return is_due and config.enabled and not sparse_map.readout.is_certain
 
 
 def _select_observations(sparse_map: SparseMap, window: Tensor) -> Tensor:
     """Rows of all observations of active landmarks that the window observes and that have at least two observations."""
-    table = sparse_map.observations
-    usable = table["valid"] & sparse_map.landmarks["active"][table["landmark"]]
-    observed = torch.zeros(len(sparse_map.landmarks), dtype=torch.bool)
-    observed[table["landmark"][usable & torch.isin(table["keyframe"], window)]] = True
-    times = torch.bincount(table["landmark"][usable], minlength=len(sparse_map.landmarks))
-    return torch.nonzero(usable & (observed & (times > 1))[table["landmark"]])[:, 0]
+    # NumPy is faster than torch here.
+    table, count = sparse_map.observations, len(sparse_map.landmarks)
+    keyframe, landmark, valid = (table[name].numpy() for name in ("keyframe", "landmark", "valid"))
+    usable = valid & sparse_map.landmarks["active"].numpy().take(landmark)
+    in_window, observed = np.zeros(len(sparse_map.keyframes), np.bool_), np.zeros(count, np.bool_)
+    in_window[window.numpy()] = True
+    observed[landmark[usable & in_window.take(keyframe)]] = True
+    times = np.bincount(landmark[usable], minlength=count)
+    return torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_REGULARISATION = 1e-6
+REGULARISATION = 1e-6
 """Added to all diagonals: makes blocks without observations solvable. Small beside the information of an observation,
 which is 1e4 per square metre and more."""
 
@@ -90,7 +90,7 @@ def _damp(blocks: Tensor, damping: float) -> Tensor:
     """Blocks (n, n, count) with damped diagonals."""
     blocks = blocks.clone()
     diagonal = blocks.diagonal(dim1=0, dim2=1)
-    diagonal.mul_(1 + damping).add_(_REGULARISATION)
+    diagonal.mul_(1 + damping).add_(REGULARISATION)
     return blocks
 
 

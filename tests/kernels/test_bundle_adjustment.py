@@ -1,0 +1,117 @@
+"""Kernels of bundle adjustment equal their torch twins on random and degenerate problems."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.kernels import compiler
+from v3d_torch.kernels.compiler import TWINS
+from v3d_torch.mapping.bundle_adjustment import BundleResult, Observations
+
+pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
+
+BUNDLE_ADJUST = TWINS["v3d_torch.mapping.bundle_adjustment.bundle_adjust"]
+DERIVATIVES = TWINS["v3d_torch.mapping.bundle_adjustment.reduced_cost_derivatives"]
+CAMERA = PinholeCamera(fx=500.0, fy=510.0, cx=320.0, cy=240.0)
+
+Problem = tuple[Tensor, Tensor, Observations, PinholeCamera, Tensor]
+
+
+def make_problem(poses: int, points: int, observations: int, fixed: list[int], seed: int = 0) -> Problem:
+    """Observations of random points by random poses near the origin, with noise and outliers, in random order."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    T_cw = se3_exp(0.1 * normal(poses, 6))
+    positions = 0.5 * normal(points, 3) + torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    # Some pairs of a pose and a point occur twice.
+    pose = torch.randint(0, max(poses, 1), (observations,), generator=generator)
+    point = torch.randint(0, max(points, 1), (observations,), generator=generator)
+    in_camera = (T_cw[pose, :3, :3] @ positions[point, :, None])[..., 0] + T_cw[pose, :3, 3]
+    uv = CAMERA.project(in_camera) + normal(observations, 2)
+    uv[::17] += 50.0
+    inverse_depth = 1 / in_camera[:, 2] + 0.003 * normal(observations)
+    inverse_depth[::3] = 0.0
+    measured = Observations(
+        uv=uv,
+        inverse_depth=inverse_depth,
+        pixel_sigma=1.2 ** (torch.arange(observations) % 5).double(),
+        inverse_depth_sigma=0.003,
+        pose=pose,
+        point=point,
+    )
+    is_fixed = torch.isin(torch.arange(poses), torch.tensor(fixed, dtype=torch.int64))
+    return se3_exp(0.01 * normal(poses, 6)) @ T_cw, positions + 0.02 * normal(points, 3), measured, CAMERA, is_fixed
+
+
+PROBLEMS = {
+    "usual": make_problem(6, 60, 300, [0]),
+    "many poses": make_problem(20, 200, 3000, [0, 5, 6]),
+    "free gauge": make_problem(4, 40, 160, []),
+    "all poses fixed": make_problem(4, 40, 160, [0, 1, 2, 3]),
+    "one observation": make_problem(2, 1, 1, [0]),
+    "unobserved points": make_problem(3, 100, 40, [0]),
+    "unobserved poses": make_problem(30, 40, 20, [0]),
+    "no observations": make_problem(3, 5, 0, [0]),
+    "no points": make_problem(3, 0, 0, [0]),
+    "no poses": make_problem(0, 0, 0, []),
+}
+
+
+def adjust(problem: Problem, compiled: bool, iterations: int = 5) -> BundleResult:
+    result = BUNDLE_ADJUST[compiled](*problem, iterations=iterations, tolerance=1e-8)
+    assert isinstance(result, BundleResult)
+    return result
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_kernel_of_bundle_adjustment_equals_its_twin(name: str) -> None:
+    expected, found = (adjust(PROBLEMS[name], compiled) for compiled in (False, True))
+    assert found.iterations == expected.iterations
+    assert math.isclose(found.cost_before, expected.cost_before, rel_tol=1e-12)
+    assert math.isclose(found.cost_after, expected.cost_after, rel_tol=1e-9, abs_tol=1e-12)
+    for field in ("T_cw", "points", "chi2"):
+        torch.testing.assert_close(getattr(found, field), getattr(expected, field), rtol=1e-6, atol=1e-8)
+
+
+def test_points_behind_the_camera_have_infinite_error_in_both() -> None:
+    T_cw, points, *rest = PROBLEMS["usual"]
+    points = points.clone()
+    points[:5, 2] = -3.0
+    expected, found = (adjust((T_cw, points, *rest), compiled, iterations=0) for compiled in (False, True))
+    assert found.chi2.isinf().any()
+    torch.testing.assert_close(found.chi2, expected.chi2, rtol=1e-10, atol=1e-10)
+    assert torch.equal(found.T_cw, expected.T_cw)
+
+
+def test_kernel_leaves_its_arguments_and_fixed_poses_unchanged() -> None:
+    T_cw, points, *rest = PROBLEMS["many poses"]
+    before = T_cw.clone(), points.clone()
+    found = adjust((T_cw, points, *rest), compiled=True)
+    assert torch.equal(T_cw, before[0]) and torch.equal(points, before[1])
+    assert torch.equal(found.T_cw[[0, 5, 6]], T_cw[[0, 5, 6]])
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_kernel_of_the_derivatives_equals_its_twin(name: str) -> None:
+    observations, camera, fixed = PROBLEMS[name][2:]
+    uv_jacobian = torch.randn(len(observations.uv), 2, generator=torch.Generator().manual_seed(1)).double()
+    at_minimum = adjust(PROBLEMS[name], compiled=False, iterations=20)
+    arguments = at_minimum.T_cw, at_minimum.points, observations, camera, fixed, uv_jacobian
+    expected, found = (DERIVATIVES[compiled](*arguments) for compiled in (False, True))
+    scale = max(1.0, abs(expected[1]))
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-6 * scale)
+    assert at_minimum.residuals.reduced_cost_derivatives(uv_jacobian) == pytest.approx(expected, rel=1e-12, abs=1e-12)
+
+
+def test_other_dtypes_are_left_to_the_torch_function() -> None:
+    T_cw, points, *rest = PROBLEMS["usual"]
+    assert BUNDLE_ADJUST.compiled(T_cw.float(), points, *rest) is NotImplemented

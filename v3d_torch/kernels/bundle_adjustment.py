@@ -1,0 +1,173 @@
+"""Kernel of bundle adjustment; see `v3d_torch.mapping.bundle_adjustment` and `v3d_torch.optim.schur`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.reprojection import Array, huber, multiply, perspective_jacobian, se3_exp, transform
+from v3d_torch.kernels.schur import solve_normal_equations
+
+Index = NDArray[np.int64]
+
+
+@device
+def _compute_residuals(
+    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, pose: Index, first: Index,
+    min_depth: float, r: Array, weights: Array, chi2: Array,
+) -> float:  # fmt: skip
+    """Robust cost; writes the whitened residuals, their weights, and the squared errors."""
+    cost = 0.0
+    for p in range(len(points)):
+        for m in range(first[p], first[p + 1]):
+            x, y, z = transform(T_cw[pose[m]], points[p, 0], points[p, 1], points[p, 2])
+            w = 1 / max(z, min_depth)
+            r0, r1 = scale[0, m] * (x * w) + offset[0, m], scale[1, m] * (y * w) + offset[1, m]
+            r2 = scale[2, m] * w + offset[2, m]
+            squared = r0 * r0 + r1 * r1 + r2 * r2
+            robust, weights[m] = huber(squared, thresholds[m])
+            cost += robust
+            r[m, 0], r[m, 1], r[m, 2], chi2[m] = r0, r1, r2, squared if z > min_depth else np.inf
+    return cost
+
+
+@device
+def _linearise(
+    T_cw: Array, points: Array, scale: Array, pose: Index, first: Index, row: Index, min_depth: float,
+    r: Array, weights: Array, U: Array, V: Array, W: Array,
+) -> None:  # fmt: skip
+    """Write the blocks of the normal equations, with the gradients as last columns of U and V; W only of free poses."""
+    U[:], V[:] = 0.0, 0.0
+    J = np.empty((3, 10))  # derivatives of a residual by pose and by point, and the residual
+    for p in range(len(points)):
+        for m in range(first[p], first[p + 1]):
+            T = T_cw[pose[m]]
+            x, y, z = transform(T, points[p, 0], points[p, 1], points[p, 2])
+            w = 1 / max(z, min_depth)
+            perspective_jacobian(x * w, y * w, w, J)
+            for i in range(3):
+                for k in range(6):
+                    J[i, k] *= scale[i, m]
+                for k in range(3):
+                    J[i, 6 + k] = J[i, 0] * T[0, k] + J[i, 1] * T[1, k] + J[i, 2] * T[2, k]
+                J[i, 9] = r[m, i]
+            for k in range(3):
+                j0, j1, j2 = weights[m] * J[0, 6 + k], weights[m] * J[1, 6 + k], weights[m] * J[2, 6 + k]
+                for i in range(4):
+                    V[p, k, i] += j0 * J[0, 6 + i] + j1 * J[1, 6 + i] + j2 * J[2, 6 + i]
+                for i in range(6 if row[m] >= 0 else 0):
+                    W[m, k, i] = j0 * J[0, i] + j1 * J[1, i] + j2 * J[2, i]
+            if row[m] < 0:
+                continue
+            for k in range(6):
+                j0, j1, j2 = weights[m] * J[0, k], weights[m] * J[1, k], weights[m] * J[2, k]
+                for i in range(6):
+                    U[row[m], k, i] += j0 * J[0, i] + j1 * J[1, i] + j2 * J[2, i]
+                U[row[m], k, 6] += j0 * J[0, 9] + j1 * J[1, 9] + j2 * J[2, 9]
+
+
+@device
+def _find_rows(pose: Index, free: Index, count: int) -> Index:
+    """Index of each observation's pose among the free poses; -1 for fixed poses."""
+    row = np.full(count, -1, np.int64)
+    row[free] = np.arange(len(free))
+    return row[pose]
+
+
+@kernel(
+    "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], i8, f8, f8, f8,"
+    " UniTuple(f8, 4))"
+)
+def bundle_adjust(
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, pose: Index, first: Index,
+    free: Index, iterations: int, tolerance: float, regularisation: float, min_depth: float,
+    damping_schedule: tuple[float, float, float, float],
+) -> tuple[Array, Array, Array, float, float, int]:  # fmt: skip
+    """Optimise poses and points by Levenberg-Marquardt.
+
+    Args:
+        T_cw: Initial poses, (K, 4, 4).
+        points: Initial points, world frame, (P, 3).
+        scale: Scale of the whitened residuals, (3, M).
+        offset: Offset of the whitened residuals, (3, M).
+        chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
+        pose: Pose of each observation, sorted by point, (M,).
+        first: First observation of each point, and M, (P + 1,).
+        free: Indices of the poses that move, (F,).
+        iterations: Maximum number of steps.
+        tolerance: Relative change of the cost at convergence.
+        regularisation: Added to the diagonal of the normal equations.
+        min_depth: Smallest depth of a projected point, metres.
+        damping_schedule: First, smallest and largest damping, and the factor between two steps.
+
+    Returns:
+        Poses (K, 4, 4), points (P, 3), squared residuals (M,), cost before and after, number of steps.
+    """
+    damping, min_damping, max_damping, factor = damping_schedule
+    F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
+    U, V, W = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((M, 3, 6))
+    r, weights, chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
+    new_r, new_weights, new_chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
+    cost = _compute_residuals(T_cw, points, scale, offset, chi2_thresholds, pose, first, min_depth, r, weights, chi2)
+    cost_before, iteration, converged, is_linearised = cost, 0, False, False
+    while iteration < iterations and not converged:
+        if not is_linearised:
+            _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
+        xi, delta = solve_normal_equations(U, V, W, row, first, damping, regularisation)
+        new_T, new_points = T_cw.copy(), points + delta
+        for f in range(F):
+            new_T[free[f]] = multiply(se3_exp(xi[f]), T_cw[free[f]])
+        new_cost = _compute_residuals(
+            new_T, new_points, scale, offset, chi2_thresholds, pose, first, min_depth, new_r, new_weights, new_chi2
+        )
+        iteration += 1
+        converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
+        is_linearised = not new_cost < cost
+        if is_linearised:
+            damping = min(damping * factor, max_damping)
+        else:
+            T_cw, points, cost = new_T, new_points, new_cost
+            r, new_r, weights, new_weights, chi2, new_chi2 = new_r, r, new_weights, weights, new_chi2, chi2
+            damping = max(damping / factor, min_damping)
+    return T_cw, points, chi2, cost_before, cost, iteration
+
+
+@kernel("(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)")
+def reduced_cost_derivatives(
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, pose: Index, first: Index,
+    free: Index, j: Array, damping: float, regularisation: float, min_depth: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
+
+    Args:
+        T_cw: Poses at the minimum, (K, 4, 4).
+        points: Points at the minimum, world frame, (P, 3).
+        scale: Scale of the whitened residuals, (3, M).
+        offset: Offset of the whitened residuals, (3, M).
+        chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
+        pose: Pose of each observation, sorted by point, (M,).
+        first: First observation of each point, and M, (P + 1,).
+        free: Indices of the poses that move, (F,).
+        j: Derivative of the whitened residuals by the parameter, (M, 3).
+        damping: Damping of the step that follows a change of the parameter.
+        regularisation: Added to the diagonal of the normal equations.
+        min_depth: Smallest depth of a projected point, metres.
+
+    Returns:
+        First and second derivative.
+    """
+    F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
+    r, weights, chi2, W = np.empty((M, 3)), np.empty(M), np.empty(M), np.empty((M, 3, 6))
+    U, V, j_U, j_V = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((F, 6, 7)), np.empty((P, 3, 4))
+    _compute_residuals(T_cw, points, scale, offset, chi2_thresholds, pose, first, min_depth, r, weights, chi2)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, j, weights, j_U, j_V, W)
+    xi, delta = solve_normal_equations(j_U, j_V, W, row, first, damping, regularisation)
+    slope = (xi * U[:, :, 6]).sum() + (delta * V[:, :, 3]).sum()
+    curvature = (xi * j_U[:, :, 6]).sum() + (delta * j_V[:, :, 3]).sum()
+    for m in range(M):
+        for i in range(3):
+            slope += weights[m] * j[m, i] * r[m, i]
+            curvature += weights[m] * j[m, i] * j[m, i]
+    return 2 * slope, 2 * curvature
