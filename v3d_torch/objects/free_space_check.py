@@ -24,6 +24,7 @@ from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.kernels import free_space as kernels
+from v3d_torch.kernels import nearest_depth as depth_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 
@@ -87,22 +88,22 @@ class DepthView:
         A position is free only if all measurements around it lie behind it. Otherwise a surface at a grazing angle, or
         a pose that is off by some pixels, would make static points appear or vacate.
         """
-        depth = self.depth[0].numpy()
-        size = 2 * (round(_POSE_ERROR * depth.shape[1]) + self.misalignment) + 1
-        return torch.from_numpy(self.min_depth_around(size) * (depth > 0))
+        return _nearest_depth(self.depth[0], round(_POSE_ERROR * self.depth.shape[2]) + self.misalignment)
 
-    def min_depth_around(self, size: int) -> NDArray[np.float32]:
-        """Return the minimum depth in a square around each pixel.
 
-        Args:
-            size: Side of the square, pixels, odd.
+def _nearest_depth_compiled(depth: Tensor, radius: int) -> Tensor:
+    if depth.dtype != torch.float32:
+        return NotImplemented
+    return torch.from_numpy(depth_kernels.nearest_depth(to_array(depth), radius))
 
-        Returns:
-            Depth, metres, shape :math:`(H, W)`; the largest float32 if the square has no measurement.
-        """
-        depth = self.depth[0].numpy()
-        no_depth = cv2.threshold(depth, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
-        return np.asarray(cv2.erode(depth + no_depth, np.ones((size, size), np.uint8)), np.float32)
+
+@compiled_by(_nearest_depth_compiled)
+def _nearest_depth(depth: Tensor, radius: int) -> Tensor:
+    """Return the minimum depth within a radius of each pixel, (H, W); 0 for a pixel without depth."""
+    array, size = depth.numpy(), 2 * radius + 1
+    no_depth = cv2.threshold(array, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
+    nearest = cv2.erode(array + no_depth, np.ones((size, size), np.uint8))
+    return torch.from_numpy(np.asarray(nearest, np.float32) * (array > 0))
 
 
 def _limits(config: FreeSpaceConfig) -> kernels.Limits:

@@ -54,7 +54,7 @@ class MaskRefiner:
         self._config = config
         self._stride = newly_occupied.stride
         # Pixels that a surface can grow over: no depth edge, and not occupied before the object appeared.
-        smooth = _smooth_pixels(view, self._stride, config.edge_ratio)
+        smooth = _smooth_pixels(view.depth[0].numpy(), self._stride, config.edge_ratio)
         self._growable = smooth & ~newly_occupied.previously_occupied.numpy()
         located = [track for track in tracks if track.newest.is_located]
         R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
@@ -147,13 +147,25 @@ def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int,
     return surface
 
 
-def _smooth_pixels(view: DepthView, step: int, edge_ratio: float) -> NDArray[np.bool_]:
+def _smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> NDArray[np.bool_]:
     """Return every n-th pixel around which depth varies by less than a fraction of it, within half the step.
 
-    Bool, shape (h, w).
+    Args:
+        depth: Depth, metres, shape (H, W); 0 = no measurement.
+        step: Step n between the pixels.
+        edge_ratio: Largest variation of the depth, as a fraction of the depth.
+
+    Returns:
+        Bool, shape (h, w).
     """
-    depth, size = view.depth[0].numpy(), step + 1
-    nearest = view.min_depth_around(size)[::step, ::step]
-    farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::step, ::step]
-    centre = depth[::step, ::step]
-    return (centre > 0) & (farthest - nearest < edge_ratio * centre)
+    before, after = (step + 1) // 2, step // 2
+    # Zeros around the image are ignored like pixels without depth.
+    padded = cv2.copyMakeBorder(depth, before, after, before, after, cv2.BORDER_CONSTANT, value=0)
+    (height, width), centre = depth.shape, depth[::step, ::step]
+    # Minimum and maximum of the rows around every n-th row, then of the columns around every n-th column.
+    rows = [padded[k : k + height : step] for k in range(step + 1)]
+    nearest = np.minimum.reduce([np.where(row > 0, row, np.finfo(np.float32).max) for row in rows])
+    farthest = np.maximum.reduce(rows)
+    nearest = np.minimum.reduce([nearest[:, k : k + width : step] for k in range(step + 1)])
+    farthest = np.maximum.reduce([farthest[:, k : k + width : step] for k in range(step + 1)])
+    return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)
