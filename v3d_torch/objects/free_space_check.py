@@ -91,6 +91,20 @@ class DepthView:
         return _nearest_depth(self.depth[0], round(_POSE_ERROR * self.depth.shape[2]) + self.misalignment)
 
 
+def erode_measured(depth: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Return the minimum depth in a square around each pixel; pixels without depth are ignored.
+
+    Args:
+        depth: Depth, metres, shape :math:`(H, W)`; 0 = no measurement.
+        size: Side of the square, pixels.
+
+    Returns:
+        Depth, metres, shape :math:`(H, W)`; the largest float32 if the square has no measurement.
+    """
+    no_depth = cv2.threshold(depth, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
+    return np.asarray(cv2.erode(depth + no_depth, np.ones((size, size), np.uint8)), np.float32)
+
+
 def _nearest_depth_compiled(depth: Tensor, radius: int) -> Tensor:
     if depth.dtype != torch.float32:
         return NotImplemented
@@ -100,10 +114,8 @@ def _nearest_depth_compiled(depth: Tensor, radius: int) -> Tensor:
 @compiled_by(_nearest_depth_compiled)
 def _nearest_depth(depth: Tensor, radius: int) -> Tensor:
     """Return the minimum depth within a radius of each pixel, (H, W); 0 for a pixel without depth."""
-    array, size = depth.numpy(), 2 * radius + 1
-    no_depth = cv2.threshold(array, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
-    nearest = cv2.erode(array + no_depth, np.ones((size, size), np.uint8))
-    return torch.from_numpy(np.asarray(nearest, np.float32) * (array > 0))
+    array = depth.numpy()
+    return torch.from_numpy(erode_measured(array, 2 * radius + 1) * (array > 0))
 
 
 def _limits(config: FreeSpaceConfig) -> kernels.Limits:

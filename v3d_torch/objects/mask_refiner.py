@@ -19,7 +19,7 @@ from v3d_torch.config import StaticMaskConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.free_space_check import DepthView, erode_measured
 from v3d_torch.objects.mask_ops import dilate, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
@@ -158,14 +158,7 @@ def _smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> 
     Returns:
         Bool, shape (h, w).
     """
-    before, after = (step + 1) // 2, step // 2
-    # Zeros around the image are ignored like pixels without depth.
-    padded = cv2.copyMakeBorder(depth, before, after, before, after, cv2.BORDER_CONSTANT, value=0)
-    (height, width), centre = depth.shape, depth[::step, ::step]
-    # Minimum and maximum of the rows around every n-th row, then of the columns around every n-th column.
-    rows = [padded[k : k + height : step] for k in range(step + 1)]
-    nearest = np.minimum.reduce([np.where(row > 0, row, np.finfo(np.float32).max) for row in rows])
-    farthest = np.maximum.reduce(rows)
-    nearest = np.minimum.reduce([nearest[:, k : k + width : step] for k in range(step + 1)])
-    farthest = np.maximum.reduce([farthest[:, k : k + width : step] for k in range(step + 1)])
+    size, centre = step + 1, depth[::step, ::step]
+    nearest = erode_measured(depth, size)[::step, ::step]
+    farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::step, ::step]
     return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)
