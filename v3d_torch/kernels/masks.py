@@ -11,9 +11,10 @@ Mask = NDArray[np.uint8]
 
 
 @device
-def _count_on(previous: Mask, mask: Mask, farthest: int, distance: Mask) -> None:
+def _count_on(previous: Mask, mask: Mask, farthest: np.uint8, distance: Mask) -> None:
     for x in range(distance.size):
-        distance[x] = min(np.uint8(previous[x] + np.uint8(1)), farthest) * np.uint8(mask[x] == 0)
+        farther = np.uint8(previous[x] + np.uint8(1))
+        distance[x] = np.uint8(0) if mask[x] else farther if farther < farthest else farthest
 
 
 @device

@@ -187,7 +187,7 @@ class Silhouette:
         # Only the part of the image within the radius of the points can be in the mask.
         border = (radius, radius, radius, radius)
         padded = cv2.copyMakeBorder(self._minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
-        minima = cv2.erode(padded, ellipse(radius))
+        minima = np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
         return _select_pixels(minima, self._first_cell - radius, depth, tolerance, step, include_missing)
 
     def visible_fraction(self, depth: Tensor, tolerance: float) -> float:
