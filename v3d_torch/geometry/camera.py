@@ -14,6 +14,7 @@ from torch import Tensor
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
+from v3d_torch.kernels.camera import Bounds, Intrinsics
 
 MAX_READOUT = 0.05
 """Longest accepted readout, seconds: no RGB-D camera takes longer to read the rows of an image."""
@@ -103,6 +104,17 @@ class PinholeCamera:
     def _size(self) -> Tensor:
         """Width and height, pixels, float64, shape (2,)."""
         return torch.tensor([self.width, self.height], dtype=torch.float64)
+
+    @cached_property
+    def intrinsics(self) -> Intrinsics:
+        """Focal lengths, principal point and distortion coefficients as numbers, for kernels."""
+        return (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """Extent of the image in normalised coordinates, with a margin of one pixel, and its size, for kernels."""
+        (x_min, y_min), (x_max, y_max) = self._normalised_bounds.tolist()
+        return x_min, x_max, y_min, y_max, float(self.width), float(self.height)
 
     @property
     def is_distorted(self) -> bool:

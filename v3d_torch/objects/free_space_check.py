@@ -23,6 +23,9 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.kernels import free_space as kernels
+from v3d_torch.kernels import nearest_depth as depth_kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 
 _POSE_ERROR = 0.01
@@ -85,24 +88,50 @@ class DepthView:
         A position is free only if all measurements around it lie behind it. Otherwise a surface at a grazing angle, or
         a pose that is off by some pixels, would make static points appear or vacate.
         """
-        depth = self.depth[0].numpy()
-        size = 2 * (round(_POSE_ERROR * depth.shape[1]) + self.misalignment) + 1
-        return torch.from_numpy(self.min_depth_around(size) * (depth > 0))
-
-    def min_depth_around(self, size: int) -> NDArray[np.float32]:
-        """Return the minimum depth in a square around each pixel.
-
-        Args:
-            size: Side of the square, pixels, odd.
-
-        Returns:
-            Depth, metres, shape :math:`(H, W)`; the largest float32 if the square has no measurement.
-        """
-        depth = self.depth[0].numpy()
-        no_depth = cv2.threshold(depth, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
-        return np.asarray(cv2.erode(depth + no_depth, np.ones((size, size), np.uint8)), np.float32)
+        return _nearest_depth(self.depth[0], round(_POSE_ERROR * self.depth.shape[2]) + self.misalignment)
 
 
+def erode_measured(depth: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Return the minimum depth in a square around each pixel; pixels without depth are ignored.
+
+    Args:
+        depth: Depth, metres, shape :math:`(H, W)`; 0 = no measurement.
+        size: Side of the square, pixels.
+
+    Returns:
+        Depth, metres, shape :math:`(H, W)`; the largest float32 if the square has no measurement.
+    """
+    no_depth = cv2.threshold(depth, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
+    return np.asarray(cv2.erode(depth + no_depth, np.ones((size, size), np.uint8)), np.float32)
+
+
+def _nearest_depth_compiled(depth: Tensor, radius: int) -> Tensor:
+    if depth.dtype != torch.float32:
+        return NotImplemented
+    return torch.from_numpy(depth_kernels.nearest_depth(to_array(depth), radius))
+
+
+@compiled_by(_nearest_depth_compiled)
+def _nearest_depth(depth: Tensor, radius: int) -> Tensor:
+    """Return the minimum depth within a radius of each pixel, (H, W); 0 for a pixel without depth."""
+    array = depth.numpy()
+    return torch.from_numpy(erode_measured(array, 2 * radius + 1) * (array > 0))
+
+
+def _limits(config: FreeSpaceConfig) -> kernels.Limits:
+    return config.min_depth, config.max_depth, config.tolerance, config.min_tolerance
+
+
+def _is_free_space_compiled(points: Tensor, view: DepthView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
+    if points.dtype != torch.float64:
+        return NotImplemented
+    pose, nearest_depth = to_array(view.T_cw), to_array(view.nearest_depth)
+    limits = _limits(config)
+    free = kernels.is_free_space(points.numpy(), pose, nearest_depth, camera.intrinsics, camera.bounds, limits)
+    return torch.from_numpy(free)
+
+
+@compiled_by(_is_free_space_compiled)
 def is_free_space(points: Tensor, view: DepthView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
     """Check whether points lie in space that a view of another time observes as free.
 
@@ -128,6 +157,58 @@ def is_free_space(points: Tensor, view: DepthView, camera: PinholeCamera, config
     return torch.where(visible, (measured > expected + tolerance).to(torch.float64), torch.nan)
 
 
+def _newly_occupied_compiled(
+    view: DepthView,
+    earlier: Sequence[DepthView | None],
+    rays: Tensor,
+    stride: int,
+    camera: PinholeCamera,
+    config: FreeSpaceConfig,
+) -> Tensor:
+    depth, T_wc, directions = to_array(view.depth[0]), to_array(invert(view.T_cw)), to_array(rays)
+    appeared = np.full((len(earlier), -(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), np.nan)
+    for row, previous in zip(appeared, earlier, strict=True):
+        if previous is not None:
+            pose, nearest_depth = to_array(previous.T_cw), to_array(previous.nearest_depth)
+            observer = pose, nearest_depth, camera.intrinsics, camera.bounds, _limits(config)
+            kernels.newly_occupied(depth, stride, directions, T_wc, *observer, row)
+    return torch.from_numpy(appeared)
+
+
+@compiled_by(_newly_occupied_compiled)
+def _newly_occupied(
+    view: DepthView,
+    earlier: Sequence[DepthView | None],
+    rays: Tensor,
+    stride: int,
+    camera: PinholeCamera,
+    config: FreeSpaceConfig,
+) -> Tensor:
+    """Check whether the points of every n-th pixel lie in space that earlier views observed as free.
+
+    Args:
+        view: Current view.
+        earlier: Earlier view of each of B baselines; None if there is none.
+        rays: Ray of every n-th pixel at unit depth, float64, shape (3, h * w).
+        stride: Step n between the pixels.
+        camera: Camera of all views.
+        config: Range of depths and tolerances.
+
+    Returns:
+        1 if the space was free, 0 if it was occupied, NaN if unknown; float64, shape (B, h, w).
+    """
+    z = view.depth[0, ::stride, ::stride].to(torch.float64)
+    appeared = torch.full((len(earlier), *z.shape), torch.nan, dtype=torch.float64)
+    measured = torch.nonzero(((z > config.min_depth) & (z <= config.max_depth)).flatten())[:, 0]
+    T_wc = invert(view.T_cw)
+    in_camera = rays.index_select(1, measured) * z.flatten().index_select(0, measured)
+    points = (T_wc[:3, :3] @ in_camera + T_wc[:3, 3:]).T
+    for row, previous in zip(appeared.flatten(1), earlier, strict=True):
+        if previous is not None:
+            row[measured] = is_free_space(points, previous, camera, config)
+    return appeared
+
+
 def vacated_fractions(
     clouds: Sequence[Tensor], view: DepthView, camera: PinholeCamera, config: FreeSpaceConfig
 ) -> Tensor:
@@ -145,11 +226,13 @@ def vacated_fractions(
     """
     if not clouds:
         return torch.zeros(0, dtype=torch.float64)
-    free = is_free_space(torch.cat([cloud.to(torch.float64) for cloud in clouds]), view, camera, config)
-    owner = torch.arange(len(clouds)).repeat_interleave(torch.tensor([len(cloud) for cloud in clouds]))
-    zeros = free.new_zeros(len(clouds))
-    known = zeros.index_add(0, owner, (~free.isnan()).to(free.dtype))
-    return (zeros.index_add(0, owner, free.nan_to_num()) / known).masked_fill(known < config.min_points, torch.nan)
+    points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
+    free = is_free_space(points, view, camera, config).numpy()
+    # NumPy counts faster here than torch.
+    owner = np.arange(len(clouds)).repeat([len(cloud) for cloud in clouds])
+    known = np.bincount(owner, ~np.isnan(free), len(clouds))
+    vacated = np.bincount(owner, free == 1, len(clouds))
+    return torch.from_numpy(np.where(known >= max(config.min_points, 1), vacated / np.maximum(known, 1), np.nan))
 
 
 class FreeSpaceCheck:
@@ -196,18 +279,8 @@ class FreeSpaceCheck:
         """
         config = self._config
         baselines = config.baselines if config.enabled and pose_known else ()
-        z = view.depth[0, :: self._stride, :: self._stride].to(torch.float64)
-        appeared = torch.full((len(baselines), *z.shape), torch.nan, dtype=torch.float64)
-        if not baselines:
-            return NewlyOccupied(appeared, self._stride)
-        measured = torch.nonzero(((z > config.min_depth) & (z <= config.max_depth)).flatten())[:, 0]
-        T_wc = invert(view.T_cw)
-        in_camera = self._rays.index_select(1, measured) * z.flatten().index_select(0, measured)
-        points = (T_wc[:3, :3] @ in_camera + T_wc[:3, 3:]).T
-        for row, baseline in zip(appeared.flatten(1), baselines, strict=True):
-            previous = self._newest_view_before(view.stamp - baseline)
-            if previous is not None:
-                row[measured] = is_free_space(points, previous, self._camera, config)
+        earlier = [self._newest_view_before(view.stamp - baseline) for baseline in baselines]
+        appeared = _newly_occupied(view, earlier, self._rays, self._stride, self._camera, config)
         return NewlyOccupied(appeared, self._stride)
 
     def add_view(self, view: DepthView) -> None:

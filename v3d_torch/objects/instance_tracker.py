@@ -85,7 +85,8 @@ class InstanceTracker(torch.nn.Module):
 
         # Predict each track, and check whether the object is visible there.
         predicted = self._predict_silhouettes(stamp, T_wc)
-        predicted_masks = [self._predict_mask(silhouette, depth, step) for silhouette in predicted.values()]
+        coarse_depth = depth[:, ::step, ::step].contiguous()
+        predicted_masks = [self._predict_mask(silhouette, coarse_depth, step) for silhouette in predicted.values()]
         rows = _flatten(torch.stack(predicted_masks)) if predicted_masks else ()
         predicted_coarse = dict(zip(predicted, rows, strict=True))
         visible = torch.tensor(
@@ -142,8 +143,8 @@ class InstanceTracker(torch.nn.Module):
         return dict(zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True))
 
     def _predict_mask(self, silhouette: Silhouette, depth: Tensor, step: int = 1) -> Tensor:
-        """Return every n-th pixel of a silhouette whose depth agrees or is missing, bool, (h, w)."""
-        return silhouette.mask(depth[:, ::step, ::step], 0, _DEPTH_TOLERANCE, step=step, include_missing=True)
+        """Return the pixels of a silhouette whose depth agrees or is missing, for every n-th pixel; bool, (h, w)."""
+        return silhouette.mask(depth, 0, _DEPTH_TOLERANCE, step=step, include_missing=True)
 
     def _match(
         self,

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from v3d_torch.kernels import masks as kernels
+from v3d_torch.kernels.compiler import compiled_by
+
+_MAX_COMPILED_RADIUS = 254
+"""The kernel stores distances, up to one pixel more than the radius, as uint8."""
 
 
 def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Sequence[int]) -> Tensor:
@@ -28,6 +35,24 @@ def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Seq
     return torch.from_numpy(np.ascontiguousarray(pixels))
 
 
+@cache
+def ellipse(radius: int) -> NDArray[np.uint8]:
+    """Elliptic structuring element of a radius, pixels, uint8, shape (2 radius + 1, 2 radius + 1)."""
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
+
+
+def _dilate_compiled(mask: Tensor, pixels: int) -> Tensor:
+    if not 0 <= pixels < _MAX_COMPILED_RADIUS:
+        return NotImplemented
+    source = mask.view(torch.uint8).numpy()
+    crop = _crop(source, pixels)
+    dilated = np.zeros_like(source)
+    if crop is not None:
+        dilated[crop] = kernels.dilate(np.ascontiguousarray(source[crop]), _heights(pixels))
+    return torch.from_numpy(dilated).view(torch.bool)
+
+
+@compiled_by(_dilate_compiled)
 def dilate(mask: Tensor, pixels: int) -> Tensor:
     """Dilate a mask by an ellipse.
 
@@ -39,11 +64,22 @@ def dilate(mask: Tensor, pixels: int) -> Tensor:
         Dilated mask, bool, shape :math:`(H, W)`.
     """
     source = mask.view(torch.uint8).numpy()
-    left, top, width, height = cv2.boundingRect(source)
-    rows = slice(max(top - pixels, 0), top + height + pixels)
-    columns = slice(max(left - pixels, 0), left + width + pixels)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    crop = _crop(source, pixels)
     dilated = np.zeros_like(source)
-    if width:
-        dilated[rows, columns] = cv2.dilate(source[rows, columns], kernel)
+    if crop is not None:
+        dilated[crop] = cv2.dilate(source[crop], ellipse(pixels))
     return torch.from_numpy(dilated).view(torch.bool)
+
+
+def _crop(mask: NDArray[np.uint8], margin: int) -> tuple[slice, slice] | None:
+    """Return the rows and columns within a margin of the pixels of a mask; None for an empty mask."""
+    left, top, width, height = cv2.boundingRect(mask)
+    if not width:
+        return None
+    return slice(max(top - margin, 0), top + height + margin), slice(max(left - margin, 0), left + width + margin)
+
+
+@cache
+def _heights(radius: int) -> NDArray[np.uint8]:
+    """Height of the ellipse above its centre, in each column from the centre to the right, pixels."""
+    return (ellipse(radius)[:, radius:].sum(axis=0) // 2).astype(np.uint8)

@@ -12,11 +12,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.kernels import masks as kernels
+from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.objects.free_space_check import DepthView, erode_measured
 from v3d_torch.objects.mask_ops import dilate, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
@@ -51,8 +54,8 @@ class MaskRefiner:
         self._config = config
         self._stride = newly_occupied.stride
         # Pixels that a surface can grow over: no depth edge, and not occupied before the object appeared.
-        smooth = _smooth_pixels(view, self._stride, config.edge_ratio)
-        self._growable = smooth & ~newly_occupied.previously_occupied
+        smooth = _smooth_pixels(view.depth[0].numpy(), self._stride, config.edge_ratio)
+        self._growable = smooth & ~newly_occupied.previously_occupied.numpy()
         located = [track for track in tracks if track.newest.is_located]
         R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
         clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in located]
@@ -67,43 +70,95 @@ class MaskRefiner:
             return track.mask if track.missed else dilate(track.mask, config.depth_margin)
         silhouette, median_depth = self._silhouettes[track]
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
-        surface = self._grow_surface(track, silhouette.mask(depth, config.surface_margin, tolerance))
+        # NumPy combines masks faster here than torch.
+        mask = self._grow_surface(track, silhouette.mask(depth, config.surface_margin, tolerance)).numpy()
         if track.missed:  # a predicted mask already agrees with the depth
-            return surface.logical_or_(track.mask)
-        agreeing = silhouette.mask(depth, config.depth_margin, tolerance).logical_or_(self._view.missing)
-        rim = dilate(track.mask, config.depth_margin).logical_and_(agreeing)
-        return surface.logical_or_(rim).logical_or_(track.cloud_pixels)
+            mask |= track.mask.numpy()
+            return torch.from_numpy(mask)
+        agreeing = silhouette.mask(depth, config.depth_margin, tolerance).numpy()
+        agreeing |= self._view.missing.numpy()
+        agreeing &= dilate(track.mask, config.depth_margin).numpy()
+        mask |= agreeing
+        mask |= track.cloud_pixels.numpy()
+        return torch.from_numpy(mask)
 
     def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
         """Grow an object's pixels within the reachable ones up to the next depth edge, bool, shape (H, W)."""
         if self._config.surface_margin == 0:
             return track.cloud_pixels & reachable
         step = self._stride
-        seed = track.cloud_pixels[::step, ::step]
-        near = dilate(track.mask[::step, ::step], self._config.surface_margin // step)
-        region = (seed | (near & reachable[::step, ::step] & self._growable)).view(torch.uint8).numpy()
-        # Crop to the region, with a margin of one cell for the final dilation.
-        left, top, width, height = cv2.boundingRect(region)
-        rows, columns = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
-        count, components = cv2.connectedComponents(region[rows, columns], connectivity=4)
-        size = np.bincount(components.ravel(), minlength=count)
-        seeds = np.bincount(components[seed.numpy()[rows, columns]], minlength=count)
-        # If the object is only a small part of a surface, it stands on the surface or leans against it.
-        selected = seeds >= self._config.min_surface_fraction * size
-        selected[0] = False
-        surface = torch.zeros_like(reachable)
-        crop = tuple(slice(step * cells.start, step * cells.stop) for cells in (rows, columns))
-        in_crop = reachable[crop]
-        # Dilate by one cell to include the pixels between the last checked pixel and the edge.
-        cells = dilate(torch.from_numpy(selected[components]), 1).numpy()
-        surface[crop] = upsample_nearest(cells, step, in_crop.shape) & in_crop
-        return surface
+        seeds = track.cloud_pixels.numpy()[::step, ::step]
+        near = dilate(track.mask[::step, ::step].contiguous(), self._config.surface_margin // step).numpy()
+        near &= reachable.numpy()[::step, ::step]
+        near &= self._growable
+        near |= seeds
+        return _fill_surfaces(
+            torch.from_numpy(near), track.cloud_pixels, reachable, step, self._config.min_surface_fraction
+        )
 
 
-def _smooth_pixels(view: DepthView, step: int, edge_ratio: float) -> Tensor:
-    """Return every n-th pixel around which depth varies by less than a fraction of it, within half the step."""
-    depth, size = view.depth[0].numpy(), step + 1
-    nearest = view.min_depth_around(size)[::step, ::step]
+def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], tuple[slice, slice]]:
+    """Return the number of connected components, the component of each cell, and the rows and columns of the latter."""
+    # Crop to the region, with a margin of one cell for the final dilation.
+    left, top, width, height = cv2.boundingRect(region)
+    crop = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
+    count, components = cv2.connectedComponents(region[crop], connectivity=4)
+    return count, np.asarray(components, np.int32), crop
+
+
+def _fill_surfaces_compiled(
+    region: Tensor, pixels: Tensor, reachable: Tensor, step: int, min_fraction: float
+) -> Tensor:
+    count, components, (rows, columns) = _components(region.view(torch.uint8).numpy())
+    seeds = np.ascontiguousarray(pixels.view(torch.uint8).numpy()[::step, ::step][rows, columns])
+    crop = slice(step * rows.start, step * rows.stop), slice(step * columns.start, step * columns.stop)
+    surface = np.zeros(reachable.shape, np.uint8)
+    in_crop = np.ascontiguousarray(reachable.view(torch.uint8).numpy()[crop])
+    surface[crop] = kernels.fill_components(components, count, seeds, in_crop, step, min_fraction)
+    return torch.from_numpy(surface).view(torch.bool)
+
+
+@compiled_by(_fill_surfaces_compiled)
+def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int, min_fraction: float) -> Tensor:
+    """Select the surfaces of a region that belong to an object.
+
+    Args:
+        region: Cells of the object and of smooth surfaces near it, bool, shape :math:`(h, w)`.
+        pixels: Pixels of the object, bool, shape :math:`(H, W)`.
+        reachable: Pixels that can be selected, bool, shape :math:`(H, W)`.
+        step: Side of a cell, pixels.
+        min_fraction: Minimum fraction of a surface that lies on the object.
+
+    Returns:
+        Reachable pixels of the connected surfaces of which enough lies on the object, bool, shape :math:`(H, W)`.
+    """
+    count, components, (rows, columns) = _components(region.view(torch.uint8).numpy())
+    size = np.bincount(components.ravel(), minlength=count)
+    seeds = np.bincount(components[pixels.numpy()[::step, ::step][rows, columns]], minlength=count)
+    # If the object is only a small part of a surface, it stands on the surface or leans against it.
+    selected = seeds >= min_fraction * size
+    selected[0] = False
+    surface = torch.zeros_like(reachable)
+    crop = slice(step * rows.start, step * rows.stop), slice(step * columns.start, step * columns.stop)
+    in_crop = reachable[crop]
+    # Dilate by one cell to include the pixels between the last checked pixel and the edge.
+    cells = dilate(torch.from_numpy(selected[components]), 1).numpy()
+    surface[crop] = upsample_nearest(cells, step, in_crop.shape) & in_crop
+    return surface
+
+
+def _smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> NDArray[np.bool_]:
+    """Return every n-th pixel around which depth varies by less than a fraction of it, within half the step.
+
+    Args:
+        depth: Depth, metres, shape (H, W); 0 = no measurement.
+        step: Step n between the pixels.
+        edge_ratio: Largest variation of the depth, as a fraction of the depth.
+
+    Returns:
+        Bool, shape (h, w).
+    """
+    size, centre = step + 1, depth[::step, ::step]
+    nearest = erode_measured(depth, size)[::step, ::step]
     farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::step, ::step]
-    centre = depth[::step, ::step]
-    return torch.from_numpy((centre > 0) & (farthest - nearest < edge_ratio * centre))
+    return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)

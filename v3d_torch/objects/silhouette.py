@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.kernels import silhouette as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.objects.mask_ops import ellipse
 
 _CELL = 4
 """Side of the cells that collect the depths of a cloud, pixels: the resolution of the network's masks."""
@@ -25,6 +28,12 @@ _NO_DEPTH = 1e6
 
 _MIN_DEPTH = 0.1
 """Points nearer than this, or behind the camera, are not projected, metres."""
+
+ProjectedCells = tuple[NDArray[np.int64], NDArray[np.float32]]
+"""Cell (column, row), shape (P, 2), and depth, metres, shape (P,), of the points of a cloud that are in the image."""
+
+Minima = NDArray[np.float32]
+"""Minimum of z and of -z in or around each cell, metres, shape (rows, columns, 2)."""
 
 
 def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float) -> list[Silhouette]:
@@ -38,6 +47,19 @@ def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float)
     Returns:
         Silhouette of each cloud.
     """
+    return [Silhouette(cells, z, camera, spacing) for cells, z in _project_to_cells(clouds, camera)]
+
+
+def _project_to_cells_compiled(clouds: Sequence[Tensor], camera: PinholeCamera) -> list[ProjectedCells]:
+    if any(cloud.requires_grad for cloud in clouds):
+        return NotImplemented
+    points = [cloud.to(torch.float64).numpy() for cloud in clouds]
+    return [kernels.project_to_cells(each, _MIN_DEPTH, _CELL, camera.intrinsics, camera.bounds) for each in points]
+
+
+@compiled_by(_project_to_cells_compiled)
+def _project_to_cells(clouds: Sequence[Tensor], camera: PinholeCamera) -> list[ProjectedCells]:
+    """Project several clouds (P, 3) into an image at once."""
     if not clouds:
         return []
     # One contiguous row per coordinate is faster to project.
@@ -48,7 +70,80 @@ def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float)
     cells = np.floor((pixels.numpy()[projected] + 0.5) / _CELL).astype(np.int64)
     z = points[:, 2].numpy()[projected].astype(np.float32)
     ends = np.concatenate([[0], projected.cumsum()])[np.cumsum([0, *map(len, clouds)])]
-    return [Silhouette(cells[begin:end], z[begin:end], camera, spacing) for begin, end in pairwise(ends.tolist())]
+    return [(cells[begin:end], z[begin:end]) for begin, end in pairwise(ends.tolist())]
+
+
+def _bin_depths_compiled(cells: NDArray[np.int64], z: NDArray[np.float32]) -> tuple[NDArray[np.int64], Minima]:
+    return kernels.bin_depths(cells, z, _NO_DEPTH)
+
+
+@compiled_by(_bin_depths_compiled)
+def _bin_depths(cells: NDArray[np.int64], z: NDArray[np.float32]) -> tuple[NDArray[np.int64], Minima]:
+    """Return the first cell (column, row), and the minima of z and of -z in each cell from there on."""
+    first = cells.min(axis=0)
+    columns, rows = (cells.max(axis=0) - first + 1).tolist()
+    column, row = (cells - first).T
+    minima = np.full(2 * rows * columns, _NO_DEPTH, np.float32)
+    index = 2 * (row * columns + column)
+    np.minimum.at(minima, index, z)
+    np.minimum.at(minima, index + 1, -z)
+    return first, minima.reshape(rows, columns, 2)
+
+
+def _select_pixels_compiled(
+    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, step: int, include_missing: bool
+) -> Tensor:
+    if depth.dtype != torch.float32:
+        return NotImplemented
+    _, height, width = depth.shape
+    left, top = first.tolist()
+    rows, columns = (
+        _pixels_of_cells(top, len(minima), step, height),
+        _pixels_of_cells(left, minima.shape[1], step, width),
+    )
+    mask = np.zeros((height, width), np.bool_)
+    box, grid = (rows.start, rows.stop, columns.start, columns.stop), (top, left, _CELL, step)
+    no_depth = _NO_DEPTH / 2 if include_missing else 0.0
+    kernels.select_pixels(minima, to_array(depth[0]), box, grid, tolerance, no_depth, mask)
+    return torch.from_numpy(mask)
+
+
+@compiled_by(_select_pixels_compiled)
+def _select_pixels(
+    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, step: int, include_missing: bool
+) -> Tensor:
+    """Select the pixels whose depth lies within the range of their cell.
+
+    Args:
+        minima: Minimum of z and of -z around each cell, metres, shape (rows, columns, 2).
+        first: First cell (column, row).
+        depth: Depth of every n-th pixel, metres, shape (1, h, w); 0 = no measurement.
+        tolerance: Tolerance of the depth, metres.
+        step: Step n between the pixels of ``depth``.
+        include_missing: Include pixels without depth in cells near points.
+
+    Returns:
+        Mask, bool, shape (h, w).
+    """
+    mask = np.zeros(depth.shape[1:], np.bool_)
+    left, top = first.tolist()
+    v, u = (
+        _pixels_of_cells(top, len(minima), step, depth.shape[1]),
+        _pixels_of_cells(left, minima.shape[1], step, depth.shape[2]),
+    )
+    cell_rows = np.arange(v.start, v.stop) * step // _CELL - top
+    cell_columns = np.arange(u.start, u.stop) * step // _CELL - left
+    # Expand the cells to pixels: columns first, while there are few rows.
+    low, high = (
+        bound.take(cell_columns, axis=1).take(cell_rows, axis=0)
+        for bound in (minima[..., 0] - tolerance, tolerance - minima[..., 1])
+    )
+    z = depth[0].numpy()[v, u]  # NumPy compares faster here than torch
+    inside = (z > low) & (z < high)
+    if include_missing:
+        inside |= (z <= 0) & (low < _NO_DEPTH / 2)
+    mask[v, u] = inside
+    return torch.from_numpy(mask)
 
 
 class Silhouette:
@@ -68,15 +163,8 @@ class Silhouette:
         middle = len(z) // 2
         median_depth = float(np.partition(z, middle)[middle])
         self._gap = spacing * camera.fx / median_depth
-        self._first_cell = cells.min(axis=0)
-        columns, rows = (cells.max(axis=0) - self._first_cell + 1).tolist()
         # Minimum of z and of -z in each cell: one erosion then finds the nearest and the farthest depth around a cell.
-        column, row = (cells - self._first_cell).T
-        minima = np.full(2 * rows * columns, _NO_DEPTH, np.float32)
-        index = 2 * (row * columns + column)
-        np.minimum.at(minima, index, z)
-        np.minimum.at(minima, index + 1, -z)
-        self._minima = minima.reshape(rows, columns, 2)
+        self._first_cell, self._minima = _bin_depths(cells, z)
 
     def mask(
         self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, include_missing: bool = False
@@ -93,29 +181,14 @@ class Silhouette:
         Returns:
             Mask of every n-th pixel, bool, shape :math:`(h, w)`; empty if no point is in the image.
         """
-        mask = np.zeros(depth.shape[1:], np.bool_)
         if len(self._z) == 0:
-            return torch.from_numpy(mask)
+            return torch.zeros(depth.shape[1:], dtype=torch.bool)
         radius = max(round((margin + self._gap) / _CELL), 1)
         # Only the part of the image within the radius of the points can be in the mask.
         border = (radius, radius, radius, radius)
         padded = cv2.copyMakeBorder(self._minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
-        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-        minima = cv2.erode(padded, kernel)
-        left, top = (self._first_cell - radius).tolist()
-        v, cell_rows = _pixels_of_cells(top, len(padded), step, depth.shape[1])
-        u, cell_columns = _pixels_of_cells(left, padded.shape[1], step, depth.shape[2])
-        # Expand the cells to pixels: columns first, while there are few rows.
-        low, high = (
-            bound.take(cell_columns, axis=1).take(cell_rows, axis=0)
-            for bound in (minima[..., 0] - tolerance, tolerance - minima[..., 1])
-        )
-        z = depth[0].numpy()[v, u]  # NumPy compares faster here than torch
-        inside = (z > low) & (z < high)
-        if include_missing:
-            inside |= (z <= 0) & (low < _NO_DEPTH / 2)
-        mask[v, u] = inside
-        return torch.from_numpy(mask)
+        minima = np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
+        return _select_pixels(minima, self._first_cell - radius, depth, tolerance, step, include_missing)
 
     def visible_fraction(self, depth: Tensor, tolerance: float) -> float:
         """Return the fraction of projected points whose depth is the measured depth.
@@ -134,7 +207,7 @@ class Silhouette:
         return float((np.abs(depth[0].numpy()[v, u] - self._z) < tolerance).mean())
 
 
-def _pixels_of_cells(first: int, count: int, step: int, size: int) -> tuple[slice, NDArray[np.int64]]:
-    """Return the range of every n-th pixel within ``count`` cells from ``first`` on, and the cell of each, one axis."""
+def _pixels_of_cells(first: int, count: int, step: int, size: int) -> slice:
+    """Return the range of every n-th pixel within ``count`` cells from ``first`` on, along one axis."""
     begin, end = max(-(-first * _CELL // step), 0), min(-(-(first + count) * _CELL // step), size)
-    return slice(begin, end), np.arange(begin, end) * step // _CELL - first
+    return slice(begin, max(begin, end))

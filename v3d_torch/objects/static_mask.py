@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,12 +54,15 @@ def static_masks(
     masks = {track: refiner.refine(track) for track in tracks}
     size, dilation = view.depth.shape[-2:], config.static_mask.dilation
     static = _outside([masks[track] for track in excluded], size, dilation)
-    return StaticMasks(static, static & _outside([masks[track] for track in people], size, dilation))
+    is_excluded = set(excluded)
+    others = [masks[track] for track in people if track not in is_excluded]
+    return StaticMasks(static, static & _outside(others, size, dilation) if others else static.clone())
 
 
 def _outside(masks: list[Tensor], size: torch.Size, dilation: int) -> Tensor:
     """Return the pixels outside of all dilated masks, bool, shape (H, W)."""
-    covered = torch.zeros(size, dtype=torch.bool)
+    covered = np.zeros(size, np.bool_)
     for mask in masks:
-        covered |= mask
-    return ~dilate(covered, dilation)
+        covered |= mask.numpy()  # NumPy combines masks faster here than torch
+    outside = dilate(torch.from_numpy(covered), dilation).numpy()
+    return torch.from_numpy(np.logical_not(outside, out=outside))

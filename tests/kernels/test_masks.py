@@ -1,0 +1,87 @@
+"""Kernels of masks, silhouettes and nearest depths equal their torch twins bitwise, on random and degenerate inputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.kernels import compiler
+from v3d_torch.kernels.compiler import TWINS
+from v3d_torch.objects import mask_refiner, silhouette
+
+pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
+
+SIZES = [(1, 1), (1, 7), (9, 1), (13, 30), (48, 64)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("density", [0.0, 0.02, 0.5, 1.0])
+@pytest.mark.parametrize("radius", [0, 1, 3, 8, 100])
+def test_dilation_equals_its_twin(size: tuple[int, int], density: float, radius: int) -> None:
+    twin = TWINS["v3d_torch.objects.mask_ops.dilate"]
+    mask = torch.from_numpy(np.random.default_rng(0).random(size) < density)
+    assert torch.equal(twin.compiled(mask, radius), twin.torch(mask, radius))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("measured", [0.0, 0.7, 1.0])
+@pytest.mark.parametrize("radius", [0, 1, 2, 6, 70])
+def test_nearest_depth_equals_its_twin(size: tuple[int, int], measured: float, radius: int) -> None:
+    twin = TWINS["v3d_torch.objects.free_space_check._nearest_depth"]
+    depth = random_depth(size, measured)[0]
+    assert torch.equal(twin.compiled(depth, radius), twin.torch(depth, radius))
+
+
+@pytest.mark.parametrize("density", [0.0, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("step", [1, 3, 4])
+def test_filled_surfaces_equal_their_twin(density: float, step: int) -> None:
+    twin, rng = TWINS[f"{mask_refiner.__name__}._fill_surfaces"], np.random.default_rng(0)
+    pixels, reachable = (torch.from_numpy(rng.random((45, 62)) < d) for d in (0.5, 0.9))
+    region = torch.from_numpy(rng.random((-(-45 // step), -(-62 // step))) < density)
+    found, expected = (f(region, pixels, reachable, step, 0.4) for f in twin)
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("count", [1, 2, 500])
+def test_binned_depths_equal_their_twin(count: int) -> None:
+    rng = np.random.default_rng(0)
+    cells, z = rng.integers(-3, 9, (count, 2)), rng.uniform(0.5, 5, count).astype(np.float32)
+    for found, expected in zip(*(f(cells, z) for f in TWINS[f"{silhouette.__name__}._bin_depths"]), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("step", [1, 3, 4])
+@pytest.mark.parametrize("first", [(0, 0), (-3, 2), (14, 9), (-20, -20), (40, 40)])
+@pytest.mark.parametrize("include_missing", [False, True])
+def test_selected_pixels_equal_their_twin(step: int, first: tuple[int, int], include_missing: bool) -> None:
+    rng = np.random.default_rng(0)
+    nearest = rng.choice([1.5, 2.0, 1e6], (6, 8)).astype(np.float32)
+    farthest = np.where(nearest < 1e6, nearest + rng.uniform(0, 0.1, (6, 8)), -1e6)
+    minima = np.stack([nearest, -farthest], axis=-1).astype(np.float32)
+    depth = random_depth((48, 64), 0.8)[:, ::step, ::step]
+    found, expected = (
+        f(minima, np.array(first), depth, 0.2, step, include_missing)
+        for f in TWINS[f"{silhouette.__name__}._select_pixels"]
+    )
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("distortion", [(), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)])
+def test_projected_cells_equal_their_twin(distortion: tuple[float, ...]) -> None:
+    camera = PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=(*distortion, *[0.0] * (5 - len(distortion))))
+    rng = np.random.default_rng(0)
+    clouds = [torch.from_numpy(rng.normal(0, 2, (count, 3))) for count in (0, 1, 1000)]
+    clouds.append(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [torch.nan, 0.0, 1.0]], dtype=torch.float64))
+    found, expected = (f(clouds, camera) for f in TWINS[f"{silhouette.__name__}._project_to_cells"])
+    for (cells, z), (expected_cells, expected_z) in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(cells, expected_cells)
+        np.testing.assert_array_equal(z, expected_z)
+
+
+def random_depth(size: tuple[int, int], measured: float) -> torch.Tensor:
+    """Depth near 2 m, shape (1, H, W); 0 for a part of the pixels."""
+    rng = np.random.default_rng(1)
+    depth = rng.normal(2, 0.1, size) * (rng.random(size) < measured)
+    return torch.from_numpy(depth.astype(np.float32))[None]

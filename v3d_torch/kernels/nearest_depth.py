@@ -1,0 +1,77 @@
+"""Kernel of the minimum depth around pixels; see `v3d_torch.objects.free_space_check`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels.compiler import device, kernel
+
+Depth = NDArray[np.float32]
+
+_MAX = np.finfo(np.float32).max
+"""Depth of a pixel without measurement: farther than any other."""
+
+
+@device
+def _read(depth: Depth, row: Depth) -> None:
+    """Copy a row; pixels without depth are set to the largest number."""
+    for x in range(row.size):
+        row[x] = depth[x] if depth[x] > 0 else np.float32(_MAX)
+
+
+@device
+def _min(a: Depth, b: Depth, minimum: Depth) -> None:
+    for x in range(minimum.size):
+        minimum[x] = a[x] if a[x] < b[x] else b[x]
+
+
+@device
+def _lower(a: Depth, minimum: Depth) -> None:
+    """Update a minimum in place: loops over overlapping arrays of different names do not use vector instructions."""
+    for x in range(minimum.size):
+        minimum[x] = a[x] if a[x] < minimum[x] else minimum[x]
+
+
+@device
+def _write(a: Depth, b: Depth, depth: Depth, nearest: Depth) -> None:
+    for x in range(nearest.size):
+        nearest[x] = (a[x] if a[x] < b[x] else b[x]) if depth[x] > 0 else np.float32(0)
+
+
+@kernel("(f4[:,::1], i8)")
+def nearest_depth(depth: Depth, radius: int) -> Depth:
+    """Minimum depth in a square around each pixel, by the algorithm of van Herk along columns.
+
+    Args:
+        depth: Depth, metres, (H, W); 0 = no measurement.
+        radius: Half the side of the square without its centre, pixels.
+
+    Returns:
+        Depth, metres, (H, W); 0 for a pixel without measurement.
+    """
+    height, width = depth.shape
+    size = 2 * radius + 1
+    row, wider = np.empty(width + 2 * radius, np.float32), np.empty(width + 2 * radius, np.float32)
+    # Minima along rows; the rows above and below the image have no measurement.
+    minima = np.full((-(-(height + 2 * radius) // size) * size + size, width), np.float32(_MAX), np.float32)
+    for y in range(height):
+        row[:radius], row[radius + width :] = np.float32(_MAX), np.float32(_MAX)
+        _read(depth[y], row[radius : radius + width])
+        window = 1  # row[x] is the minimum of this many pixels from x on
+        while 2 * window <= size:
+            _min(row[: row.size - window], row[window:], wider[: row.size - window])
+            row, wider = wider, row
+            window *= 2
+        _min(row[:width], row[size - window : size - window + width], minima[radius + y])
+    # A window of rows is the end of one block of rows and the beginning of the next.
+    nearest, end, begin = np.empty_like(depth), np.empty((size, width), np.float32), np.empty(width, np.float32)
+    for first in range(0, height, size):
+        end[size - 1] = minima[first + size - 1]
+        for i in range(size - 2, -1, -1):
+            _min(end[i + 1], minima[first + i], end[i])
+        begin[:] = np.float32(_MAX)
+        for i in range(min(size, height - first)):
+            _write(end[i], begin, depth[first + i], nearest[first + i])
+            _lower(minima[first + size + i], begin)
+    return nearest
