@@ -12,7 +12,7 @@ from v3d_torch.optim.reprojection import Measurements
 
 _NOT_GIVEN = torch.zeros(0, 2, dtype=torch.float64)
 
-MIN_DEPTH = 1e-6
+_MIN_DEPTH = 1e-6
 """Keeps 1/z finite for pixels without depth, metres."""
 
 
@@ -51,7 +51,7 @@ class Features:
     @property
     def inverse_depth(self) -> Tensor:
         """Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement."""
-        return torch.where(self.depth > 0, 1.0 / self.depth.clamp(min=MIN_DEPTH), 0.0)
+        return torch.where(self.depth > 0, 1.0 / self.depth.clamp(min=_MIN_DEPTH), 0.0)
 
     def in_mask(self, mask: Tensor) -> Tensor:
         """Check which features lie on the true pixels of a mask.

@@ -1,4 +1,4 @@
-"""Kernel of the compensation of readout times; see `v3d_torch.odometry.time_compensation`."""
+"""Kernels of the compensation of readout times; see `v3d_torch.odometry.depth_delay` and `.rolling_shutter`."""
 
 from __future__ import annotations
 
@@ -23,48 +23,58 @@ def _motion_field(
     return (w * vx + wy - wz * y - x * s) * fx, (w * vy + wz * x - wx - y * s) * fy, -s * w
 
 
-@device
-def _inverse(depth: float, min_depth: float) -> float:
-    return 1 / max(depth, min_depth) if depth > 0 else 0.0
-
-
-@kernel("(f8[:,::1], i8[:,::1], f8[::1], f8[:,::1], f4[:,::1], f8[::1], f8, f8, i8, f8, f8, UniTuple(f8, 4))")
-def compensate(
-    uv: Array, pixel: NDArray[np.int64], depth: Array, readout_jacobian: Array, depth_image: NDArray[np.float32],
-    velocity: Array, delay: float, readout: float, rows: int, min_depth: float, max_depth: float, intrinsics: Intrinsics,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Compensate depth delay, then rolling shutter.
+@kernel("(f8[:,::1], i8[:,::1], f8[::1], f4[:,::1], f8[::1], f8, f8, UniTuple(f8, 4))")
+def compensate_depth_delay(
+    uv: Array, pixel: NDArray[np.int64], inverse_depth: Array, depth_image: NDArray[np.float32], velocity: Array,
+    delay: float, max_depth: float, intrinsics: Intrinsics,
+) -> Array:  # fmt: skip
+    """Depth of features at the time of the colour image, metres, (N,); 0 = no measurement.
 
     Args:
         uv: Undistorted pixels of the features, (N, 2).
         pixel: (column, row) in the recorded image, (N, 2).
-        depth: Depth, metres, (N,); 0 = no measurement.
-        readout_jacobian: Derivative of ``uv`` by the readout, pixels per second, (N, 2).
+        inverse_depth: Inverse depth before the compensation, 1/m, (N,); 0 = no measurement.
         depth_image: Depth image, metres, (H, W); 0 = no measurement.
         velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
-        delay: Depth stamp minus colour stamp, seconds; 0 = the depth stays.
-        readout: Readout, seconds.
-        rows: Number of rows that are read in this time.
-        min_depth: Keeps the inverse depth finite, metres.
+        delay: Depth stamp minus colour stamp, seconds.
         max_depth: Depth beyond this counts as missing, metres.
         intrinsics: ``fx, fy, cx, cy``.
-
-    Returns:
-        New ``uv``, ``depth`` and ``readout_jacobian``.
     """
     height, width = depth_image.shape
-    new_uv, new_depth, new_jacobian = np.empty_like(uv), depth.copy(), np.empty_like(uv)
+    depth = np.zeros(len(uv))
     for i in range(len(uv)):
-        if delay != 0:
-            du, dv, rate = _motion_field(uv[i, 0], uv[i, 1], _inverse(depth[i], min_depth), velocity, intrinsics)
-            column, row, z = np.rint(pixel[i, 0] + delay * du), np.rint(pixel[i, 1] + delay * dv), 0.0
-            if 0 <= column < width and 0 <= row < height:
-                z = np.float64(depth_image[int(row), int(column)])
-            new_depth[i] = z / (1 - delay * rate * z) if 0 < z <= max_depth else 0.0
+        du, dv, rate = _motion_field(uv[i, 0], uv[i, 1], inverse_depth[i], velocity, intrinsics)
+        column, row = np.rint(pixel[i, 0] + delay * du), np.rint(pixel[i, 1] + delay * dv)
+        if 0 <= column < width and 0 <= row < height:
+            z = np.float64(depth_image[int(row), int(column)])
+            if 0 < z <= max_depth:
+                depth[i] = z / (1 - delay * rate * z)
+    return depth
+
+
+@kernel("(f8[:,::1], i8[:,::1], f8[::1], f8[:,::1], f8[::1], f8, i8, UniTuple(f8, 4))")
+def compensate_rolling_shutter(
+    uv: Array, pixel: NDArray[np.int64], inverse_depth: Array, readout_jacobian: Array, velocity: Array,
+    readout: float, rows: int, intrinsics: Intrinsics,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Pixels of features at the time of the middle row, and their derivatives by the readout, both (N, 2).
+
+    Args:
+        uv: Undistorted pixels, compensated with ``readout_jacobian``, (N, 2).
+        pixel: (column, row) in the recorded image, (N, 2).
+        inverse_depth: 1/m, (N,); 0 = no measurement.
+        readout_jacobian: Earlier derivative of ``uv`` by the readout, pixels per second, (N, 2).
+        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
+        readout: Time from the first to the last row, seconds.
+        rows: Number of rows of the image.
+        intrinsics: ``fx, fy, cx, cy``.
+    """
+    new_uv, new_jacobian = np.empty_like(uv), np.empty_like(uv)
+    for i in range(len(uv)):
         u = uv[i, 0] - readout * readout_jacobian[i, 0]
         v = uv[i, 1] - readout * readout_jacobian[i, 1]
-        du, dv, _ = _motion_field(u, v, _inverse(new_depth[i], min_depth), velocity, intrinsics)
-        time = pixel[i, 1] / (rows - 1) - 0.5  # of the row, in readouts since the middle row
+        du, dv, _ = _motion_field(u, v, inverse_depth[i], velocity, intrinsics)
+        time = pixel[i, 1] / (rows - 1) - 0.5  # of the row, from -0.5 to 0.5 readouts
         new_jacobian[i, 0], new_jacobian[i, 1] = -time * du, -time * dv
         new_uv[i, 0], new_uv[i, 1] = u + readout * new_jacobian[i, 0], v + readout * new_jacobian[i, 1]
-    return new_uv, new_depth, new_jacobian
+    return new_uv, new_jacobian
