@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -46,12 +46,14 @@ class Features:
 
     def __getitem__(self, keep: Tensor) -> Features:
         """Select features by a boolean mask or by indices."""
-        return Features(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
+        indices = torch.nonzero(keep)[:, 0] if keep.dtype == torch.bool else keep
+        # index_select is faster than indexing here.
+        return Features(**{name: column.index_select(0, indices) for name, column in vars(self).items()})
 
     @property
     def inverse_depth(self) -> Tensor:
         """Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement."""
-        return torch.where(self.depth > 0, 1.0 / self.depth.clamp(min=_MIN_DEPTH), 0.0)
+        return torch.where(self.depth > 0, self.depth.clamp(min=_MIN_DEPTH).reciprocal_(), 0.0)
 
     def in_mask(self, mask: Tensor) -> Tensor:
         """Check which features lie on the true pixels of a mask.
