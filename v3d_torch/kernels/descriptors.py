@@ -23,16 +23,17 @@ _ODD_BITS, _BIT_PAIRS, _HALF_BYTES, _BYTES = (
 
 
 @device
-def _count_bits(word: np.uint64) -> np.int64:
+def _count_bits(word: np.uint64) -> int:
     """Number of set bits. The compiler recognises this form and uses the processor's instruction."""
     word = word - ((word >> np.uint64(1)) & _ODD_BITS)
     word = (word & _BIT_PAIRS) + ((word >> np.uint64(2)) & _BIT_PAIRS)
     word = (word + (word >> np.uint64(4))) & _HALF_BYTES
-    return np.int64((word * _BYTES) >> np.uint64(56))
+    count: int = np.int64((word * _BYTES) >> np.uint64(56))  # type: ignore[assignment]
+    return count
 
 
 @device
-def hamming_distance(a: Words, i: int, b: Words, j: int) -> np.int64:
+def hamming_distance(a: Words, i: int, b: Words, j: int) -> int:
     """Number of different bits of descriptors ``a[i]`` and ``b[j]``."""
     return (
         _count_bits(a[i, 0] ^ b[j, 0])

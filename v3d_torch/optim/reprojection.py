@@ -81,7 +81,8 @@ def _whiten_compiled(measured: Measurements, camera: PinholeCamera) -> WhitenedM
     if any(column.dtype != torch.float64 or column.requires_grad for column in columns) or measured.uv.ndim != 2:
         return NotImplemented
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    whitened = kernels.whiten(*map(to_array, columns), measured.inverse_depth_sigma, intrinsics)
+    uv, inverse_depth, pixel_sigma = map(to_array, columns)
+    whitened = kernels.whiten(uv, inverse_depth, pixel_sigma, measured.inverse_depth_sigma, intrinsics)
     return WhitenedMeasurements(*map(torch.from_numpy, whitened))
 
 
