@@ -45,8 +45,10 @@ class Features:
     def __len__(self) -> int:
         return self.uv.shape[0]
 
-    def __getitem__(self, keep: Tensor) -> Features:
-        """Select features by a boolean mask or by indices."""
+    def __getitem__(self, keep: Tensor | slice) -> Features:
+        """Select features by a boolean mask, by indices from 0, or by a slice."""
+        if isinstance(keep, slice):
+            return Features(**{name: column[keep] for name, column in vars(self).items()})
         indices = torch.nonzero(keep)[:, 0] if keep.dtype == torch.bool else keep
         # index_select is faster than indexing here.
         return Features(**{name: column.index_select(0, indices) for name, column in vars(self).items()})
