@@ -68,11 +68,14 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
 def test_kernel_equals_its_twin_on_the_calls_of_a_run(name: str, calls: dict[str, list[Call]]) -> None:
     step = max(1, len(calls[name]) // MAX_CALLS)
     assert calls[name], "the run does not call this function"
+    compared = 0
     for args, kwargs in calls[name][::step]:
-        expected = TWINS[name].torch(*deepcopy(args), **kwargs)
         found = TWINS[name].compiled(*deepcopy(args), **kwargs)
-        assert found is not NotImplemented
-        assert_same(found, expected, name)
+        if found is NotImplemented:  # for example a batch of poses
+            continue
+        assert_same(found, TWINS[name].torch(*deepcopy(args), **kwargs), name)
+        compared += 1
+    assert compared, "the kernel supports none of these calls"
 
 
 def assert_same(found: Any, expected: Any, where: str) -> None:

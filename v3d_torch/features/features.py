@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,14 +45,18 @@ class Features:
     def __len__(self) -> int:
         return self.uv.shape[0]
 
-    def __getitem__(self, selected: Tensor) -> Features:
-        """Select features by a boolean mask or by indices."""
-        return Features(**{field.name: getattr(self, field.name)[selected] for field in fields(self)})
+    def __getitem__(self, selected: Tensor | slice) -> Features:
+        """Select features by a boolean mask, by indices from 0, or by a slice."""
+        if isinstance(selected, slice):
+            return Features(**{name: column[selected] for name, column in vars(self).items()})
+        indices = torch.nonzero(selected)[:, 0] if selected.dtype == torch.bool else selected
+        # index_select is faster than indexing here.
+        return Features(**{name: column.index_select(0, indices) for name, column in vars(self).items()})
 
     @property
     def inverse_depth(self) -> Tensor:
         """Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement."""
-        return torch.where(self.depth > 0, 1.0 / self.depth.clamp(min=_MIN_DEPTH), 0.0)
+        return torch.where(self.depth > 0, self.depth.clamp(min=_MIN_DEPTH).reciprocal_(), 0.0)
 
     def in_mask(self, mask: Tensor) -> Tensor:
         """Check which features lie on the true pixels of a mask.
@@ -96,12 +101,16 @@ def select_evenly(pixel: Tensor, count: int, cell: int) -> Tensor:
     """
     if pixel.shape[0] <= count:
         return torch.arange(pixel.shape[0])
-    columns = int(pixel[:, 0].max()) // cell + 1
-    key = (pixel[:, 1] // cell) * columns + pixel[:, 0] // cell
-    order = torch.argsort(key, stable=True)
-    rank = torch.empty_like(key)  # position of each pixel within its cell
-    rank[order] = torch.arange(key.shape[0]) - torch.searchsorted(key[order], key[order], side="left")
-    return torch.argsort(rank, stable=True)[:count].sort().values
+    column, row = (pixel.numpy() // cell).T  # NumPy is faster here
+    key, index = row * (int(column.max()) + 1) + column, np.arange(len(row))
+    order = np.sort(key * len(key) + index) % len(key)  # an argsort by key; sorting numbers is faster
+    rank = np.empty_like(key)  # position of each pixel within its cell
+    rank[order] = index - np.searchsorted(key[order], key[order])
+    # All pixels of the ranks that fit as a whole, and the first ones of the next rank.
+    full_ranks = np.searchsorted(np.bincount(rank).cumsum(), count, side="right")
+    selected, next_rank = rank < full_ranks, np.flatnonzero(rank == full_ranks)
+    selected[next_rank[: count - np.count_nonzero(selected)]] = True
+    return torch.from_numpy(np.flatnonzero(selected))
 
 
 def pixel_sigma(octave: Tensor, config: TrackingConfig, pyramid: FeaturesConfig) -> Tensor:

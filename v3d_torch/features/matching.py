@@ -8,6 +8,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.kernels import descriptors as descriptor_kernels
+from v3d_torch.kernels import projection_matching as projection_kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+
 _CELL = 8.0
 """Side of the cells of the search grid, pixels. Cells of about half a search radius keep the candidates few."""
 
@@ -33,6 +37,20 @@ def _as_words(descriptors: Tensor) -> NDArray[np.uint64]:
     return descriptors.contiguous().numpy().view(np.uint64)
 
 
+def _match_descriptors_compiled(a: Tensor, b: Tensor, *, max_hamming: int, max_ratio: float) -> Tensor:
+    if not _are_descriptors(a, b):
+        return NotImplemented
+    if min(a.shape[0], b.shape[0]) < 2:
+        return torch.zeros(0, 2, dtype=torch.int64)
+    return torch.from_numpy(descriptor_kernels.match_descriptors(_as_words(a), _as_words(b), max_hamming, max_ratio))
+
+
+def _are_descriptors(*tensors: Tensor) -> bool:
+    """Check whether all tensors have the type and shape of 256-bit descriptors."""
+    return all(tensor.dtype == torch.uint8 and tensor.shape[1:] == (32,) for tensor in tensors)
+
+
+@compiled_by(_match_descriptors_compiled)
 def match_descriptors(a: Tensor, b: Tensor, *, max_hamming: int, max_ratio: float) -> Tensor:
     """Match descriptors: mutual nearest neighbours that pass Lowe's ratio test.
 
@@ -65,6 +83,39 @@ def _index(descriptors: NDArray[np.uint8]) -> faiss.IndexBinaryFlat:
     return index
 
 
+def _match_by_projection_compiled(
+    projected: Tensor,
+    radius: Tensor,
+    levels: Tensor,
+    descriptors: Tensor,
+    uv: Tensor,
+    octave: Tensor,
+    candidates: Tensor,
+    *,
+    max_hamming: int,
+    max_ratio: float,
+) -> Tensor:
+    types = {projected.dtype, radius.dtype, uv.dtype}, {levels.dtype, octave.dtype}
+    if types != ({torch.float64}, {torch.int64}) or not _are_descriptors(descriptors, candidates):
+        return NotImplemented
+    if uv.shape[0] == 0:
+        return torch.zeros(0, 2, dtype=torch.int64)
+    pairs = projection_kernels.match_by_projection(
+        to_array(projected),
+        to_array(radius),
+        to_array(levels),
+        _as_words(descriptors),
+        to_array(uv),
+        to_array(octave),
+        _as_words(candidates),
+        max_hamming,
+        max_ratio,
+        _CELL,
+    )
+    return torch.from_numpy(pairs)
+
+
+@compiled_by(_match_by_projection_compiled)
 def match_by_projection(
     projected: Tensor,
     radius: Tensor,

@@ -12,6 +12,8 @@ from v3d_torch.config import FeaturesConfig, TrackingConfig
 from v3d_torch.features.features import Features
 from v3d_torch.features.matching import match_by_projection
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.kernels import landmark_projection as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,15 @@ class ProjectedLandmarks:
     levels: Tensor
 
 
+def _project_compiled(self: ProjectionMatcher, T_cw: Tensor, local_map: LocalMap) -> ProjectedLandmarks:
+    columns = T_cw, local_map.points, local_map.directions, local_map.reference_distance
+    if any(column.dtype != torch.float64 or column.requires_grad for column in columns):
+        return NotImplemented
+    pose, points, directions, distances, K, bounds = map(to_array, (*columns, self._camera.K, self._bounds))
+    projected = kernels.project(pose, points, directions, distances, K, bounds, math.log(self._scale), self._levels)
+    return ProjectedLandmarks(*map(torch.from_numpy, projected))
+
+
 class ProjectionMatcher:
     """Matches landmarks to the features of a frame whose pose is approximately known.
 
@@ -80,7 +91,7 @@ class ProjectionMatcher:
         margin = self._LEVEL_MARGIN
         lower = [self._MIN_DEPTH, 0.0, 0.0, self._MIN_COSINE, -margin]
         upper = [math.inf, camera.width, camera.height, math.inf, pyramid.levels - 1 + margin]
-        self._lower, self._upper = torch.tensor([lower, upper], dtype=torch.float64)[..., None]
+        self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
 
     def __call__(
         self, features: Features, projection: ProjectedLandmarks, local_map: LocalMap, radius: float
@@ -110,6 +121,7 @@ class ProjectionMatcher:
         )
         return torch.stack([projection.indices[pairs[:, 0]], pairs[:, 1]], dim=1)
 
+    @compiled_by(_project_compiled)
     def project(self, T_cw: Tensor, local_map: LocalMap) -> ProjectedLandmarks:
         """Project a local map into a camera, and select the landmarks in view.
 
@@ -129,7 +141,8 @@ class ProjectionMatcher:
         cosine = (points * directions).sum(dim=0) / distance
         level = torch.log(local_map.reference_distance / distance) / math.log(self._scale)
         predicted = torch.stack([z, u, v, cosine, level])
-        rows = torch.nonzero(((predicted >= self._lower) & (predicted < self._upper)).all(dim=0))[:, 0]
+        lower, upper = self._bounds[..., None]
+        rows = torch.nonzero(((predicted >= lower) & (predicted < upper)).all(dim=0))[:, 0]
         z, u, v, _, level = predicted.index_select(1, rows)
         levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
         return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, levels)

@@ -12,6 +12,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from v3d_torch.kernels import se3 as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+
 # Generators of se(3): row k is the derivative of se3_exp by xi[k] at 0, a flattened 4x4 matrix.
 _GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
 _GENERATORS[(0, 1, 2), (0, 1, 2), 3] = 1.0
@@ -48,12 +51,30 @@ _SMALL_ANGLE = 1e-4
 _SMALL_ANGLE_SQUARED = _SMALL_ANGLE**2
 
 
+def _is_single(tensor: Tensor, *shape: int) -> bool:
+    """Check whether a tensor is a single element of the group or of its tangent space, which the kernels expect."""
+    return tensor.shape == shape and tensor.dtype == torch.float64
+
+
+def _invert_compiled(T: Tensor) -> Tensor:
+    return torch.from_numpy(kernels.invert(to_array(T))) if _is_single(T, 4, 4) else NotImplemented
+
+
+@compiled_by(_invert_compiled)
 def invert(T: Tensor) -> Tensor:
     """Invert rigid motions, shape :math:`(..., 4, 4)`: ``invert(T_wc)`` is ``T_cw``."""
     R = T[..., :3, :3].mT
     return _assemble(R, -(R @ T[..., :3, 3:]))
 
 
+def _orthonormalise_compiled(T: Tensor) -> Tensor:
+    if not _is_single(T, 4, 4):
+        return NotImplemented
+    converged, result = kernels.orthonormalise(to_array(T))
+    return torch.from_numpy(result) if converged else NotImplemented
+
+
+@compiled_by(_orthonormalise_compiled)
 def orthonormalise(T: Tensor) -> Tensor:
     """Replace rotations by the nearest orthonormal matrices.
 
@@ -76,6 +97,11 @@ def _assemble(R: Tensor, t: Tensor) -> Tensor:
     return torch.cat([torch.cat([R, t], dim=-1), last], dim=-2)
 
 
+def _se3_exp_compiled(xi: Tensor) -> Tensor:
+    return torch.from_numpy(kernels.exp(to_array(xi))) if _is_single(xi, 6) else NotImplemented
+
+
+@compiled_by(_se3_exp_compiled)
 def se3_exp(xi: Tensor) -> Tensor:
     r"""Exponential map of SE(3): the matrix exponential of :math:`\hat\xi`, in closed form.
 
@@ -98,6 +124,11 @@ def se3_exp(xi: Tensor) -> Tensor:
     return (torch.eye(4, dtype=xi.dtype) + X).addcmul(b, X2).addcmul(c, X2 @ X)
 
 
+def _se3_log_compiled(T: Tensor) -> Tensor:
+    return torch.from_numpy(kernels.log(to_array(T))) if _is_single(T, 4, 4) else NotImplemented
+
+
+@compiled_by(_se3_log_compiled)
 def se3_log(T: Tensor) -> Tensor:
     """Logarithm of SE(3), the inverse of `se3_exp`.
 

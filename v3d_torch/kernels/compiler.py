@@ -7,9 +7,11 @@ import hashlib
 import importlib.util
 import os
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator
 from functools import cache, wraps
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
@@ -36,7 +38,10 @@ class Twin(NamedTuple):
 TWINS: dict[str, Twin] = {}
 """All functions with two implementations, by qualified name."""
 
-_KERNELS: list[tuple[Any, str]] = []
+_TO_COMPILE: deque[tuple[Any, str]] = deque()
+"""Kernels that are neither loaded nor compiled yet, each with its signature."""
+
+_LOCK = Lock()
 
 
 def kernel(signature: str) -> Callable[[_F], _F]:
@@ -60,7 +65,7 @@ def kernel(signature: str) -> Callable[[_F], _F]:
             compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
         finally:
             settings["CACHE_DIR"] = before
-        _KERNELS.append((compiled, signature))
+        _TO_COMPILE.append((compiled, signature))
         return cast("_F", compiled)
 
     return decorate
@@ -82,10 +87,16 @@ def compile_kernels() -> Iterator[tuple[int, int]]:
         Number of kernels that had to be compiled, and that still have to be loaded or compiled, after each kernel.
     """
     compiled = 0
-    for position, (each, signature) in enumerate(_KERNELS, start=1):
-        each.compile(signature)
+    while True:
+        with _LOCK:
+            if not _TO_COMPILE:
+                return
+            each, signature = _TO_COMPILE[0]
+            each.compile(signature)
+            each.disable_compile()  # arguments of other types are converted, or are an error
+            _TO_COMPILE.popleft()
         compiled += sum(each.stats.cache_misses.values())
-        yield compiled, len(_KERNELS) - position
+        yield compiled, len(_TO_COMPILE)
 
 
 def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
@@ -105,6 +116,8 @@ def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Call
         @wraps(function)
         def either(*args: _P.args, **kwargs: _P.kwargs) -> _R:
             if ENABLED and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
+                if _TO_COMPILE:
+                    deque(compile_kernels(), maxlen=0)
                 result = TWINS[name].compiled(*args, **kwargs)
                 if result is not NotImplemented:
                     return result

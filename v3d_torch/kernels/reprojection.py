@@ -14,7 +14,7 @@ from v3d_torch.kernels.compiler import device
 
 Array = NDArray[np.float64]
 
-_SMALL_ANGLE = 1e-4
+SMALL_ANGLE = 1e-4
 
 
 @device
@@ -49,7 +49,7 @@ def se3_exp(xi: Array) -> Array:
     X[0, 3], X[1, 3], X[2, 3] = xi[0], xi[1], xi[2]
     X[2, 1], X[0, 2], X[1, 0] = xi[3], xi[4], xi[5]
     X[1, 2], X[2, 0], X[0, 1] = -xi[3], -xi[4], -xi[5]
-    angle = max(math.sqrt(xi[3] ** 2 + xi[4] ** 2 + xi[5] ** 2), _SMALL_ANGLE)
+    angle = max(math.sqrt(xi[3] ** 2 + xi[4] ** 2 + xi[5] ** 2), SMALL_ANGLE)
     b = 2 * (math.sin(angle / 2) / angle) ** 2
     c = (angle - math.sin(angle)) / angle**3
     X2 = multiply(X, X)

@@ -20,11 +20,11 @@ def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
     Returns:
         Number of shared landmarks of each keyframe, int64, shape :math:`(K,)`.
     """
-    # NumPy is faster than torch here.
-    observed, keyframe, valid = (tables.observations[name].numpy() for name in ("landmark", "keyframe", "valid"))
+    # NumPy is faster here, and indices are faster than a mask.
+    keyframe, landmark, valid = (tables.observations[name].numpy() for name in ("keyframe", "landmark", "valid"))
     wanted = np.zeros(len(tables.landmarks), dtype=np.bool_)
     wanted[landmarks.numpy()] = True
-    observers = keyframe[wanted.take(observed) & valid]
+    observers = keyframe[np.flatnonzero(wanted[landmark] & valid)]
     return torch.from_numpy(np.bincount(observers, minlength=len(tables.keyframes)))
 
 
@@ -39,10 +39,27 @@ def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Ten
     Returns:
         Indices of keyframes that observe at least one of the landmarks, int64, shape :math:`(<= count,)`.
     """
-    shared = count_shared_landmarks(tables, landmarks)
-    score = shared * len(shared) + torch.arange(len(shared))  # the newer keyframe first, if the counts are equal
-    order = torch.argsort(score, descending=True)[:count]
-    return order[shared[order] > 0]
+    shared = count_shared_landmarks(tables, landmarks).numpy()
+    score = shared * len(shared) + np.arange(len(shared))  # the newer keyframe first, if the counts are equal
+    order = np.argsort(-score)[:count]
+    return torch.from_numpy(order[shared[order] > 0])
+
+
+def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
+    """Find the landmarks that any of the given keyframes observes.
+
+    Args:
+        tables: Data of the map.
+        keyframes: Indices of keyframes, int64, shape :math:`(K,)`.
+
+    Returns:
+        IDs, ascending, int64, shape :math:`(L,)`.
+    """
+    keyframe, landmark = (tables.observations[name].numpy() for name in ("keyframe", "landmark"))
+    wanted, observed = np.zeros(len(tables.keyframes), np.bool_), np.zeros(len(tables.landmarks), np.bool_)
+    wanted[keyframes.numpy()] = True
+    observed[landmark[np.flatnonzero(wanted[keyframe])]] = True
+    return torch.from_numpy(np.flatnonzero(observed))
 
 
 def covisibility_edges(tables: MapTables, min_shared: int) -> Tensor:

@@ -127,11 +127,7 @@ class SparseMap(MapTables):
             landmarks: IDs of the landmarks that the previous frame observed, int64, shape :math:`(L,)`.
             count: Maximum number of keyframes.
         """
-        local = torch.zeros(len(self.keyframes), dtype=torch.bool)
-        local[self.covisible_keyframes(landmarks, count)] = True
-        observed = torch.zeros(len(self.landmarks), dtype=torch.bool)
-        observed[self.observations["landmark"][local[self.observations["keyframe"]]]] = True
-        return self.select_landmarks(torch.nonzero(observed)[:, 0])
+        return self.select_landmarks(covisibility.observed_landmarks(self, self.covisible_keyframes(landmarks, count)))
 
     def select_landmarks(self, landmarks: Tensor) -> LocalMap:
         """Return the active ones of the given landmarks as a local map.

@@ -17,6 +17,29 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
+from v3d_torch.kernels import time_compensation as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+
+
+def _compensate_compiled(
+    self: DepthDelayCompensation, features: Features, depth: Tensor, velocity: Tensor, delay: float
+) -> Features:
+    if not delay or not self._enabled:
+        return features
+    if depth.dtype != torch.float32 or velocity.dtype != torch.float64 or features.uv.requires_grad:
+        return NotImplemented
+    camera = self._camera
+    new_depth = kernels.compensate_depth_delay(
+        to_array(features.uv),
+        to_array(features.pixel),
+        to_array(features.inverse_depth),
+        to_array(depth[0]),
+        to_array(velocity),
+        delay,
+        self._max_depth,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+    )
+    return replace(features, depth=torch.from_numpy(new_depth))
 
 
 class DepthDelayCompensation:
@@ -32,6 +55,7 @@ class DepthDelayCompensation:
         self._max_depth = config.features.max_depth
         self._camera = camera
 
+    @compiled_by(_compensate_compiled)
     def __call__(self, features: Features, depth: Tensor, velocity: Tensor, delay: float) -> Features:
         r"""Sample the depth of features at the time of the depth image, and convert it to the time of the colour image.
 

@@ -19,6 +19,8 @@ from v3d_torch.config import RollingShutterConfig
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
+from v3d_torch.kernels import time_compensation as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,25 @@ GLOBAL_SHUTTER = Readout(0.0, math.inf)
 """Readout of a camera that reads all rows at once."""
 
 
+def _compensate_compiled(
+    self: RollingShutterCompensation, features: Features, velocity: Tensor, readout: Readout
+) -> Features:
+    if velocity.dtype != torch.float64 or features.uv.requires_grad:
+        return NotImplemented
+    camera = self._camera
+    uv, readout_jacobian = kernels.compensate_rolling_shutter(
+        to_array(features.uv),
+        to_array(features.pixel),
+        to_array(features.inverse_depth),
+        to_array(features.readout_jacobian),
+        to_array(velocity),
+        readout.seconds,
+        camera.height,
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+    )
+    return replace(features, uv=torch.from_numpy(uv), readout_jacobian=torch.from_numpy(readout_jacobian))
+
+
 class RollingShutterCompensation:
     """Moves features to where they would have been observed at the time of the middle row.
 
@@ -81,6 +102,7 @@ class RollingShutterCompensation:
     def __init__(self, camera: PinholeCamera) -> None:
         self._camera = camera
 
+    @compiled_by(_compensate_compiled)
     def __call__(self, features: Features, velocity: Tensor, readout: Readout) -> Features:
         """Compensate the rolling shutter of a moving camera.
 

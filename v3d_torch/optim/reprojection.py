@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.kernels import whitening as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 CHI2_THRESHOLD_2D = 5.991
 """95 % quantile of the chi-square distribution with 2 degrees of freedom: inlier threshold for (u, v)."""
@@ -75,6 +77,17 @@ class WhitenedMeasurements:
         return torch.addcmul(self.offset, self.scale, projected)
 
 
+def _whiten_compiled(measured: Measurements, camera: PinholeCamera) -> WhitenedMeasurements:
+    columns = measured.uv, measured.inverse_depth, measured.pixel_sigma
+    if any(column.dtype != torch.float64 or column.requires_grad for column in columns) or measured.uv.ndim != 2:
+        return NotImplemented
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    uv, inverse_depth, pixel_sigma = map(to_array, columns)
+    whitened = kernels.whiten(uv, inverse_depth, pixel_sigma, measured.inverse_depth_sigma, intrinsics)
+    return WhitenedMeasurements(*map(torch.from_numpy, whitened))
+
+
+@compiled_by(_whiten_compiled)
 def whiten(measured: Measurements, camera: PinholeCamera) -> WhitenedMeasurements:
     """Precompute the parts of the residuals that do not depend on the pose.
 

@@ -1,0 +1,80 @@
+"""Kernels of the compensation of readout times; see `v3d_torch.odometry.depth_delay` and `.rolling_shutter`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels.compiler import device, kernel
+
+Array = NDArray[np.float64]
+Intrinsics = tuple[float, float, float, float]
+
+
+@device
+def _motion_field(
+    u: float, v: float, inverse_depth: float, velocity: Array, intrinsics: Intrinsics
+) -> tuple[float, float, float]:
+    """Velocity of a pixel and rate of its inverse depth, by the formula of `v3d_torch.geometry.motion_field`."""
+    fx, fy, cx, cy = intrinsics
+    x, y, w = (u - cx) / fx, (v - cy) / fy, inverse_depth
+    vx, vy, vz, wx, wy, wz = velocity[0], velocity[1], velocity[2], velocity[3], velocity[4], velocity[5]
+    s = w * vz + wx * y - wy * x
+    return (w * vx + wy - wz * y - x * s) * fx, (w * vy + wz * x - wx - y * s) * fy, -s * w
+
+
+@kernel("(f8[:,::1], i8[:,::1], f8[::1], f4[:,::1], f8[::1], f8, f8, UniTuple(f8, 4))")
+def compensate_depth_delay(
+    uv: Array, pixel: NDArray[np.int64], inverse_depth: Array, depth_image: NDArray[np.float32], velocity: Array,
+    delay: float, max_depth: float, intrinsics: Intrinsics,
+) -> Array:  # fmt: skip
+    """Depth of features at the time of the colour image, metres, (N,); 0 = no measurement.
+
+    Args:
+        uv: Undistorted pixels of the features, (N, 2).
+        pixel: (column, row) in the recorded image, (N, 2).
+        inverse_depth: Inverse depth before the compensation, 1/m, (N,); 0 = no measurement.
+        depth_image: Depth image, metres, (H, W); 0 = no measurement.
+        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
+        delay: Depth stamp minus colour stamp, seconds.
+        max_depth: Depth beyond this counts as missing, metres.
+        intrinsics: ``fx, fy, cx, cy``.
+    """
+    height, width = depth_image.shape
+    depth = np.zeros(len(uv))
+    for i in range(len(uv)):
+        du, dv, rate = _motion_field(uv[i, 0], uv[i, 1], inverse_depth[i], velocity, intrinsics)
+        column, row = np.rint(pixel[i, 0] + delay * du), np.rint(pixel[i, 1] + delay * dv)
+        if 0 <= column < width and 0 <= row < height:
+            z = np.float64(depth_image[int(row), int(column)])
+            if 0 < z <= max_depth:
+                depth[i] = z / (1 - delay * rate * z)
+    return depth
+
+
+@kernel("(f8[:,::1], i8[:,::1], f8[::1], f8[:,::1], f8[::1], f8, i8, UniTuple(f8, 4))")
+def compensate_rolling_shutter(
+    uv: Array, pixel: NDArray[np.int64], inverse_depth: Array, readout_jacobian: Array, velocity: Array,
+    readout: float, rows: int, intrinsics: Intrinsics,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Pixels of features at the time of the middle row, and their derivatives by the readout, both (N, 2).
+
+    Args:
+        uv: Undistorted pixels, compensated with ``readout_jacobian``, (N, 2).
+        pixel: (column, row) in the recorded image, (N, 2).
+        inverse_depth: 1/m, (N,); 0 = no measurement.
+        readout_jacobian: Earlier derivative of ``uv`` by the readout, pixels per second, (N, 2).
+        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
+        readout: Time from the first to the last row, seconds.
+        rows: Number of rows of the image.
+        intrinsics: ``fx, fy, cx, cy``.
+    """
+    new_uv, new_jacobian = np.empty_like(uv), np.empty_like(uv)
+    for i in range(len(uv)):
+        u = uv[i, 0] - readout * readout_jacobian[i, 0]
+        v = uv[i, 1] - readout * readout_jacobian[i, 1]
+        du, dv, _ = _motion_field(u, v, inverse_depth[i], velocity, intrinsics)
+        time = pixel[i, 1] / (rows - 1) - 0.5  # of the row, from -0.5 to 0.5 readouts
+        new_jacobian[i, 0], new_jacobian[i, 1] = -time * du, -time * dv
+        new_uv[i, 0], new_uv[i, 1] = u + readout * new_jacobian[i, 0], v + readout * new_jacobian[i, 1]
+    return new_uv, new_jacobian
