@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence, Sized
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event
 from types import FrameType
@@ -117,15 +119,29 @@ def run_with_progress(
 
 
 def compile_kernels(console: Console) -> None:
-    """Load the compiled kernels, or compile them with a progress bar; that takes some seconds after an installation."""
+    """Load the compiled kernels, or compile them with a progress bar: half a minute after an installation."""
     bar = None
-    with progress_bars(console) as progress:
+    with progress_bars(console) as progress, ExitStack() as resources:
         for compiled, left in compiler.compile_kernels():
             if compiled and bar is None:
                 console.print("compiling kernels for this processor; this is done once")
-                bar = ProgressBar(progress, "kernels")
+                bar, total = ProgressBar(progress, "kernels"), 1 + left
+                helper = resources.enter_context(_start_compiling_backwards())  # waits for its end
+                resources.callback(helper.kill)
             if bar is not None:
-                bar(compiled, compiled + left)
+                bar(total - left, total)
+
+
+def _start_compiling_backwards() -> subprocess.Popen[bytes]:
+    """Start a second process that compiles the kernels from the last one on, and leaves them in the cache."""
+    command = "import v3d_torch.slam; from v3d_torch.kernels.compiler import compile_kernels as c; [*c(backwards=True)]"
+    return subprocess.Popen(  # noqa: S603 - runs this package
+        [sys.executable, "-c", command],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
 
 
 def progress_bars(console: Console) -> Progress:
