@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
@@ -14,24 +14,55 @@ from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
 
 @dataclass(frozen=True)
+class Segmentation:
+    """Result of `V3DSLAM.segment_instances`.
+
+    Attributes:
+        instances: Instances of the frame; None if the segmentation leaves this frame out.
+        segmenter_state: State of the segmenter after this frame; None if it has no state.
+        times: Time that each stage took.
+    """
+
+    instances: Instances | None
+    segmenter_state: dict[str, Any] | None
+    times: dict[str, StageTime]
+
+
+@dataclass(frozen=True)
+class Extraction:
+    """Result of `V3DSLAM.extract_features`.
+
+    Attributes:
+        depth: Re-estimated depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+        features: Features of the whole image.
+        times: Time that each stage took.
+    """
+
+    depth: Tensor
+    features: Features
+    times: dict[str, StageTime]
+
+
+@dataclass(frozen=True)
 class PreprocessedFrame:
     """Result of `V3DSLAM.preprocess`: everything that follows from the frame alone.
 
     Attributes:
         frame: Frame.
-        instances: Instances of the segmentation; None if it leaves this frame out.
-        depth: Re-estimated depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-        features: Features of the whole image.
-        times: Time that each stage took.
-        segmenter_state: State of the segmenter after this frame; None if it has no state.
+        segmentation: Instances of the frame.
+        extraction: Depth and features of the frame.
+        read_times: Time that reading the frame took, by stage; empty if it was not measured.
     """
 
     frame: RGBDFrame
-    instances: Instances | None
-    depth: Tensor
-    features: Features
-    times: dict[str, StageTime]
-    segmenter_state: dict[str, Any] | None
+    segmentation: Segmentation
+    extraction: Extraction
+    read_times: dict[str, StageTime] = field(default_factory=dict)
+
+    @property
+    def times(self) -> dict[str, StageTime]:
+        """Time that each stage took."""
+        return {**self.read_times, **self.segmentation.times, **self.extraction.times}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -201,7 +201,6 @@ class Pipeline:
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
         self._snapshot_step = 1
-        self._prefetcher: FramePrefetcher | None = None
 
     @property
     def frame_count(self) -> int:
@@ -223,8 +222,8 @@ class Pipeline:
         record.failure, record.interrupted = None, False
         previous_seconds, start = record.seconds, time.perf_counter()
         try:
-            with torch.inference_mode(), closing(self.start_prefetching()) as prefetcher:
-                start = time.perf_counter()
+            prefetcher = FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
+            with torch.inference_mode(), closing(prefetcher):
                 for preprocessed in prefetcher:
                     self.between_frames = False
                     frame, result = preprocessed.frame, self.slam.track(preprocessed)
@@ -248,17 +247,8 @@ class Pipeline:
             if isinstance(self.sequence, Sized):
                 done, total = len(self.slam.poses), len(self.sequence)
                 record.failure = f"interrupted after {done} of {total} frames"
-        record.seconds, self._prefetcher = previous_seconds + time.perf_counter() - start, None
+        record.seconds = previous_seconds + time.perf_counter() - start
         return record
-
-    def start_prefetching(self) -> FramePrefetcher:
-        """Start the prefetcher, unless it is running, and return it.
-
-        The start can take seconds. Calling the pipeline does it, too.
-        """
-        if self._prefetcher is None:
-            self._prefetcher = FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
-        return self._prefetcher
 
     @torch.inference_mode()
     def flush(self) -> None:

@@ -14,7 +14,7 @@ from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError
 from v3d_torch.features.orb import ORB
-from v3d_torch.frame_result import FrameResult, PreprocessedFrame
+from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.se3 import invert, orthonormalise
@@ -133,28 +133,55 @@ class V3DSLAM:
     def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
         """Run the stages that need the frame alone; the state of the tracking stages is neither read nor changed.
 
+        `segment_instances` and `extract_features` are independent of each other and can run in different threads.
+
         Args:
             frame: Next frame.
-            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
-                the camera; None if the pose is not known.
+            prediction: See `segment_instances`.
 
         Raises:
             InputError: If the frame is not valid or of another camera.
             ConfigError: If the segmenter returned something else than instances.
         """
+        self.check(frame)
+        return PreprocessedFrame(frame, self.segment_instances(frame, prediction), self.extract_features(frame))
+
+    def check(self, frame: RGBDFrame) -> None:
+        """Check a frame before it is preprocessed.
+
+        Raises:
+            InputError: If the frame is not valid or of another camera.
+        """
         check_frame(frame, self.camera)
+
+    def segment_instances(self, frame: RGBDFrame, prediction: PosePrediction | None) -> Segmentation:
+        """Find the instances of a frame (III-A); people are masked until they are classified.
+
+        Args:
+            frame: Frame; frames are segmented in their order, because a segmenter can have state.
+            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
+                the camera; None if the pose is not known.
+
+        Raises:
+            ConfigError: If the segmenter returned something else than instances.
+        """
         timer = StageTimer()
-        with timer("segmentation"):  # III-A: instances; people are masked until they are classified
+        with timer("segmentation"):
             instances = None
             if frame.index % self.config.segmentation.interval == 0:
                 T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
                 instances = segment_frame(self.segment, frame, T_cw)
                 check_instances(instances, frame)
-        with timer("depth"):  # III-B.1: depth re-estimation
+        return Segmentation(instances, segmenter_state_of(self.segment), timer.times)
+
+    def extract_features(self, frame: RGBDFrame) -> Extraction:
+        """Re-estimate the depth of a frame (III-B.1), and detect its ORB features (III-A)."""
+        timer = StageTimer()
+        with timer("depth"):
             depth = self.smooth_depth(frame.depth[None])[0]
-        with timer("features"):  # III-A: ORB
+        with timer("features"):
             features = self.detect_features(frame.image, depth)
-        return PreprocessedFrame(frame, instances, depth, features, timer.times, segmenter_state_of(self.segment))
+        return Extraction(depth, features, timer.times)
 
     def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         """Track the camera and the objects in the next frame, and extend the map.
@@ -162,14 +189,15 @@ class V3DSLAM:
         Raises:
             InputError: If the frame is not later than the previous one.
         """
-        frame, instances, depth = preprocessed.frame, preprocessed.instances, preprocessed.depth
+        frame, instances = preprocessed.frame, preprocessed.segmentation.instances
+        depth, all_features = preprocessed.extraction.depth, preprocessed.extraction.features
         check_order(frame, self.poses.stamp)
-        self._segmenter_state = preprocessed.segmenter_state
+        self._segmenter_state = preprocessed.segmentation.segmenter_state
         self.timer.add(preprocessed.times)
         with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
             velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
-            features = self.compensate(preprocessed.features, depth, frame.depth_delay, velocity, self.map.readout)
+            features = self.compensate(all_features, depth, frame.depth_delay, velocity, self.map.readout)
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
             view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
@@ -187,7 +215,7 @@ class V3DSLAM:
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
             landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
-            static = preprocessed.features[is_static]
+            static = all_features[is_static]
             static = self.compensate(static, depth, frame.depth_delay, motion.velocity, self.map.readout)
             T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
             pose = self.track_camera(static, depth, T_cw, landmarks, motion, self.poses)
@@ -228,10 +256,6 @@ class V3DSLAM:
         self.predictions.popleft()
         self.predictions.append(self._predict())
         return self.predictions[-1]
-
-    def preprocessing_stages(self) -> dict[str, Any]:
-        """Return the stages that `preprocess` uses, by attribute name."""
-        return {"segment": self.segment, "smooth_depth": self.smooth_depth, "detect_features": self.detect_features}
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that changes from frame to frame, between two frames.

@@ -210,9 +210,9 @@ def test_pose_graph_closes_drifting_ring() -> None:
 
 
 def test_our_contenders_have_overrides() -> None:
-    from contenders.ours import OVERRIDES
+    from contenders.ours import OPTIONS
 
-    assert tuple(OVERRIDES) == OURS
+    assert tuple(OPTIONS) == OURS
 
 
 class TestPage:

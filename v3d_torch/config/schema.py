@@ -382,8 +382,8 @@ class Config(Section):
     threads: int = Field(1, gt=0, le=256)
     """Threads of torch and OpenCV: the tensors of a frame are small, and more threads mostly wait for each other."""
     prefetch: bool = True
-    """True to preprocess the next frames in another thread or process while one is tracked, and to run the back end in
-    a thread. The results are the same."""
+    """True to preprocess the next frames in threads while one is tracked, and to run the back end in a thread. The
+    results are the same."""
     check_numerics: bool = False
     """True to check everything that a stage returns for NaN and infinity; the first stage that returns one is named.
     The results are the same. In Python: `v3d_torch.runs.numerics_check.CheckedSLAM`."""

@@ -68,7 +68,7 @@ class StoredSequence(ABC):
 
     def frames_from(self, index: int) -> Iterator[RGBDFrame]:
         """Iterate over the frames from ``index`` on. Each frame is decoded when it is requested."""
-        return FrameIterator(self, index)
+        return map(self.__getitem__, range(index, len(self)))
 
     def __getitem__(self, index: int) -> RGBDFrame:
         """Decode frame ``index``, counted from 0.
@@ -133,34 +133,6 @@ class StoredSequence(ABC):
                 " pass the camera of these images with --camera"
             )
         return image
-
-
-class FrameIterator(Iterator[RGBDFrame]):
-    """Iterator over the frames of a stored sequence.
-
-    Args:
-        sequence: Sequence to iterate over.
-        first: Index of the first frame.
-
-    Attributes:
-        index: Index of the next frame. It can be increased to skip frames that were read by other means.
-    """
-
-    def __init__(self, sequence: StoredSequence, first: int) -> None:
-        self.sequence = sequence
-        self.index = first
-
-    @property
-    def remaining(self) -> int:
-        """Number of frames left."""
-        return max(len(self.sequence) - self.index, 0)
-
-    def __next__(self) -> RGBDFrame:
-        if not self.remaining:
-            raise StopIteration
-        frame = self.sequence[self.index]
-        self.index += 1
-        return frame
 
 
 class Cursor(Generic[_T]):

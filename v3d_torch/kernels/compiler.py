@@ -59,10 +59,11 @@ def kernel(signature: str) -> Callable[[_F], _F]:
             return function
         import numba
 
+        njit: Any = numba.njit  # its type lacks some options
         settings = vars(numba.config)
         before, settings["CACHE_DIR"] = settings["CACHE_DIR"], str(_code_folder())
         try:
-            compiled = numba.njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+            compiled = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
         finally:
             settings["CACHE_DIR"] = before
         _TO_COMPILE.append((compiled, signature))
@@ -77,9 +78,9 @@ def device(function: _F) -> _F:
         return function
     import numba
 
-    return cast(
-        "_F", numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
-    )
+    njit: Any = numba.njit  # its type lacks some options
+    options = {"nogil": True, "error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return cast("_F", njit(**options)(function))
 
 
 def compile_kernels(*, backwards: bool = False) -> Iterator[tuple[int, int]]:

@@ -2,61 +2,54 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
-from dataclasses import replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import partial
+from typing import ParamSpec, TypeVar
 
 import torch
 
-from v3d_torch.datasets.stored import FrameIterator
-from v3d_torch.frame_result import PreprocessedFrame
-from v3d_torch.prefetch.preprocess_worker import PreprocessWorker
-from v3d_torch.runtime.stage_timer import StageTimer
+from v3d_torch.frame_result import Extraction, PreprocessedFrame, Segmentation
+from v3d_torch.runtime.stage_timer import StageTime, StageTimer
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_MIN_FRAMES_FOR_WORKER = 150
-"""A second process takes seconds to start, so shorter sequences use a thread."""
-
 PendingFrame = Callable[[], PreprocessedFrame | None]
 """Waits for a preprocessed frame; returns None after the last one."""
+
+ReadFrame = tuple[RGBDFrame, dict[str, StageTime]] | None
+"""A frame and the time that reading it took; None after the last frame."""
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 class FramePrefetcher:
     """Iterator over preprocessed frames for `V3DSLAM.track`.
 
     Each frame is preprocessed with the pose prediction made some frames before. Therefore the results do not depend on
-    whether it is preprocessed in turn, ahead in a thread, or ahead in a second process.
+    whether it is preprocessed in turn or ahead.
+
+    One thread reads the frames and extracts their features, another one segments them. Both work in the order of the
+    frames, and spend most of their time in compiled code that lets other threads run.
 
     Args:
         frames: Frames to read.
         slam: System that preprocesses the frames, and tracks each before it requests the next.
-        ahead: True to read and preprocess the next frames while one is tracked: in a second process if the frames
-            come from a stored sequence that is long enough, else in a thread. The process is ready when the
-            constructor returns.
+        ahead: True to read and preprocess the next frames while one is tracked.
     """
 
     def __init__(self, frames: Iterator[RGBDFrame], slam: V3DSLAM, *, ahead: bool) -> None:
         self._frames = frames
         self._slam = slam
+        self._ahead = ahead
         self._resources = ExitStack()
-        self._worker: PreprocessWorker | None = None
-        if (
-            ahead
-            and isinstance(frames, FrameIterator)
-            and frames.remaining >= _MIN_FRAMES_FOR_WORKER
-            and _available_cores() > 1
-        ):
-            worker = self._resources.enter_context(closing(PreprocessWorker(slam, frames.sequence)))
-            self._worker = worker if worker.is_alive else None
-        self._thread = ThreadPoolExecutor(1, "preprocessing") if ahead and self._worker is None else None
-        if self._thread is not None:
-            self._resources.callback(self._thread.shutdown, cancel_futures=True)
+        self._reader, self._segmenter = (ThreadPoolExecutor(1, name) for name in ("features", "segmentation"))
+        for executor in (self._reader, self._segmenter):
+            self._resources.callback(executor.shutdown, cancel_futures=True)
 
     def __iter__(self) -> Iterator[PreprocessedFrame]:
         """Yield the next preprocessed frames.
@@ -65,45 +58,67 @@ class FramePrefetcher:
             V3DError: If a frame cannot be read; all frames before it have been yielded.
         """
         slam = self._slam
-        pending = deque(map(self._submit, slam.predictions, range(len(slam.predictions))))
+        pending = deque(map(self._submit, slam.predictions))
         while (preprocessed := pending.popleft()()) is not None:
-            pending.append(self._submit(slam.advance_predictions(), len(pending)))
+            pending.append(self._submit(slam.advance_predictions()))
             yield preprocessed
 
     def close(self) -> None:
-        """Stop the thread or the process."""
+        """Stop the threads."""
         self._resources.close()
 
-    def _submit(self, prediction: PosePrediction | None, pending: int) -> PendingFrame:
-        """Start to preprocess the frame that follows the pending ones."""
-        preprocess = partial(self._preprocess, torch.is_inference_mode_enabled(), prediction)
-        if self._worker is not None and isinstance(self._frames, FrameIterator) and pending < self._frames.remaining:
-            self._worker.submit(self._frames.index + pending, prediction)
-            return partial(self._receive, self._worker, self._frames, preprocess)
-        return preprocess if self._thread is None else self._thread.submit(preprocess).result
+    def _submit(self, prediction: PosePrediction | None) -> PendingFrame:
+        """Start to read and preprocess the next frame."""
+        if not self._ahead:
+            return partial(self._preprocess, prediction)
+        frame = self._start(self._reader, self._read)
+        segmentation = self._start(self._segmenter, self._segment, frame, prediction)
+        return partial(_combine, frame, segmentation, self._start(self._reader, self._extract, frame))
 
-    def _preprocess(self, inference: bool, prediction: PosePrediction | None) -> PreprocessedFrame | None:
-        """Read and preprocess the next frame in this process, without gradients if ``inference``."""
+    def _start(
+        self, executor: ThreadPoolExecutor, step: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs
+    ) -> Future[_R]:
+        """Start a step in a thread, with the inference mode of this thread."""
+        inference = torch.is_inference_mode_enabled()
+
+        def run() -> _R:
+            with torch.inference_mode(inference):
+                return step(*args, **kwargs)
+
+        return executor.submit(run)
+
+    def _preprocess(self, prediction: PosePrediction | None) -> PreprocessedFrame | None:
+        """Read and preprocess the next frame in this thread."""
+        read = self._read()
+        if read is None:
+            return None
+        frame, times = read
+        segmentation = self._slam.segment_instances(frame, prediction)
+        return PreprocessedFrame(frame, segmentation, self._slam.extract_features(frame), times)
+
+    def _read(self) -> ReadFrame:
         timer = StageTimer()
         with timer("read"):
             frame = next(self._frames, None)
         if frame is None:
             return None
-        with torch.inference_mode(inference):
-            preprocessed = self._slam.preprocess(frame, prediction)
-        return replace(preprocessed, times={**timer.times, **preprocessed.times})
+        self._slam.check(frame)
+        return frame, timer.times
 
-    def _receive(
-        self, worker: PreprocessWorker, frames: FrameIterator, preprocess_here: PendingFrame
-    ) -> PreprocessedFrame | None:
-        """Return the result of the second process; if it has failed, preprocess the frame in this process."""
-        preprocessed = worker.result()
-        if preprocessed is None:
-            return preprocess_here()
-        frames.index += 1
-        return preprocessed
+    def _segment(self, read: Future[ReadFrame], prediction: PosePrediction | None) -> Segmentation | None:
+        frame = read.result()
+        return None if frame is None else self._slam.segment_instances(frame[0], prediction)
+
+    def _extract(self, read: Future[ReadFrame]) -> Extraction | None:
+        frame = read.result()
+        return None if frame is None else self._slam.extract_features(frame[0])
 
 
-def _available_cores() -> int:
-    """Return the number of processors that this process can use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _combine(
+    read: Future[ReadFrame], segmentation: Future[Segmentation | None], extraction: Future[Extraction | None]
+) -> PreprocessedFrame | None:
+    """Wait for the parts of a frame; None after the last frame."""
+    frame, segmented, extracted = read.result(), segmentation.result(), extraction.result()
+    if frame is None or segmented is None or extracted is None:
+        return None
+    return PreprocessedFrame(frame[0], segmented, extracted, frame[1])

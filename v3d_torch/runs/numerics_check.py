@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.errors import NumericsError
-from v3d_torch.frame_result import FrameResult, PreprocessedFrame
+from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
@@ -128,15 +128,33 @@ class CheckedSLAM(V3DSLAM):
         is_stage = not name.startswith("_") and name not in _NOT_STAGES
         super().__setattr__(name, CheckedStage(value, name) if is_stage else value)
 
-    def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
-        """Run `V3DSLAM.preprocess`.
+    def check(self, frame: RGBDFrame) -> None:
+        """Run `V3DSLAM.check`.
 
         Raises:
-            NumericsError: If the frame, or the result of a stage, is not finite.
+            NumericsError: If the frame is not finite.
         """
         with _frame_in_message(frame):
             check_finite("the input", frame)
-            return super().preprocess(frame, prediction)
+        super().check(frame)
+
+    def segment_instances(self, frame: RGBDFrame, prediction: PosePrediction | None) -> Segmentation:
+        """Run `V3DSLAM.segment_instances`.
+
+        Raises:
+            NumericsError: If the result of the segmenter is not finite.
+        """
+        with _frame_in_message(frame):
+            return super().segment_instances(frame, prediction)
+
+    def extract_features(self, frame: RGBDFrame) -> Extraction:
+        """Run `V3DSLAM.extract_features`.
+
+        Raises:
+            NumericsError: If the result of a stage is not finite.
+        """
+        with _frame_in_message(frame):
+            return super().extract_features(frame)
 
     def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         """Run `V3DSLAM.track`.
