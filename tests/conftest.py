@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
+from v3d_torch.io.download import cache_dir
+
+# Commands that tests start with caches of their own share the compiled kernels; read when kernels are imported.
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "kernels"))
+
+import v3d_torch.slam  # noqa: F401 - registers the kernels
 from v3d_torch.datasets.demo.sequence import write_sequence
+from v3d_torch.kernels.compiler import compile_kernels
 
 torch.set_num_threads(1)
 
 SLOWEST = ("test_real_sequences.py", "cli/test_run.py", "test_corpus.py", "cli/test_ablate.py")
 """Files that run first, so that several workers (``-n 2``) finish at about the same time."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile all kernels before the tests, whose time is limited; with ``-n``, once and not in each worker."""
+    if not hasattr(config, "workerinput"):
+        deque(compile_kernels(), maxlen=0)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

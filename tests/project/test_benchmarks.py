@@ -188,7 +188,7 @@ class TestTables:
         }
         assert rows["v3d_torch"] == ["15.0 [10.0-20.0]", "0.50", "135.0 [90.0-180.0]", "3.00", "0%", "0 of 2"]
         assert rows["open3d"] == ["-", "-", "-", "-", "-", "2 of 2"]
-        assert list(speed.stage_table(turns))[2] == "| read | 7.5 [5.0-10.0] | - | - |"
+        assert list(speed.stage_table(turns))[2] == "| read | 7.5 [5.0-10.0] | - | - | - |"
         assert "- turn 2, open3d: broke" in list(speed.failures(turns))
 
     def test_accuracy_table_has_ours_then_peers_then_published(self, tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_pose_graph_closes_drifting_ring() -> None:
     assert int(cells["iterations"]) > 0 and float(cells["error_after"]) < float(cells["error_before"])
 
 
-def test_our_contenders_have_overrides() -> None:
+def test_our_contenders_have_options() -> None:
     from contenders.ours import OPTIONS
 
     assert tuple(OPTIONS) == OURS

@@ -155,11 +155,12 @@ def _code_folder() -> Path:
     """
     files = sorted(Path(__file__).parent.glob("*.py"))
     version = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
     # Without a cache folder, as in a container with a read-only home, the system's temporary folder has to do.
-    for parent in (cache_dir(), Path(tempfile.gettempdir()) / f"v3d_torch-{getpass.getuser()}"):
-        folder = parent / "kernels" / version
-        if _make_private(folder):
-            return folder
+    temporary = Path(tempfile.gettempdir()) / f"v3d_torch-{getpass.getuser()}"
+    for parent in (Path(chosen) if chosen else cache_dir() / "kernels", temporary / "kernels"):
+        if _make_private(parent / version):
+            return parent / version
     return Path(tempfile.mkdtemp(prefix="v3d_torch-"))
 
 
