@@ -1,0 +1,125 @@
+"""Choice between kernels and torch functions, folder of the compiled code, progress of the compilation."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from io import StringIO
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from v3d_torch.kernels import compiler
+from v3d_torch.kernels.compiler import TWINS, Twin, compiled_by
+from v3d_torch.runs import console
+
+needs_numba = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
+
+
+def python(code: str, **variables: str) -> str:
+    """Run code in a new process, in an environment without the folder of the tests' kernels."""
+    kept = {name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "V3D_KERNELS")}
+    done = subprocess.run([sys.executable, "-c", code], env=kept | variables, capture_output=True, text=True)  # noqa: S603
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def double() -> Iterator[list[str]]:
+    """Names of the implementations of `doubled` that were called."""
+    yield []
+    TWINS.pop(f"{__name__}.make_doubled.<locals>.doubled", None)
+
+
+def make_doubled(calls: list[str], supported: torch.dtype = torch.float64):  # type: ignore[no-untyped-def]
+    def compiled(x: Tensor) -> Tensor:
+        if x.dtype != supported:
+            return NotImplemented
+        calls.append("kernel")
+        return 2 * x
+
+    @compiled_by(compiled)
+    def doubled(x: Tensor) -> Tensor:
+        """Twice a number."""
+        calls.append("torch")
+        return 2 * x
+
+    return doubled
+
+
+@needs_numba
+def test_kernel_runs_for_plain_tensors_only(double: list[str]) -> None:
+    doubled = make_doubled(double)
+    doubled(torch.ones(1, dtype=torch.float64))
+    doubled(torch.ones(1))  # another dtype
+    doubled(torch.ones(1, dtype=torch.float64, requires_grad=True))
+    doubled(torch.ones(1, dtype=torch.float64, device="meta"))
+    assert double == ["kernel", "torch", "torch", "torch"]
+    assert doubled.__doc__ == "Twice a number."
+
+
+def test_both_implementations_are_registered() -> None:
+    assert all(isinstance(twin, Twin) and twin.torch is not twin.compiled for twin in TWINS.values())
+    assert "v3d_torch.optim.pose_refinement.refine_pose" in TWINS
+
+
+def test_variable_turns_kernels_off() -> None:
+    code = (
+        "import sys, v3d_torch.optim.pose_refinement, v3d_torch.kernels.compiler as c\n"
+        "print(c.ENABLED, 'numba' in sys.modules)"
+    )
+    assert python(code, V3D_KERNELS="torch") == "False False"
+
+
+@needs_numba
+@pytest.mark.parametrize(
+    ("variables", "parent"),
+    [
+        ({"NUMBA_CACHE_DIR": "{}/numba"}, "{}/numba"),
+        ({"V3D_CACHE": "{}/cache"}, "{}/cache/kernels"),
+        # A file is in the place of the folder.
+        ({"V3D_CACHE": "{}/file/cache", "TMPDIR": "{}/tmp"}, "{}/tmp"),
+    ],
+)
+def test_code_is_kept_in_a_private_folder(tmp_path: Path, variables: dict[str, str], parent: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "tmp").mkdir()
+    given = {name: value.format(tmp_path) for name, value in variables.items()}
+    folder = Path(python("from v3d_torch.kernels.compiler import _code_folder; print(_code_folder())", **given))
+    assert folder.is_relative_to(parent.format(tmp_path)) and folder.is_dir()
+    assert folder.stat().st_mode & 0o022 == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")
+def test_folder_that_others_can_write_is_not_used(tmp_path: Path) -> None:
+    open_to_all = tmp_path / "kernels"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o777)
+    assert not compiler._make_private(open_to_all)
+    assert compiler._make_private(tmp_path / "other" / "kernels")
+
+
+def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Helper:
+        killed = False
+
+        def __enter__(self) -> Helper:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            assert self.killed
+
+        def kill(self) -> None:
+            self.killed = True
+
+    monkeypatch.setattr(console, "_start_compiling_backwards", Helper)
+    for steps, expected in (([(0, 2), (0, 1), (0, 0)], 0), ([(0, 2), (1, 1), (2, 0)], 1)):
+        monkeypatch.setattr(compiler, "compile_kernels", lambda steps=steps: iter(steps))
+        text = StringIO()
+        console.compile_kernels(Console(file=text))
+        assert text.getvalue().count("compiling kernels for this processor") == expected

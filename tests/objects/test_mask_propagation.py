@@ -1,0 +1,89 @@
+"""Masks of frames without segmentation follow boards that move in front of a wall."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.boards import CAMERA, CHAIR, CLOUDS, HERE, PERSON, Board, BoardTracker, render
+from torch import Tensor
+
+from v3d_torch import V3DSLAM, RGBDFrame, load_config, load_sequence
+from v3d_torch.config import Config
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.mask_propagation import propagate_instances
+from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.segmentation.coco import UNLABELLED
+from v3d_torch.types import Instances
+
+SPEED = 1.2
+"""Speed of the walking board, m/s."""
+
+
+def walk(rate: float = 30.0, label: int = PERSON, frames: int = 6) -> BoardTracker:
+    """Track a walking board and a standing one."""
+    track_boards = BoardTracker(rate)
+    for i in range(frames):
+        track_boards(Board(-0.6 + SPEED * i / rate, label=label), Board(0.8, z=2.5, label=CHAIR))
+    return track_boards
+
+
+def propagate(track_boards: BoardTracker, boards: list[Board], T_wc: Tensor = HERE) -> tuple[Instances, Instances]:
+    """Return the propagated and the true instances of the next frame."""
+    depth, truth = render(boards, T_wc)
+    view = DepthView((track_boards.frame + 1) / track_boards.rate, depth, invert(T_wc))
+    return propagate_instances(track_boards.tracker.tracks, view, CAMERA, CLOUDS.voxel_size), truth
+
+
+def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
+    return (a & b).flatten(1).sum(dim=1) / (a | b).flatten(1).sum(dim=1)
+
+
+@pytest.mark.parametrize("rate", [10.0, 30.0])
+def test_masks_follow_a_moving_and_a_standing_object(rate: float) -> None:
+    track_boards = walk(rate)
+    found, truth = propagate(track_boards, [Board(-0.6 + SPEED * 6 / rate), Board(0.8, z=2.5, label=CHAIR)])
+    assert found.labels.tolist() == [PERSON, CHAIR]
+    assert found.scores.tolist() == [0.0, 0.0] and found.boxes.shape == (2, 4)
+    assert float(intersection_over_union(found.masks, truth.masks).min()) > 0.85
+
+
+def test_masks_follow_the_motion_of_the_camera() -> None:
+    T_wc = HERE.clone()
+    T_wc[0, 3] = 0.2
+    found, truth = propagate(walk(), [Board(-0.6 + SPEED * 6 / 30), Board(0.8, z=2.5, label=CHAIR)], T_wc)
+    assert float(intersection_over_union(found.masks, truth.masks).min()) > 0.85
+
+
+def test_object_that_has_left_has_an_empty_mask() -> None:
+    found, _ = propagate(walk(), [Board(0.8, z=2.5, label=CHAIR)])
+    assert found.masks.flatten(1).any(dim=1).tolist() == [False, True]
+
+
+def test_missed_and_unlabelled_objects_are_not_propagated() -> None:
+    track_boards = walk()
+    track_boards(Board(-0.36, detected=False), Board(0.8, z=2.5, label=CHAIR))
+    found, _ = propagate(track_boards, [Board(-0.32), Board(0.8, z=2.5, label=CHAIR)])
+    assert found.labels.tolist() == [CHAIR]
+    found, _ = propagate(walk(label=UNLABELLED), [Board(-0.36), Board(0.8, z=2.5, label=CHAIR)])
+    assert found.labels.tolist() == [CHAIR]
+
+
+def test_no_tracks_give_no_instances() -> None:
+    found, _ = propagate(BoardTracker(), [Board(0.0)])
+    assert len(found) == 0 and found.masks.shape == (0, CAMERA.height, CAMERA.width)
+
+
+def test_realtime_segments_every_second_frame() -> None:
+    assert load_config("realtime").segmentation.interval == 2 and Config().segmentation.interval == 1
+    sequence, segmented = load_sequence("demo"), []
+
+    def segment(frame: RGBDFrame) -> Instances:
+        segmented.append(frame.index)
+        return NoSegmentation()(frame)
+
+    slam = V3DSLAM(sequence.camera, segment, load_config("realtime"))
+    with torch.inference_mode():
+        for index in range(5):
+            slam(sequence[index])
+    assert segmented == [0, 2, 4]
