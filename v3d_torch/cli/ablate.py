@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import DataRoot, make_app
 from v3d_torch.io.paths import expand_user_paths
 
@@ -36,7 +37,6 @@ def main(
     Each variant runs with each seed on each sequence, one run after the other.
     """
     from v3d_torch.batch.ablation_study import run_ablation_study
-    from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         names = [name.strip() for name in variants.split(",")]

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
 
@@ -53,7 +54,6 @@ def main(
     Each run has its own process. Tables compare the scores of all runs.
     """
     from v3d_torch.batch.runner import run_batch
-    from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         run_batch(

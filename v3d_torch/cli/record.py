@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
 from v3d_torch.io.paths import expand_user_paths
 
@@ -39,7 +40,7 @@ def main(
     from v3d_torch.datasets.stored import StoredSequence
     from v3d_torch.datasets.tum_writer import TUMWriter
     from v3d_torch.errors import InputError
-    from v3d_torch.runs.console import exit_on_error, interrupts_between_frames
+    from v3d_torch.runs.console import interrupts_between_frames
 
     console = Console(soft_wrap=True)
     with exit_on_error():

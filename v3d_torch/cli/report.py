@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
 
@@ -27,7 +28,6 @@ def main(
     The report is report.html in the folder of the results: one self-contained file for any browser.
     """
     from v3d_torch.io.files import write_text
-    from v3d_torch.runs.console import exit_on_error
     from v3d_torch.runs.report_page import render_page
     from v3d_torch.runs.stored_run import read_run
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
 
@@ -39,7 +40,6 @@ def main(
     Runs the paper's eight sequences of the TUM RGB-D benchmark and downloads those that are missing.
     """
     from v3d_torch.batch.reproduction import TABLE_CONFIGS, run_reproduction
-    from v3d_torch.runs.console import exit_on_error
 
     with exit_on_error():
         run_reproduction(

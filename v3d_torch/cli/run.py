@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
+from v3d_torch.datasets.locate import check_name
 from v3d_torch.io.paths import expand_user_paths
 
 app = make_app()
@@ -55,7 +57,7 @@ def main(
         Path | None, typer.Option(metavar="FILE", help="Localise the camera in this map and extend it.")
     ] = None,
     serial: Annotated[
-        bool, typer.Option("--serial", help="Use one thread and one process; the results are the same.")
+        bool, typer.Option("--serial", help="Use one thread; the results are the same.")
     ] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: do not change the map.")] = False,
     resume: Annotated[
@@ -63,8 +65,11 @@ def main(
     ] = None,
 ) -> None:
     """Track an RGB-D camera, and map the static part of the scene."""
+    if seq is not None:
+        with exit_on_error():
+            check_name(seq, data_root)
+
     from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
-    from v3d_torch.runs.console import exit_on_error
     from v3d_torch.runs.request import RunRequest
 
     if seq is None and resume is None:

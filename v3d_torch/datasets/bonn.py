@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.tum import TUMSequence, is_tum
+from v3d_torch.datasets.locate import is_tum
+from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.types import Trajectory

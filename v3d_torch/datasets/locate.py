@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from v3d_torch.datasets.sequence_names import canonical_name, download_url, short_name, unknown_name_error
-from v3d_torch.datasets.tum import is_tum
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.io.download import Progress, cache_dir, fetch
 from v3d_torch.io.extract import extract_tar
@@ -53,6 +53,27 @@ def find_or_download(name: str, *, data_root: Path | None, download: bool, progr
             f"{short_name(full_name)}: is not in {folder} and its download failed ({error}); download it manually,"
             f" {install}"
         ) from error
+
+
+def is_tum(path: Path) -> bool:
+    """Check whether a folder has any list of the TUM layout. Opening the sequence reports missing ones."""
+    return any((path / name).is_file() for name in ("associations.txt", "rgb.txt", "depth.txt"))
+
+
+def check_name(name: str, data_root: Path | None) -> None:
+    """Reject a name that is no source at all, before libraries are imported to open it.
+
+    Args:
+        name: Name as in `open_source`.
+        data_root: Folder with the user's sequences; None for ``$V3D_DATA``.
+
+    Raises:
+        InputError: If there is no such path and no such sequence.
+    """
+    with suppress(OSError):  # such as a name that is too long; `open_source` says what is wrong
+        is_special = name in ("", "demo") or name.partition(":")[0] == "realsense"
+        if not is_special and canonical_name(name) is None and find_stored(name, data_root) is None:
+            raise unknown_name_error(name)
 
 
 def find_stored(name: str, data_root: Path | None) -> Path | None:

@@ -11,12 +11,13 @@ from v3d_torch.datasets.bonn import BonnSequence, is_bonn
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.icl_nuim import ICLNUIMSequence, is_icl_nuim
 from v3d_torch.datasets.image_folder import ImageFolder, is_image_folder
+from v3d_torch.datasets.locate import is_tum
 from v3d_torch.datasets.openloris import OpenLORISSequence, is_openloris
 from v3d_torch.datasets.realsense import is_realsense_recording, open_realsense_recording
 from v3d_torch.datasets.ros import BagSequence, is_bag
 from v3d_torch.datasets.scannet import ScanNetSequence, is_scannet
 from v3d_torch.datasets.seven_scenes import SevenScenesSequence, is_seven_scenes
-from v3d_torch.datasets.tum import TUMSequence, is_tum
+from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.datasets.video import VideoSequence, is_video
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress

@@ -70,11 +70,6 @@ class TUMSequence(PairedImages):
         return self._check_size(path, torch.from_numpy(ids).permute(2, 0, 1))[0]
 
 
-def is_tum(path: Path) -> bool:
-    """Check whether a folder has any list of the TUM layout. Opening the sequence reports missing ones."""
-    return any((path / name).is_file() for name in ("associations.txt", "rgb.txt", "depth.txt"))
-
-
 def _read_pairs(folder: Path) -> list[ImagePair]:
     if (folder / "associations.txt").is_file():
         return read_associations(folder / "associations.txt")

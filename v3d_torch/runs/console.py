@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
+from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.kernels import compiler
@@ -29,30 +28,6 @@ from v3d_torch.runs.log import log_to
 from v3d_torch.runs.result_folder import clear_earlier_results
 from v3d_torch.runs.run import Run, describe_motion
 from v3d_torch.types import RGBDFrame
-
-
-@contextmanager
-def exit_on_error() -> Iterator[None]:
-    """Print an error that the user can act on as one line on stderr, and exit with code 2."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", GroundTruthWarning)  # the commands report it after the results
-            yield
-    except V3DError as error:
-        print(f"error: {_printable(error)}", file=sys.stderr)
-        sys.exit(2)
-    except OSError as error:  # of a path given by the user: too long a name, a folder without permission
-        path, reason = error.filename or "a file", error.strerror or error
-        print(f"error: {_printable(path)}: cannot be used ({reason}); check path and permissions", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("error: interrupted before the results were written", file=sys.stderr)
-        sys.exit(2)
-
-
-def _printable(value: object) -> str:
-    """Return a text in one line; file names and contents in it can hold control characters."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))
 
 
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
