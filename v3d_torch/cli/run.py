@@ -9,7 +9,6 @@ import typer
 
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
-from v3d_torch.datasets.locate import check_name
 from v3d_torch.io.paths import expand_user_paths
 
 app = make_app()
@@ -65,9 +64,11 @@ def main(
     ] = None,
 ) -> None:
     """Track an RGB-D camera, and map the static part of the scene."""
+    from v3d_torch.datasets.locate import check_name
+
     if seq is not None:
         with exit_on_error():
-            check_name(seq, data_root)
+            check_name(seq, data_root)  # before the imports below, which take seconds
 
     from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
     from v3d_torch.runs.request import RunRequest
