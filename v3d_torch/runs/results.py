@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import platform
 import re
@@ -161,8 +162,10 @@ def _object_table(dynamics: TensorTable) -> pa.Table:
 
 
 def _write_table(path: Path, table: pa.Table) -> None:
+    content = io.BytesIO()  # errors of files are then those of Python, not of pyarrow
+    pq.write_table(table, content)
     with atomic_write(path) as temporary:
-        pq.write_table(table, temporary)
+        temporary.write_bytes(content.getvalue())
 
 
 def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> dict[str, object]:
