@@ -111,9 +111,7 @@ def test_source_archive_contains_tests_and_documents(built: tuple[Path, Path, Pa
 
 
 def test_every_command_module_is_a_subcommand() -> None:
-    modules = {
-        path.stem for path in (PACKAGE / "cli").glob("*.py") if re.search(r"^app = ", path.read_text(), re.M)
-    }
+    modules = {path.stem for path in (PACKAGE / "cli").glob("*.py") if re.search(r"^app = ", path.read_text(), re.M)}
     assert {module.__name__.rpartition(".")[2] for module in COMMANDS} == modules
 
 

@@ -55,9 +55,7 @@ def main(
     load_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Localise the camera in this map and extend it.")
     ] = None,
-    serial: Annotated[
-        bool, typer.Option("--serial", help="Use one thread; the results are the same.")
-    ] = False,
+    serial: Annotated[bool, typer.Option("--serial", help="Use one thread; the results are the same.")] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: do not change the map.")] = False,
     resume: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run that wrote its results there.")

@@ -14,6 +14,7 @@ from v3d_torch.features.matching import match_by_projection
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import landmark_projection as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.optim.reprojection import MIN_DEPTH
 
 
 @dataclass(frozen=True)
@@ -79,9 +80,6 @@ class ProjectionMatcher:
     """Landmarks up to this many levels beyond either end of the pyramid are matched, too: the expected level is
     rounded, and descriptors tolerate a difference of one level."""
 
-    _MIN_DEPTH = 0.05
-    """Smallest depth of a landmark, metres: below the range of any RGB-D camera."""
-
     def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._scale = pyramid.scale
@@ -89,7 +87,7 @@ class ProjectionMatcher:
         self._camera = camera
         # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower ones are inclusive.
         margin = self._LEVEL_MARGIN
-        lower = [self._MIN_DEPTH, 0.0, 0.0, self._MIN_COSINE, -margin]
+        lower = [MIN_DEPTH, 0.0, 0.0, self._MIN_COSINE, -margin]
         upper = [math.inf, camera.width, camera.height, math.inf, pyramid.levels - 1 + margin]
         self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
 

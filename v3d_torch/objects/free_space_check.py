@@ -27,6 +27,7 @@ from v3d_torch.kernels import free_space as kernels
 from v3d_torch.kernels import nearest_depth as depth_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.track import STAMP_TOLERANCE
 
 _POSE_ERROR = 0.01
 """Reprojection error of a view's pose, as a fraction of the image width: 0.6 degrees of a Kinect's field of view."""
@@ -37,9 +38,6 @@ _COLUMNS = 160
 _VIEW_MARGIN = 0.2
 """Views are kept for this much longer than the longest baseline, seconds: at 5 frames per second, the newest view that
 is at least as old as the baseline can be one frame interval older."""
-
-_STAMP_TOLERANCE = 1e-3
-"""Tolerance of a baseline, seconds: timestamps are rounded."""
 
 _MIN_INTERVAL = 1e-3
 """Shortest time between two views, seconds: lower bound of a divisor."""
@@ -313,4 +311,4 @@ class FreeSpaceCheck:
         self._views = list(state["views"])
 
     def _newest_view_before(self, stamp: float) -> DepthView | None:
-        return next((view for view in reversed(self._views) if view.stamp <= stamp + _STAMP_TOLERANCE), None)
+        return next((view for view in reversed(self._views) if view.stamp <= stamp + STAMP_TOLERANCE), None)

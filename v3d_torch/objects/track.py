@@ -24,7 +24,7 @@ the hidden part: the centroid of a person who is cut off at the waist is off by 
 _HISTORY = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""
 
-_STAMP_TOLERANCE = 1e-3
+STAMP_TOLERANCE = 1e-3
 """Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
 
 
@@ -110,7 +110,7 @@ class Track:
         """
         current = self.newest
         for previous in reversed(self.detections[:-1]):
-            if current.stamp - previous.stamp >= baseline - _STAMP_TOLERANCE:
+            if current.stamp - previous.stamp >= baseline - STAMP_TOLERANCE:
                 return (previous, current) if previous.is_located and current.is_located else None
         return None
 
@@ -152,7 +152,7 @@ class Track:
         sigma = _CENTROID_SIGMA + _PARTIAL_SIGMA * hidden_fraction
         self._filter.update(detection.stamp, detection.centroid, sigma)
         self.detections.append(detection)
-        oldest = detection.stamp - _HISTORY - _STAMP_TOLERANCE
+        oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
 
