@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial, reduce
-from statistics import fmean, median
+from statistics import median
 
 import columns
 import psutil
@@ -79,11 +79,11 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
 
     snapshots = [take_snapshot()]
     system(lambda *_: snapshots.append(take_snapshot()))
-    stages = list(slam.timer.seconds)
+    times = system.pipeline.record.times
     columns = ["frames", "ms per frame", "slowest", "CPU ms per frame", "resident MB", "keyframes", "loops"]
     lines = [
-        markdown_row([*columns, *(f"{stage} ms" for stage in stages)]),
-        markdown_row(["---:"] * (len(columns) + len(stages))),
+        markdown_row([*columns, *(f"{stage} ms" for stage in times.stages)]),
+        markdown_row(["---:"] * (len(columns) + len(times.stages))),
     ]
     cpu_ms: list[str] = []
     ends: list[Snapshot] = []
@@ -95,7 +95,6 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
         slowest = max(snapshots[i + 1].wall - snapshots[i].wall for i in range(first, end))
         cpu_ms.append(f"{1e3 * (stop.cpu - start.cpu) / (end - first):.1f}")
         ends.append(stop)
-        rows = system.pipeline.record.frames[first:end]
         cells = [
             f"{first + 1}-{end}",
             f"{1e3 * (stop.wall - start.wall) / (end - first):.1f}",
@@ -104,10 +103,7 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
             f"{stop.resident_mb:.0f}",
             str(stop.keyframes),
             str(stop.loops),
-            *(
-                f"{1e3 * fmean(frame.stages[stage].wall if stage in frame.stages else 0.0 for frame in rows):.1f}"
-                for stage in stages
-            ),
+            *(f"{1e3 * seconds:.1f}" for seconds in times.wall[first:end].mean(dim=0).tolist()),
         ]
         lines.append(markdown_row(cells))
     early, late = ends[0], ends[-1]

@@ -33,7 +33,7 @@ def test_sequence_exercises_all_state(uninterrupted: Pipeline) -> None:
     assert slam.loop_closer.loop_count > 0 and len(slam.map.keyframes) > 10
     assert not slam.map.landmarks["active"].all()
     assert {PERSON, UNLABELLED} <= set(record.dynamics["label"].tolist())
-    assert {MotionState.DYNAMIC, MotionState.STATIC} <= record.motion_state_counts.keys()
+    assert {MotionState.DYNAMIC, MotionState.STATIC} <= record.dynamics.count_motion_states().keys()
     assert record.dynamics["missed"].any() and record.dynamics["votes"].any()
     state = segmenter_state_of(slam.segment)
     assert state is not None and state["calls"] > 10 and state["up"].norm() > 1
@@ -67,7 +67,7 @@ def test_run_resumed_many_times_equals_an_uninterrupted_run(uninterrupted: Pipel
     slam, expected = pipeline.slam, uninterrupted.slam
     assert torch.equal(slam.poses.trajectory().T_wc, expected.poses.trajectory().T_wc)
     assert set(slam.timer.seconds) == set(expected.timer.seconds)
-    assert [row.frame for row in pipeline.record.frames] == list(range(len(Walk())))
+    assert pipeline.record.times.indices.tolist() == list(range(len(Walk())))
     # The database of loop closing is rebuilt and gives the same candidates.
     query = expected.map.keyframes[3].features.descriptors
     assert slam.loop_closer._database.query(query, 9) == expected.loop_closer._database.query(query, 9)

@@ -8,10 +8,10 @@ import sys
 import psutil
 import pytest
 
-import v3d_torch.pipeline
 from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
 from v3d_torch.config.loading import load_config
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runtime.process import trim_memory
 
 
@@ -46,8 +46,8 @@ def test_pipeline_trims_memory_at_intervals(monkeypatch: pytest.MonkeyPatch) -> 
     demo, trimmed_after = load_sequence("demo"), []
     config = load_config(None, ["segmentation.source=none", "prefetch=false"])
     pipeline = Pipeline(demo, V3DSLAM(demo.camera, config=config))
-    monkeypatch.setattr(v3d_torch.pipeline, "_TRIM_INTERVAL", 3)
-    monkeypatch.setattr(v3d_torch.pipeline, "trim_memory", lambda: trimmed_after.append(len(pipeline.record.frames)))
+    monkeypatch.setattr(pipeline_module, "_TRIM_INTERVAL", 3)
+    monkeypatch.setattr(pipeline_module, "trim_memory", lambda: trimmed_after.append(len(pipeline.record.times)))
 
     def stop(frame: RGBDFrame, *_: object) -> None:
         if frame.index == 7:

@@ -181,7 +181,7 @@ def _print_summary(
     console.print(_summary_table(pipeline, evaluation))
     if evaluation is not None and (table := make_paper_table(pipeline.sequence.name, evaluation)) is not None:
         console.print(table)
-    if display.profile and record.frames:
+    if display.profile and record.times:
         console.print(stage_table(record))
     for note in evaluation.notes if evaluation is not None else ():
         console.print(f"note: {note}", markup=False)
@@ -204,7 +204,7 @@ def _print_summary(
 def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     slam, record = pipeline.slam, pipeline.record
     statuses = Counter(slam.poses.statuses)
-    motion_states = record.motion_state_counts
+    motion_states = record.dynamics.count_motion_states()
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
     table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))

@@ -21,7 +21,7 @@ import torch
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import atomic_write
 
-_FORMAT, _VERSION = "v3d_torch state", 10
+_FORMAT, _VERSION = "v3d_torch state", 11
 
 _FIRST_LINE = f"{_FORMAT} {{version}} sha256 {{digest}}\n"
 _PLACEHOLDER_DIGEST = "0" * hashlib.sha256().digest_size * 2

@@ -55,7 +55,7 @@ class Autosave:
         record = self._pipeline.record
         if (
             record.failure is None
-            or not record.frames
+            or not record.times
             or not self._pipeline.between_frames
             or math.isinf(self._config.interval)
         ):
@@ -76,7 +76,7 @@ class Autosave:
         start, path = time.perf_counter(), self._folder / CHECKPOINT
         write_checkpoint(self._folder, self._pipeline, self._request)
         seconds, size = time.perf_counter() - start, path.stat().st_size / (1 << 20)
-        _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.frames), size, seconds)
+        _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)
 
     def _report(self, error: OutputError) -> None:
         self._pipeline.record.save_error = str(error)

@@ -24,12 +24,11 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
-from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import fuse_points
-from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -118,29 +117,22 @@ def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | No
 
 def _frame_table(pipeline: Pipeline) -> pa.Table:
     """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
-    slam, rows = pipeline.slam, pipeline.record.frames
-    stages = list(slam.timer.times)
-    columns = [("frame", pa.int64()), ("stamp", pa.float64()), ("status", pa.string()), ("keyframe", pa.bool_())]
-    keyframes = {keyframe.frame for keyframe in slam.map.active_keyframes}
-    table = [
-        {
-            **{
-                "frame": row.frame,
-                "stamp": row.stamp,
-                "status": status.value,
-                "keyframe": row.frame in keyframes,
-            },
-            **{f"seconds_{stage}": row.stages.get(stage, StageTime()).wall for stage in stages},
-            **{f"cpu_seconds_{stage}": row.stages.get(stage, StageTime()).cpu for stage in stages},
-        }
-        for row, status in zip(rows, slam.poses.statuses, strict=False)  # one row less if a frame was interrupted
-    ]
-    columns += [(f"{kind}_{stage}", pa.float64()) for kind in ("seconds", "cpu_seconds") for stage in stages]
-    schema = pa.schema(columns)
-    return pa.Table.from_pylist(table, schema=schema)
+    slam, times = pipeline.slam, pipeline.record.times
+    keyframes = torch.tensor([keyframe.frame for keyframe in slam.map.active_keyframes], dtype=torch.int64)
+    statuses = [status.value for status in slam.poses.statuses][: len(times)]  # one more if a frame was interrupted
+    wall, cpu = times.wall.T.numpy(), times.cpu.T.numpy()
+    columns = {
+        "frame": times.indices.numpy(),
+        "stamp": times.stamps.numpy(),
+        "status": pa.array(statuses, pa.string()),
+        "keyframe": torch.isin(times.indices, keyframes).numpy(),
+        **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
+        **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
+    }
+    return pa.table(columns)
 
 
-def _object_table(dynamics: TensorTable) -> pa.Table:
+def _object_table(dynamics: ObjectTable) -> pa.Table:
     """Return the table of objects: one row per frame and object."""
     x, y, z = dynamics["centroid"].T
     states = [state.value for state in MotionState]

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from v3d_torch.pipeline import RunRecord
-from v3d_torch.runtime.stage_timer import StageTime
+from v3d_torch.pipeline.run_record import RunRecord
 
 _PREPROCESSING = ("read", "segmentation", "depth", "features")
 _BACK_END = ("bundle", "loop")
@@ -23,10 +22,7 @@ def stage_table(run: RunRecord) -> Table:
     Args:
         run: Record of a finished run with at least one frame.
     """
-    stages = list(dict.fromkeys(stage for row in run.frames for stage in row.stages))
-    # Wall and CPU time, 2 x frames x stages, ms
-    times = 1e3 * np.array([[row.stages.get(stage, StageTime()) for stage in stages] for row in run.frames])
-    wall, cpu = times.transpose(2, 0, 1)
+    stages, wall, cpu = run.times.stages, 1e3 * run.times.wall.numpy(), 1e3 * run.times.cpu.numpy()
     table = Table(title="time per frame, ms")
     for heading in ("stage", "wall", "median", "95%", "CPU", "fraction"):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
@@ -41,7 +37,7 @@ def stage_table(run: RunRecord) -> Table:
     table.add_row("all", *_summary(wall.sum(axis=1), cpu.sum(axis=1), cpu.sum()))
     slowest = max(chains, key=lambda name: wall[:, chains[name]].sum())
     table.caption = (
-        f"{1e3 * run.seconds / len(run.frames):.1f} ms of wall time, because stages overlap; the chain that limits the"
+        f"{1e3 * run.seconds / len(run.times):.1f} ms of wall time, because stages overlap; the chain that limits the"
         f" rate is {slowest}"
     )
     return table

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import BackProjector
 from v3d_torch.objects.frame_objects import TrackedObject
-from v3d_torch.pipeline import Pipeline, Snapshot
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline.run_record import Snapshot
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure
 from v3d_torch.viz.object_overlay import Overlay, save_mask_figure

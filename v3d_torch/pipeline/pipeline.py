@@ -1,30 +1,26 @@
-"""A whole sequence through the system, with the records that the results need."""
+"""A whole sequence through the system, with its records and a viewer."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import closing
-from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
 
 from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
-from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.mapping.static_views import StaticViews
-from v3d_torch.mapping.tensor_table import TensorTable
-from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
-from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState
+from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
+from v3d_torch.pipeline.run_record import RunRecord, Snapshot
 from v3d_torch.runtime.process import trim_memory
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
@@ -37,8 +33,6 @@ _SNAPSHOTS = 6
 
 _TRIM_INTERVAL = 200
 """Frames between two calls of `trim_memory`, which takes some milliseconds."""
-
-_MOTION_STATES = tuple(MotionState)
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
@@ -83,87 +77,6 @@ class NullViewer:
 
 NULL_VIEWER = NullViewer()
 """Viewer of a run that is not shown."""
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """A frame that is kept for the figures.
-
-    Attributes:
-        frame: Frame.
-        T_cw: World-to-camera pose at that time, float64, shape :math:`(4, 4)`.
-        result: Result of the frame, with its objects.
-    """
-
-    frame: RGBDFrame
-    T_cw: Tensor
-    result: FrameResult
-
-
-@dataclass(frozen=True)
-class FrameTimes:
-    """Time spent on one frame.
-
-    Attributes:
-        frame: Index of the frame.
-        stamp: Timestamp of the frame, seconds.
-        stages: Time of each stage that ran.
-    """
-
-    frame: int
-    stamp: float
-    stages: Mapping[str, StageTime]
-
-
-def _dynamics_table() -> TensorTable:
-    # Tensors take a tenth of the memory of a dictionary for each row.
-    return TensorTable(
-        frame=((), torch.int64),
-        stamp=((), torch.float64),
-        id=((), torch.int64),
-        label=((), torch.int64),
-        centroid=((3,), torch.float64),
-        votes=((), torch.int64),
-        chamfer=((), torch.float64),
-        motion_state=((), torch.int64),
-        missed=((), torch.bool),
-    )
-
-
-@dataclass
-class RunRecord:
-    """Records of a run in addition to the trajectory.
-
-    Attributes:
-        frames: Times of each frame.
-        dynamics: One row per frame and object: index and timestamp of the frame, id, COCO class, centroid (world frame,
-            metres), votes, Chamfer distance, position of the motion state in `MotionState`, and whether it was missed.
-        snapshots: Frames for the figure of masks.
-        most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
-        mask_evaluation: Comparison of the masks with true masks.
-        seconds: Wall time of all frames, seconds.
-        failure: Reason why the run ended before the sequence; None if it did not.
-        interrupted: True if the user interrupted the run.
-        mask_error: Reason why the masks were not evaluated although there are true masks; None if there is none.
-        save_error: Reason why a checkpoint could not be written; None if there is none.
-    """
-
-    frames: list[FrameTimes] = field(default_factory=list)
-    dynamics: TensorTable = field(default_factory=_dynamics_table)
-    snapshots: list[Snapshot] = field(default_factory=list)
-    most_dynamic_snapshot: Snapshot | None = None
-    mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)
-    seconds: float = 0.0
-    failure: str | None = None
-    interrupted: bool = False
-    mask_error: str | None = None
-    save_error: str | None = None
-
-    @property
-    def motion_state_counts(self) -> dict[MotionState, int]:
-        """Number of rows of ``dynamics`` with each motion state, in the order of their first row."""
-        codes = self.dynamics["motion_state"].tolist()
-        return {_MOTION_STATES[code]: count for code, count in Counter(codes).items()}
 
 
 class Pipeline:
@@ -228,13 +141,13 @@ class Pipeline:
                     self.between_frames = False
                     frame, result = preprocessed.frame, self.slam.track(preprocessed)
                     times = self.slam.timer.lap()
-                    record.frames.append(FrameTimes(frame.index, frame.stamp, times))
+                    record.times.append(frame, times)
                     self._record_frame(frame, result)
                     self._viewer.show(frame, result, self.slam, times)
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
-                    if len(record.frames) % _TRIM_INTERVAL == 0:
+                    if len(record.times) % _TRIM_INTERVAL == 0:
                         trim_memory()
         except V3DError as error:
             record.failure = str(error)
@@ -276,7 +189,7 @@ class Pipeline:
         return islice(iter(self.sequence), done, None)
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
-        _append_dynamics(self.record.dynamics, frame, result.objects)
+        self.record.dynamics.append_objects(frame, result.objects)
         self._evaluate_masks(frame, result)
         if self._masks is not None:
             masked = (~result.static_mask).to(torch.uint8) * 255
@@ -319,19 +232,3 @@ def _dynamic_votes(objects: FrameObjects) -> tuple[int, int]:
     """Return the number of votes for dynamic objects, and the number of objects."""
     dynamic = {each.id for each in objects.objects if each.motion_state is MotionState.DYNAMIC}
     return sum(candidate in dynamic for _, candidate in objects.vote_pairs), len(objects.objects)
-
-
-def _append_dynamics(table: TensorTable, frame: RGBDFrame, objects: Sequence[TrackedObject]) -> None:
-    if not objects:
-        return
-    table.append(
-        frame=torch.full((len(objects),), frame.index),
-        stamp=torch.full((len(objects),), frame.stamp, dtype=torch.float64),
-        id=torch.tensor([each.id for each in objects]),
-        label=torch.tensor([each.label for each in objects]),
-        centroid=torch.stack([each.centroid for each in objects]),
-        votes=torch.tensor([each.votes for each in objects]),
-        chamfer=torch.tensor([each.chamfer for each in objects], dtype=torch.float64),
-        motion_state=torch.tensor([_MOTION_STATES.index(each.motion_state) for each in objects]),
-        missed=torch.tensor([each.missed for each in objects]),
-    )

@@ -16,7 +16,7 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import InputError
 from v3d_torch.frame_result import PreprocessedFrame
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.prefetch.frame_prefetcher import FramePrefetcher
+from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.slam import PREFETCHED_FRAMES
 from v3d_torch.types import Instances

@@ -1,0 +1,18 @@
+"""A whole sequence through the system: preprocessing ahead of the tracking, records of the run, and a viewer."""
+
+from __future__ import annotations
+
+from v3d_torch.pipeline.pipeline import NULL_VIEWER, FrameCallback, NullViewer, Pipeline, Viewer
+from v3d_torch.pipeline.run_record import FrameTimes, ObjectTable, RunRecord, Snapshot
+
+__all__ = [
+    "NULL_VIEWER",
+    "FrameCallback",
+    "FrameTimes",
+    "NullViewer",
+    "ObjectTable",
+    "Pipeline",
+    "RunRecord",
+    "Snapshot",
+    "Viewer",
+]

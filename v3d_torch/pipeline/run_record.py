@@ -1,0 +1,156 @@
+"""Records of a run in addition to the trajectory, from which the results are written."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from v3d_torch.evaluation.masks import MaskEvaluation
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.mapping.tensor_table import TensorTable
+from v3d_torch.objects.frame_objects import MotionState, TrackedObject
+from v3d_torch.runtime.stage_timer import StageTime
+from v3d_torch.types import RGBDFrame
+
+_MOTION_STATES = tuple(MotionState)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A frame that is kept for the figures.
+
+    Attributes:
+        frame: Frame.
+        T_cw: World-to-camera pose at that time, float64, shape :math:`(4, 4)`.
+        result: Result of the frame, with its objects.
+    """
+
+    frame: RGBDFrame
+    T_cw: Tensor
+    result: FrameResult
+
+
+class FrameTimes:
+    """Time spent on each frame, by stage. A frame takes half a kilobyte, because runs can have 100,000 of them.
+
+    Attributes:
+        stages: Names of the stages, in the order in which they first ran.
+    """
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []
+        self._frames = TensorTable(index=((), torch.int64), stamp=((), torch.float64))
+        self._times = TensorTable(row=((), torch.int64), stage=((), torch.int64), seconds=((2,), torch.float64))
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._frames)
+
+    @property
+    def indices(self) -> Tensor:
+        """Index of each frame in the sequence, int64, shape :math:`(N,)`."""
+        return self._frames["index"]
+
+    @property
+    def stamps(self) -> Tensor:
+        """Timestamps of the frames, seconds, float64, shape :math:`(N,)`."""
+        return self._frames["stamp"]
+
+    @property
+    def wall(self) -> Tensor:
+        """Wall time of each stage, seconds, float64, shape :math:`(N, S)`; 0 on frames on which it did not run."""
+        return self._seconds()[..., 0]
+
+    @property
+    def cpu(self) -> Tensor:
+        """Processor time of each stage, seconds, float64, shape :math:`(N, S)`; 0 on frames on which it did not run."""
+        return self._seconds()[..., 1]
+
+    def append(self, frame: RGBDFrame, times: Mapping[str, StageTime]) -> None:
+        """Append a frame with the time of each stage that ran."""
+        self.stages += [stage for stage in times if stage not in self.stages]
+        self._times.append(
+            row=torch.full((len(times),), len(self)),
+            stage=torch.tensor([self.stages.index(stage) for stage in times], dtype=torch.int64),
+            seconds=torch.tensor(list(times.values()), dtype=torch.float64).reshape(-1, 2),
+        )
+        self._frames.append(index=torch.tensor([frame.index]), stamp=torch.tensor([frame.stamp], dtype=torch.float64))
+
+    def _seconds(self) -> Tensor:
+        seconds = torch.zeros(len(self), len(self.stages), 2, dtype=torch.float64)
+        seconds[self._times["row"], self._times["stage"]] = self._times["seconds"]
+        return seconds
+
+
+class ObjectTable(TensorTable):
+    """Objects of all frames, one row per frame and object.
+
+    The columns are the index and timestamp of the frame, and id, COCO class, centroid (world frame, metres), votes,
+    Chamfer distance, position of the motion state in `MotionState`, and whether the network missed the object.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(
+            frame=((), torch.int64),
+            stamp=((), torch.float64),
+            id=((), torch.int64),
+            label=((), torch.int64),
+            centroid=((3,), torch.float64),
+            votes=((), torch.int64),
+            chamfer=((), torch.float64),
+            motion_state=((), torch.int64),
+            missed=((), torch.bool),
+        )
+
+    def append_objects(self, frame: RGBDFrame, objects: Sequence[TrackedObject]) -> None:
+        """Append the objects of a frame."""
+        if not objects:
+            return
+        self.append(
+            frame=torch.full((len(objects),), frame.index),
+            stamp=torch.full((len(objects),), frame.stamp, dtype=torch.float64),
+            id=torch.tensor([each.id for each in objects]),
+            label=torch.tensor([each.label for each in objects]),
+            centroid=torch.stack([each.centroid for each in objects]),
+            votes=torch.tensor([each.votes for each in objects]),
+            chamfer=torch.tensor([each.chamfer for each in objects], dtype=torch.float64),
+            motion_state=torch.tensor([_MOTION_STATES.index(each.motion_state) for each in objects]),
+            missed=torch.tensor([each.missed for each in objects]),
+        )
+
+    def count_motion_states(self) -> dict[MotionState, int]:
+        """Return the number of rows with each motion state, in the order of their first row."""
+        return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
+
+
+@dataclass
+class RunRecord:
+    """Records of a run in addition to the trajectory.
+
+    Attributes:
+        times: Time spent on each frame.
+        dynamics: Objects of all frames.
+        snapshots: Frames for the figure of masks.
+        most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
+        mask_evaluation: Comparison of the masks with true masks.
+        seconds: Wall time of all frames, seconds.
+        failure: Reason why the run ended before the sequence; None if it did not.
+        interrupted: True if the user interrupted the run.
+        mask_error: Reason why the masks were not evaluated although there are true masks; None if there is none.
+        save_error: Reason why a checkpoint could not be written; None if there is none.
+    """
+
+    times: FrameTimes = field(default_factory=FrameTimes)
+    dynamics: ObjectTable = field(default_factory=ObjectTable)
+    snapshots: list[Snapshot] = field(default_factory=list)
+    most_dynamic_snapshot: Snapshot | None = None
+    mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)
+    seconds: float = 0.0
+    failure: str | None = None
+    interrupted: bool = False
+    mask_error: str | None = None
+    save_error: str | None = None

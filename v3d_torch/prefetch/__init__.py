@@ -1,1 +1,0 @@
-"""Preprocessing of the next frames in a thread or a second process."""
