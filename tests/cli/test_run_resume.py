@@ -22,6 +22,7 @@ from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from typer.testing import CliRunner, Result
 
+from v3d_torch.io.state_file import VERSION
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import run
@@ -287,9 +288,9 @@ def test_damaged_checkpoint_or_one_of_another_version_is_rejected(out: Path) -> 
     content = path.read_bytes()
     path.write_bytes(content[:-10])
     assert_error_line(call("--resume", out), f"{path}: is damaged or not a state of a run; start a new run")
-    path.write_bytes(content.replace(b"state 10", b"state 11", 1))
+    path.write_bytes(content.replace(b"state %d" % VERSION, b"state 9", 1))
     assert_error_line(
-        call("--resume", out), f"{path}: has state format 11, this program reads format 10; continue with"
+        call("--resume", out), f"{path}: has state format 9, this program reads format {VERSION}; continue with"
     )
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
 

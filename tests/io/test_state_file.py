@@ -10,7 +10,7 @@ from helpers.unpickled_code import CreatesFile
 
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.io.state_file import read_state, write_state
+from v3d_torch.io.state_file import VERSION, read_state, write_state
 
 CAMERA = PinholeCamera(fx=130.0, fy=130.0, cx=79.5, cy=59.5, width=160, height=120)
 
@@ -55,8 +55,8 @@ def test_reading_runs_no_code_and_creates_allowed_classes_only(tmp_path: Path) -
 
 def test_state_of_another_version_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = write_value(tmp_path / "s")
-    (tmp_path / "s").write_bytes(content.replace(b"state 10 ", b"state 9 ", 1))
-    with pytest.raises(InputError, match=r"/s: has state format 9, .* reads format 10"):
+    (tmp_path / "s").write_bytes(content.replace(b"state %d " % VERSION, b"state 9 ", 1))
+    with pytest.raises(InputError, match=rf"/s: has state format 9, .* reads format {VERSION}"):
         read_state(tmp_path / "s", [])
     with monkeypatch.context() as patch:
         patch.setattr("v3d_torch.io.state_file.version", lambda _: "9.9")

@@ -22,6 +22,7 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import NumericsError
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runs.numerics_check import CheckedSLAM, CheckedStage, check_finite
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.run import Run
@@ -78,6 +79,14 @@ def test_documented_nan_is_accepted_and_infinity_is_not() -> None:
     )
     with pytest.raises(NumericsError, match=r"x\.appeared is infinite: 1 of 2"):
         check_finite("x", NewlyOccupied(torch.tensor([math.nan, math.inf]), 4))
+
+
+def test_documented_infinity_is_accepted_and_nan_is_not() -> None:
+    check_finite("x", {"readout": Readout(0.02, math.inf)})
+    with pytest.raises(NumericsError, match=r"x\.information is NaN"):
+        check_finite("x", Readout(0.02, math.nan))
+    with pytest.raises(NumericsError, match=r"x\.seconds is infinite"):
+        check_finite("x", Readout(math.inf, 1.0))
 
 
 def test_integers_and_other_types_are_ignored() -> None:

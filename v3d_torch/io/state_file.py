@@ -21,7 +21,10 @@ import torch
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import atomic_write
 
-_FORMAT, _VERSION = "v3d_torch state", 11
+_FORMAT = "v3d_torch state"
+
+VERSION = 11
+"""Version of the content of states. A state of another version is rejected."""
 
 _FIRST_LINE = f"{_FORMAT} {{version}} sha256 {{digest}}\n"
 _PLACEHOLDER_DIGEST = "0" * hashlib.sha256().digest_size * 2
@@ -47,13 +50,13 @@ def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:
         OutputError: If the file cannot be written.
     """
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_FIRST_LINE.format(version=_VERSION, digest=_PLACEHOLDER_DIGEST).encode())
+        file.write(_FIRST_LINE.format(version=VERSION, digest=_PLACEHOLDER_DIGEST).encode())
         hashed = _HashingWriter(file)
         hashed.write(json.dumps({"v3d-torch": version("v3d-torch"), **metadata}).encode() + b"\n")
         torch.save(state, cast("IO[bytes]", hashed))  # torch.save only calls write and flush
         hashed.raise_error()
         file.seek(0)
-        file.write(_FIRST_LINE.format(version=_VERSION, digest=hashed.digest).encode())
+        file.write(_FIRST_LINE.format(version=VERSION, digest=hashed.digest).encode())
         file.flush()
         os.fsync(file.fileno())  # the rename can reach the disk before the content otherwise
 
@@ -93,9 +96,9 @@ def _verify(path: Path, file: IO[bytes]) -> None:
     match = re.fullmatch(rf"{_FORMAT} (\d+) sha256 ([0-9a-f]{{64}})\n", file.readline(200).decode("ascii", "replace"))
     if match is None:
         raise _damage_error(path)
-    if int(match[1]) != _VERSION:
+    if int(match[1]) != VERSION:
         raise InputError(
-            f"{path}: has state format {match[1]}, this program reads format {_VERSION}; continue with the program"
+            f"{path}: has state format {match[1]}, this program reads format {VERSION}; continue with the program"
             " that wrote it, or start a new run"
         )
     start, digest = file.tell(), hashlib.sha256()

@@ -36,42 +36,47 @@ MAY_BE_NAN = frozenset(
         "TrackedObject.chamfer",  # if it was not measured
     }
 )
-"""Fields in which NaN has a meaning, which their class documents; infinity is an error in them, too."""
+"""Fields in which NaN has a meaning, which their class documents."""
+
+MAY_BE_INFINITE = frozenset({"Readout.information"})  # of a readout that the camera states
+"""Fields in which infinity has a meaning, which their class documents."""
 
 
-def check_finite(name: str, value: object, *, nan: bool = False) -> None:
+def check_finite(name: str, value: object, *, nan: bool = False, infinite: bool = False) -> None:
     """Check tensors, arrays and numbers, also in dataclasses, sequences and mappings.
 
     Args:
         name: Name of the value in the message; names of fields and positions are appended.
         value: Value to check; values of other types are ignored.
         nan: True to allow NaN in the value itself.
+        infinite: True to allow infinity in the value itself.
 
     Raises:
-        NumericsError: If a number is infinite, or NaN outside of the fields in `MAY_BE_NAN`.
+        NumericsError: If a number is NaN outside of the fields in `MAY_BE_NAN`, or infinite outside of those in
+            `MAY_BE_INFINITE`.
     """
     if isinstance(value, Tensor | np.ndarray):
-        _check_tensor(name, torch.as_tensor(value), nan=nan)
+        _check_tensor(name, torch.as_tensor(value), nan=nan, infinite=infinite)
     elif isinstance(value, float):
-        _check_tensor(name, torch.tensor(value, dtype=torch.float64), nan=nan)
+        _check_tensor(name, torch.tensor(value, dtype=torch.float64), nan=nan, infinite=infinite)
     elif is_dataclass(value) and not isinstance(value, type):
-        classes = [cls.__name__ for cls in type(value).__mro__]
         for field in fields(value):
-            allowed = any(f"{cls}.{field.name}" in MAY_BE_NAN for cls in classes)
-            check_finite(f"{name}.{field.name}", getattr(value, field.name), nan=allowed)
+            names = {f"{cls.__name__}.{field.name}" for cls in type(value).__mro__}
+            nan, infinite = not names.isdisjoint(MAY_BE_NAN), not names.isdisjoint(MAY_BE_INFINITE)
+            check_finite(f"{name}.{field.name}", getattr(value, field.name), nan=nan, infinite=infinite)
     elif isinstance(value, Mapping):
         for key, item in value.items():
             check_finite(f"{name}[{key!r}]", item)
     elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        names = getattr(value, "_fields", None)  # of a named tuple
+        keys = getattr(value, "_fields", None)  # of a named tuple
         for index, item in enumerate(value):
-            check_finite(f"{name}[{index}]" if names is None else f"{name}.{names[index]}", item)
+            check_finite(f"{name}[{index}]" if keys is None else f"{name}.{keys[index]}", item)
 
 
-def _check_tensor(name: str, tensor: Tensor, *, nan: bool) -> None:
+def _check_tensor(name: str, tensor: Tensor, *, nan: bool, infinite: bool) -> None:
     if not (tensor.is_floating_point() or tensor.is_complex()):
         return
-    wrong = ~tensor.isfinite() & ~(tensor.isnan() & nan)
+    wrong = ~tensor.isfinite() & ~(tensor.isnan() & nan) & ~(tensor.isinf() & infinite)
     count = int(wrong.sum())
     if count:
         first = tuple(torch.nonzero(wrong)[0].tolist())
