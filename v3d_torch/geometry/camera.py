@@ -19,6 +19,12 @@ from v3d_torch.kernels.camera import Bounds, Intrinsics
 MAX_READOUT = 0.05
 """Longest accepted readout, seconds: no RGB-D camera takes longer to read the rows of an image."""
 
+MAX_DEPTH_DELAY = 0.5
+"""Longest accepted depth delay, seconds: images that are farther apart do not belong together."""
+
+MAX_INVERSE_DEPTH_OFFSET = 0.05
+"""Largest accepted offset of inverse depth, 1/m: it changes a depth of 2 m by 0.2 m."""
+
 # The corners of an image with strong lens distortion take about 20 steps. The tolerance is in pixels.
 _UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
 
@@ -43,6 +49,9 @@ class PinholeCamera:
         depth_scale: Units of the depth image per metre (TUM: 5000).
         readout: Time from the first to the last row of a colour image, seconds. 0 for a global shutter, negative if the
             rows are read from the bottom up, None if unknown; an unknown readout is calibrated while mapping.
+        depth_delay: Time of the depth image minus time of the colour image, seconds, in addition to the difference of
+            their timestamps.
+        inverse_depth_offset: Offset of the true inverse depth from the measured one, 1/m; see `correct_depth`.
 
     Raises:
         InputError: If a value is not a finite number in its range. Focal lengths are positive: a negative ``fy``, as
@@ -58,6 +67,8 @@ class PinholeCamera:
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: float = 5000.0
     readout: float | None = None
+    depth_delay: float = 0.0
+    inverse_depth_offset: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "width", "height", "depth_scale"):
@@ -80,6 +91,11 @@ class PinholeCamera:
             if not abs(readout) <= MAX_READOUT:
                 raise InputError(f"the camera's readout is {self.readout!r}; give seconds, at most {MAX_READOUT}")
             object.__setattr__(self, "readout", readout)
+        for name, limit in (("depth_delay", MAX_DEPTH_DELAY), ("inverse_depth_offset", MAX_INVERSE_DEPTH_OFFSET)):
+            value = to_float(getattr(self, name))
+            if not abs(value) <= limit:
+                raise InputError(f"the camera's {name} is {getattr(self, name)!r}; give a number, at most {limit}")
+            object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, object]:
         """Fields without the cached tensors, which follow from them and take megabytes."""
@@ -136,6 +152,24 @@ class PinholeCamera:
         K, coefficients = self.K.numpy(), np.array(self.distortion)
         pixels = cv2.undistortImagePoints(uv.numpy(), K, coefficients, None, _UNDISTORT_CRITERIA)
         return torch.from_numpy(pixels).view_as(uv)
+
+    def correct_depth(self, depth: Tensor) -> Tensor:
+        r"""Correct measured depth by the camera's offset of inverse depth: :math:`1 / z = 1 / z_{measured} + \beta`.
+
+        Cameras with structured light and stereo cameras measure disparity, which is linear in inverse depth; an error
+        of its zero point is a constant offset of inverse depth, and an error of depth that grows with its square
+        (Khoshelham and Elberink, Accuracy and Resolution of Kinect Depth Data, Sensors 2012).
+
+        Args:
+            depth: Measured depth, metres, any shape; 0 = no measurement.
+
+        Returns:
+            Corrected depth, 0 where it would be infinite; the same tensor if the camera has no offset.
+        """
+        if not self.inverse_depth_offset:
+            return depth
+        relative = 1 + self.inverse_depth_offset * depth  # inverse depth, true over measured
+        return torch.where(relative > 0, depth / relative, 0.0)
 
     def distort(self, uv: Tensor) -> Tensor:
         """Map undistorted pixels to distorted pixels; the inverse of `undistort`.

@@ -10,7 +10,7 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -35,12 +35,9 @@ from v3d_torch.optim.reprojection import (
 )
 from v3d_torch.optim.schur import REGULARISATION, NormalEquations, gather_columns, solve_normal_equations
 
-_NEGLIGIBLE_DAMPING = 1e-9
-"""Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
-
 _Array = NDArray[Any]
 
-_SortedProblem = tuple[_Array, _Array, _Array, _Array, _Array, _Array]
+SortedProblem = tuple[_Array, _Array, _Array, _Array, _Array, _Array]
 """Scale, offset, chi-square threshold and pose of the observations sorted by point; first observation of each point;
 free poses."""
 
@@ -112,40 +109,20 @@ class BundleResiduals:
     @cached_property
     def normal_equations(self) -> NormalEquations:
         """Normal equations of the linearised robust cost; computed once for all damping factors."""
-        return self.problem.linearise(self)
-
-    def reduced_cost_derivatives(self, uv_jacobian: Tensor) -> tuple[float, float]:
-        r"""Derivatives of the minimum cost over poses and points, with respect to a parameter of the measurements.
-
-        Let :math:`j` be the derivative of the residuals with respect to the parameter, and :math:`J` their Jacobian
-        with respect to poses and points. When the parameter changes by one unit, the adjusted poses and points change
-        by :math:`-(J^T W J)^{-1} J^T W j`, and the cost changes by the part of :math:`j` that remains after that.
-
-        Args:
-            uv_jacobian: Derivative of the measured pixels with respect to the parameter, float64,
-                shape :math:`(M, 2)`, in the order in which the observations were given.
-
-        Returns:
-            First and second derivative of the cost.
-        """
-        j = self.problem.whitened_derivative(uv_jacobian)
-        own, change = self.normal_equations, replace(self, whitened=j).normal_equations
-        pose_step, point_step = solve_normal_equations(change, _NEGLIGIBLE_DAMPING)
-        first, second = (
-            float(
-                (self.weights * j * residuals).sum()
-                + (pose_step * equations.U[..., 6]).sum()
-                + (point_step.T * equations.V[:, 3]).sum()
-            )
-            for residuals, equations in ((self.whitened, own), (j, change))
-        )
-        return 2 * first, 2 * second
+        return self.problem.linearise(self, self.whitened[None])
 
 
-def _sort_by_point(
+def sort_by_point(
     observations: Observations, camera: PinholeCamera, fixed: Tensor, point_count: int
-) -> tuple[NDArray[np.int64], _SortedProblem]:
-    """Order of observations that sorts them by point, and a problem in that order, as arguments of the kernels."""
+) -> tuple[NDArray[np.int64], SortedProblem]:
+    """Order of observations that sorts them by point, and a problem in that order, as arguments of the kernels.
+
+    Args:
+        observations: Observations of the points by the poses.
+        camera: Intrinsics.
+        fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`.
+        point_count: Number of points.
+    """
     point, target = to_array(observations.point), whiten(observations, camera)
     order = np.argsort(point, kind="stable")
     return order, (
@@ -169,7 +146,7 @@ def _bundle_adjust_compiled(
 ) -> BundleResult:
     if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
         return NotImplemented
-    order, problem = _sort_by_point(observations, camera, fixed, len(points))
+    order, problem = sort_by_point(observations, camera, fixed, len(points))
     *state, squared, cost_before, cost_after, steps = kernels.bundle_adjust(
         to_array(T_cw),
         to_array(points),
@@ -223,51 +200,6 @@ def bundle_adjust(
     return BundleResult(T_cw, points, chi2, found.cost_before, found.cost_after, found.iterations, lambda: found.system)
 
 
-def _reduced_cost_derivatives_compiled(
-    T_cw: Tensor,
-    points: Tensor,
-    observations: Observations,
-    camera: PinholeCamera,
-    fixed: Tensor,
-    uv_jacobian: Tensor,
-) -> tuple[float, float]:
-    if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
-        return NotImplemented
-    order, problem = _sort_by_point(observations, camera, fixed, len(points))
-    derivative = np.zeros((len(order), 3))
-    derivative[:, :2] = to_array(-uv_jacobian / observations.pixel_sigma[:, None])[order]
-    return kernels.reduced_cost_derivatives(
-        to_array(T_cw), to_array(points), *problem, derivative, _NEGLIGIBLE_DAMPING, REGULARISATION, MIN_DEPTH
-    )
-
-
-@torch.no_grad()
-@compiled_by(_reduced_cost_derivatives_compiled)
-def reduced_cost_derivatives(
-    T_cw: Tensor,
-    points: Tensor,
-    observations: Observations,
-    camera: PinholeCamera,
-    fixed: Tensor,
-    uv_jacobian: Tensor,
-) -> tuple[float, float]:
-    """Derivatives of the minimum cost of a bundle adjustment; see `BundleResiduals.reduced_cost_derivatives`.
-
-    Args:
-        T_cw: World-to-camera poses at the minimum, float64, shape :math:`(K, 4, 4)`.
-        points: Positions of the landmarks at the minimum, world frame, metres, float64, shape :math:`(P, 3)`.
-        observations: Observations of the points by the poses.
-        camera: Intrinsics.
-        fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`.
-        uv_jacobian: Derivative of the measured pixels with respect to a parameter, float64, shape :math:`(M, 2)`.
-
-    Returns:
-        First and second derivative of the minimum cost with respect to the parameter.
-    """
-    problem = BundleProblem(observations, camera, fixed, len(points))
-    return problem.residuals_at((T_cw, points))[1].reduced_cost_derivatives(uv_jacobian)
-
-
 @dataclass
 class BundleProblem:
     """Least-squares problem of a bundle adjustment. Its observations are sorted by pose, those of fixed poses last.
@@ -293,17 +225,16 @@ class BundleProblem:
         self._pose, self._point = observations.pose[self._order], observations.point[self._order]
         target = whiten(observations, self.camera)
         self._target = WhitenedMeasurements(target.scale[:, self._order], target.offset[:, self._order])
-        self._limit, self._sigma = observations.chi2_threshold[self._order], observations.pixel_sigma[self._order]
+        self._limit = observations.chi2_threshold[self._order]
+
+    @property
+    def order(self) -> Tensor:
+        """Index of each sorted observation among the given ones, int64, shape :math:`(M,)`."""
+        return self._order
 
     def in_input_order(self, values: Tensor) -> Tensor:
         """Reorder one value per sorted observation, shape :math:`(M,)`, to the order of the given observations."""
         return torch.empty_like(values).index_copy_(0, self._order, values)
-
-    def whitened_derivative(self, uv_jacobian: Tensor) -> Tensor:
-        """Derivative of the whitened residuals, :math:`(3, M)`, for a derivative of the measured pixels, (M, 2)."""
-        derivative = torch.zeros_like(self._target.scale)
-        derivative[:2] = -uv_jacobian[self._order].T / self._sigma
-        return derivative
 
     def residuals_at(self, state: State) -> tuple[float, BundleResiduals]:
         """Robust cost at poses :math:`(K, 4, 4)` and points :math:`(P, 3)`, and the residuals."""
@@ -316,30 +247,57 @@ class BundleProblem:
         costs, weights = huber((residuals * residuals).sum(dim=0), self._limit)
         return float(costs.sum()), BundleResiduals(in_camera, projected, T[:, :3], residuals, weights, self)
 
-    def linearise(self, residuals: BundleResiduals) -> NormalEquations:
-        """Normal equations of the robust cost, linearised at the given residuals."""
+    def jacobians(self, residuals: BundleResiduals) -> tuple[Tensor, Tensor]:
+        """Jacobians of the whitened residuals by pose, shape (6, 3, M), and by point, shape (3, 3, M)."""
+        by_pose = perspective_jacobian(residuals.projected) * self._target.scale
+        return by_pose, _inner(residuals.R_cw.transpose(0, 1), by_pose[:3].transpose(0, 1))
+
+    def linearise(self, residuals: BundleResiduals, columns: Tensor) -> NormalEquations:
+        """Normal equations of the robust cost at the given residuals, with several right-hand sides.
+
+        Args:
+            residuals: Residuals at the poses and points of the linearisation.
+            columns: Residuals of each right-hand side, whitened, shape :math:`(C, 3, M)`.
+        """
         root, free = residuals.weights.sqrt(), sum(self._counts)
-        by_pose = perspective_jacobian(residuals.projected) * (self._target.scale * root)
-        by_point = _inner(residuals.R_cw.transpose(0, 1), by_pose[:3].transpose(0, 1))
-        weighted = (residuals.whitened * root)[None]
+        by_pose, by_point = (jacobian * root for jacobian in self.jacobians(residuals))
+        weighted = columns * root
         V = _inner(by_point, torch.cat([by_point, weighted]))
         by_pose = by_pose[..., :free]
         # One matrix product for each pose, whose observations are adjacent: faster than a sum of outer products.
         of_each = torch.cat([by_pose, weighted[..., :free]]).split(self._counts, dim=-1)
         U = [rows[None, :6] @ rows.T for rows in (of_one.flatten(1) for of_one in of_each)]
-        index = self._point.expand(12, -1)
+        index = self._point.expand(V.shape[0] * V.shape[1], -1)
         return NormalEquations(
-            U=torch.cat([V.new_zeros(0, 6, 7), *U]),
-            V=V.new_zeros(12, self.point_count).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, 4)),
+            U=torch.cat([V.new_zeros(0, 6, 6 + len(columns)), *U]),
+            V=V.new_zeros(len(index), self.point_count).scatter_add_(1, index, V.flatten(0, 1)).unflatten(0, (3, -1)),
             W=_inner(by_point[..., :free], by_pose),
             pose=self._row[:free],
             point=self._point[:free],
         )
 
+    def remaining(self, residuals: BundleResiduals, columns: Tensor, damping: float) -> Tensor:
+        """Part of each column that no change of poses and points explains, to first order.
+
+        Args:
+            residuals: Residuals at the poses and points of the linearisation.
+            columns: Whitened residuals, shape :math:`(C, 3, M)`.
+            damping: Damping of the step that explains most of them.
+
+        Returns:
+            Shape :math:`(C, 3, M)`.
+        """
+        pose_steps, point_steps = solve_normal_equations(self.linearise(residuals, columns), damping)
+        by_pose, by_point = self.jacobians(residuals)
+        free = sum(self._counts)
+        remaining = columns + torch.einsum("aim,mac->cim", by_point, point_steps[self._point])
+        remaining[..., :free] += torch.einsum("aim,mac->cim", by_pose[..., :free], pose_steps[self._row[:free]])
+        return remaining
+
     def step(self, state: State, residuals: BundleResiduals, damping: float) -> State:
         """State after a damped Gauss-Newton step from the given state and its residuals."""
         T_cw, points = state
-        pose_step, point_step = solve_normal_equations(residuals.normal_equations, damping)
+        pose_step, point_step = (step[..., 0] for step in solve_normal_equations(residuals.normal_equations, damping))
         return T_cw.index_copy(0, self._free, se3_exp(pose_step) @ T_cw[self._free]), points + point_step
 
 

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from v3d_torch.config import Config, RollingShutterConfig
-from v3d_torch.features.features import pixel_sigma
+from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
-from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust, reduced_cost_derivatives
+from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.mapping.readout_calibration import calibrate_readout
+from v3d_torch.mapping.map_observations import select_observations
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.mapping.tensor_table import unique_ids
-from v3d_torch.odometry.rolling_shutter import Readout
 
 _MAX_ITERATIONS = 5
 """Maximum number of Levenberg-Marquardt steps."""
@@ -25,9 +21,6 @@ _MAX_ITERATIONS = 5
 _COST_TOLERANCE = 1e-5
 """Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations:
 a smaller change is a small fraction of one, and the next keyframe continues from there."""
-
-_LATE_CALIBRATION_INTERVAL = 10
-"""Interval in keyframes of the readout calibration after the first keyframes, for later rotations of the camera."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +32,12 @@ class LocalAdjustment:
         landmarks: IDs of the adjusted landmarks, int64, shape :math:`(P,)`.
         points: Positions of the adjusted landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
         outliers: Rows of the outliers in the table of observations, int64, shape :math:`(O,)`.
-        readout: Estimate of the camera's readout after the adjustment.
     """
 
     T_cw: Tensor
     landmarks: Tensor
     points: Tensor
     outliers: Tensor
-    readout: Readout
 
     def apply(self, sparse_map: SparseMap) -> None:
         """Write the result to the map that was adjusted, in place; the map must have no newer keyframe.
@@ -58,8 +49,10 @@ class LocalAdjustment:
         sparse_map.move_keyframes(self.T_cw)
         sparse_map.landmarks["point"][self.landmarks] = self.points
         sparse_map.remove_observations(self.outliers)
-        if self.readout != sparse_map.readout:
-            sparse_map.set_readout(self.readout)
+
+    def points_of(self, sparse_map: SparseMap) -> Tensor:
+        """Return the positions of all landmarks, adjusted or unchanged, float64, shape :math:`(L, 3)`."""
+        return sparse_map.landmarks["point"].index_copy(0, self.landmarks, self.points)
 
 
 def local_bundle_adjust(
@@ -79,57 +72,22 @@ def local_bundle_adjust(
         The result, or None if there are fewer than two keyframes or no observations to adjust.
     """
     window = sparse_map.covisible_keyframes(keyframe.observed_landmarks, config.mapping.bundle_keyframes)
-    table = sparse_map.observations
-    rows = _select_observations(sparse_map, window)
-    if len(window) < 2 or len(rows) == 0:
+    selected = select_observations(sparse_map, window, config)
+    if len(window) < 2 or len(selected) == 0:
         return None
-    poses, pose = unique_ids(table["keyframe"][rows], len(sparse_map.keyframes))
-    landmarks, point = unique_ids(table["landmark"][rows], len(sparse_map.landmarks))
-    T_cw = sparse_map.T_cw
-    fixed = ~torch.isin(poses, window) | (poses == 0)
+    T_cw, keyframes = sparse_map.T_cw, selected.keyframes
+    fixed = ~torch.isin(keyframes, window) | (keyframes == 0)
     if not fixed.any():
         fixed[0] = True  # fix the gauge by the oldest keyframe
-    observations = Observations(
-        uv=table["uv"].index_select(0, rows),
-        inverse_depth=table["inverse_depth"][rows],
-        pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
-        inverse_depth_sigma=config.tracking.inverse_depth_sigma,
-        pose=pose,
-        point=point,
-    )
     result = bundle_adjust(
-        T_cw[poses],
-        sparse_map.landmarks["point"][landmarks],
-        observations,
+        T_cw[keyframes],
+        sparse_map.landmarks["point"][selected.landmarks],
+        selected.observations,
         camera,
         fixed,
         iterations=_MAX_ITERATIONS,
         tolerance=_COST_TOLERANCE,
     )
-    readout = sparse_map.readout
-    if _is_calibration_due(sparse_map, keyframe, config.rolling_shutter):
-        uv_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, rows)
-        readout = calibrate_readout(
-            readout, *reduced_cost_derivatives(result.T_cw, result.points, observations, camera, fixed, uv_jacobian)
-        )
-    T_cw[poses[~fixed]] = orthonormalise(result.T_cw[~fixed])
-    return LocalAdjustment(T_cw, landmarks, result.points, rows[result.chi2 > observations.chi2_threshold], readout)
-
-
-def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: RollingShutterConfig) -> bool:
-    """Check whether the adjustment of a new keyframe calibrates the readout."""
-    is_due = keyframe.index <= config.calibration_keyframes or keyframe.index % _LATE_CALIBRATION_INTERVAL == 0
-    return is_due and config.enabled and not sparse_map.readout.is_certain
-
-
-def _select_observations(sparse_map: SparseMap, window: Tensor) -> Tensor:
-    """Rows of all observations of active landmarks that the window observes and that have at least two observations."""
-    # NumPy is faster than torch here.
-    table, count = sparse_map.observations, len(sparse_map.landmarks)
-    keyframe, landmark, valid = (table[name].numpy() for name in ("keyframe", "landmark", "valid"))
-    usable = valid & sparse_map.landmarks["active"].numpy().take(landmark)
-    in_window, observed = np.zeros(len(sparse_map.keyframes), np.bool_), np.zeros(count, np.bool_)
-    in_window[window.numpy()] = True
-    observed[landmark[usable & in_window.take(keyframe)]] = True
-    times = np.bincount(landmark[usable], minlength=count)
-    return torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))
+    T_cw[keyframes[~fixed]] = orthonormalise(result.T_cw[~fixed])
+    outliers = selected.rows[result.chi2 > selected.observations.chi2_threshold]
+    return LocalAdjustment(T_cw, selected.landmarks, result.points, outliers)

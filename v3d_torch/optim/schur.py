@@ -6,7 +6,7 @@ With the free poses first and the points second, :math:`H = J^T W J` has the blo
     \begin{pmatrix} U & W^T \\ W & V \end{pmatrix}
     \begin{pmatrix} \xi \\ \delta \end{pmatrix} = - \begin{pmatrix} g_{pose} \\ g_{point} \end{pmatrix}
 
-with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points are eliminated; the reduced camera
+for one or several right-hand sides, with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points are eliminated; the reduced camera
 system, 6 unknowns per pose, is solved densely (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
 """
 
@@ -24,11 +24,11 @@ which is 1e4 per square metre and more."""
 
 @dataclass(frozen=True)
 class NormalEquations:
-    r"""Blocks of the normal equations of F free poses, P points and N observations by free poses.
+    r"""Blocks of the normal equations of F free poses, P points, N observations by free poses and C right-hand sides.
 
     Attributes:
-        U: Diagonal blocks of the poses, with the gradient :math:`g_{pose}` as last column, shape :math:`(F, 6, 7)`.
-        V: Diagonal blocks of the points, with the gradient :math:`g_{point}` as last column, shape :math:`(3, 4, P)`.
+        U: Diagonal blocks of the poses, followed by the columns :math:`g_{pose}`, shape :math:`(F, 6, 6 + C)`.
+        V: Diagonal blocks of the points, followed by the columns :math:`g_{point}`, shape :math:`(3, 3 + C, P)`.
         W: Point-by-pose block of each observation, shape :math:`(3, 6, N)`.
         pose: Index of the free pose of each observation, int64, shape :math:`(N,)`.
         point: Index of the point of each observation, int64, shape :math:`(N,)`.
@@ -61,17 +61,17 @@ def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Ten
     :math:`(U - Y^T Y)\, \xi = -g_{pose} + Y^T L^{-1} g_{point}`.
 
     Args:
-        system: Normal equations of F poses and P points.
+        system: Normal equations of F poses, P points and C right-hand sides.
         damping: Factor :math:`\lambda`; :math:`\lambda` times the diagonal is added. The damping keeps unobservable
             directions in place, such as the depth of a point that was observed once without depth.
 
     Returns:
-        Steps of the poses, shape :math:`(F, 6)`, and of the points, shape :math:`(P, 3)`.
+        Steps of the poses, shape :math:`(F, 6, C)`, and of the points, shape :math:`(P, 3, C)`.
     """
-    F, P = system.U.shape[0], system.V.shape[-1]
+    F, P, C = system.U.shape[0], system.V.shape[-1], system.V.shape[1] - 3
     U, V = _damp(system.U[..., :6].permute(1, 2, 0), damping), _damp(system.V[:, :3], damping)
     L = _cholesky(V)
-    h = _forward(L, system.V[:, 3])
+    h = _forward(L, system.V[:, 3:])  # (3, C, P)
     blocks = _forward(gather_columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
     # Y is dense: a local map is small, and most of its poses observe many of its points. It is stored transposed, poses
     # by points, with the points ordered by coordinate first, like h.
@@ -81,9 +81,9 @@ def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Ten
     Yt = blocks.new_zeros(18 * F * P).scatter_add_(0, index.flatten(), blocks.flatten()).view(6 * F, 3 * P)
     S = -(Yt @ Yt.T)
     S.view(F, 6, F, 6).diagonal(dim1=0, dim2=2).add_(U)
-    xi = torch.linalg.solve(S, Yt @ h.flatten() - system.U[..., 6].flatten())
-    delta = _backward(L, -(h + (Yt.T @ xi).view(3, P)))
-    return xi.view(F, 6), delta.T
+    xi = torch.linalg.solve(S, Yt @ h.transpose(1, 2).reshape(3 * P, C) - system.U[..., 6:].flatten(0, 1))
+    delta = _backward(L, -(h + (Yt.T @ xi).view(3, P, C).transpose(1, 2)))
+    return xi.view(F, 6, C), delta.permute(2, 0, 1)
 
 
 def _damp(blocks: Tensor, damping: float) -> Tensor:

@@ -1,0 +1,82 @@
+"""Parameters of a camera that a map can calibrate, in groups that are taken or left as a whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from v3d_torch.geometry.camera import MAX_INVERSE_DEPTH_OFFSET, MAX_READOUT, PinholeCamera
+
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+
+DERIVATIVE_STEPS = {
+    **dict.fromkeys(("fx", "fy", "cx", "cy"), 0.1),
+    **dict.fromkeys(_DISTORTION, 1e-3),
+    "inverse_depth_offset": 1e-4,
+    "readout": 1e-3,
+}
+"""Steps of central differences of the residuals by each parameter: pixels; no unit; 1/m; seconds. Large enough that the
+tolerance of undistortion, 1e-6 pixels, does not matter, small enough that the residuals are linear."""
+
+
+_MIN_FOCAL_LENGTH = 10.0
+"""Smallest focal length of a step, pixels."""
+
+LIMITS = {
+    "readout": (-MAX_READOUT, MAX_READOUT),
+    "inverse_depth_offset": (-MAX_INVERSE_DEPTH_OFFSET, MAX_INVERSE_DEPTH_OFFSET),
+    "fx": (_MIN_FOCAL_LENGTH, math.inf),
+    "fy": (_MIN_FOCAL_LENGTH, math.inf),
+}
+"""Range of the parameters that have one; a step ends at its limits."""
+
+
+@dataclass(frozen=True)
+class ParameterGroup:
+    """Parameters that have one meaning together.
+
+    Attributes:
+        name: Name for tables.
+        parameters: Names of the parameters.
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+
+
+GROUPS = (
+    ParameterGroup("focal length", ("fx", "fy")),
+    ParameterGroup("readout", ("readout",)),
+    ParameterGroup("principal point", ("cx", "cy")),
+    ParameterGroup("radial distortion", ("k1", "k2", "k3")),
+    ParameterGroup("inverse-depth offset", ("inverse_depth_offset",)),
+    ParameterGroup("tangential distortion", ("p1", "p2")),
+)
+"""Groups in the order in which they are freed: by their effect on the images, and a group before those that resemble
+it. A tangential distortion can hardly be told from a shift of the principal point."""
+
+
+def get_values(camera: PinholeCamera, readout: float, names: Iterable[str]) -> list[float]:
+    """Return parameters of a camera by name.
+
+    Args:
+        camera: Camera.
+        readout: Readout, seconds; that of the camera can be unknown.
+        names: Names of parameters.
+    """
+    values = vars(camera) | dict(zip(_DISTORTION, camera.distortion, strict=True)) | {"readout": readout}
+    return [float(values[name]) for name in names]
+
+
+def with_values(camera: PinholeCamera, values: Mapping[str, float]) -> PinholeCamera:
+    """Return a camera with other values of some parameters.
+
+    Args:
+        camera: Camera.
+        values: New values by name.
+    """
+    coefficients = zip(_DISTORTION, camera.distortion, strict=True)
+    distortion = {"distortion": tuple(values.get(name, coefficient) for name, coefficient in coefficients)}
+    others = {name: value for name, value in values.items() if name not in _DISTORTION}
+    return replace(camera, **distortion, **others)

@@ -1,0 +1,229 @@
+"""Bundle adjustment with free parameters of the camera, by variable projection.
+
+For given parameters, poses and points are adjusted by the bundle adjustment of the map. The remaining cost depends on
+the parameters alone, and is minimised by damped Gauss-Newton steps with its exact derivatives (variable projection:
+Golub and Pereyra, SIAM Journal on Numerical Analysis 1973; self-calibration: Triggs et al., Bundle Adjustment - A
+Modern Synthesis, 2000). So every camera model that can undistort pixels can be calibrated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from v3d_torch.calibration.parameters import DERIVATIVE_STEPS, LIMITS, get_values, with_values
+from v3d_torch.config import Config
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
+from v3d_torch.mapping.map_observations import select_observations
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.reduced_cost import reduced_cost_derivatives
+from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt
+from v3d_torch.optim.reprojection import perspective, whiten
+
+_MAX_STEPS = 20
+"""Maximum number of steps of the parameters."""
+
+_INNER_STEPS = 4
+"""Maximum number of steps of poses and points between two steps of the parameters."""
+
+_TOLERANCE = 1e-6
+"""Relative change of the cost that ends the optimisation."""
+
+_SCALE_STEP = 1.0
+"""Distance over which the scale of undistortion is measured, pixels."""
+
+_NORMAL_MAD = 0.6745
+"""Median absolute value of a standard normal distribution."""
+
+
+@dataclass(frozen=True)
+class AdjustedMap:
+    """Poses and points adjusted for given parameters, and the derivatives of the minimum cost at these parameters.
+
+    Attributes:
+        T_cw: World-to-camera poses, float64, shape :math:`(K, 4, 4)`.
+        points: Landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
+        gradient: First derivatives of each keyframe's cost by the parameters, float64, shape :math:`(K, C)`.
+        hessian: Second derivatives, shape :math:`(K, C, C)`.
+    """
+
+    T_cw: Tensor
+    points: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+State = tuple[Tensor, Tensor, Tensor]
+"""Values of the free parameters (C,), poses ``T_cw`` (K, 4, 4) and points (P, 3)."""
+
+
+class SelfCalibration:
+    """Calibration of a camera from the keyframes and landmarks of a map that was built with it.
+
+    Args:
+        tables: Data of the map.
+        camera: Camera with which the map was built.
+        config: Configuration of the run: measurement noise.
+        max_keyframes: Maximum number of keyframes, the newest ones; None for all.
+
+    Attributes:
+        observations: Observations of the map, with noise estimated from its residuals.
+        T_cw: World-to-camera poses of the keyframes, adjusted with the given camera, float64, shape
+            :math:`(K, 4, 4)`.
+        points: Landmarks, adjusted with the given camera, float64, shape :math:`(P, 3)`.
+    """
+
+    def __init__(
+        self, tables: MapTables, camera: PinholeCamera, config: Config, max_keyframes: int | None = None
+    ) -> None:
+        active = torch.tensor([keyframe.index for keyframe in tables.active_keyframes], dtype=torch.int64)
+        window = active if max_keyframes is None else active[-max_keyframes:]
+        selected = select_observations(tables, window, config)
+        self._camera, self._readout = camera, tables.readout.seconds
+        self._fixed = ~torch.isin(selected.keyframes, window)
+        self._fixed[:1] = True  # the gauge
+        self._pixel = camera.distort(selected.observations.uv)  # in the recorded image
+        self._readout_jacobian = selected.readout_jacobian
+        self.observations = selected.observations
+        self.T_cw, self.points = tables.T_cw[selected.keyframes], tables.landmarks["point"][selected.landmarks]
+        for _ in range(2):
+            self._adjust_with_given_camera()
+            self.observations = self._with_estimated_noise()
+
+    @property
+    def residual_count(self) -> int:
+        """Number of residuals: two pixel coordinates of each observation, and its depth if it was measured."""
+        return 2 * len(self.observations.uv) + int((self.observations.inverse_depth > 0).sum())
+
+    @property
+    def unknown_count(self) -> int:
+        """Number of unknowns of poses and points."""
+        return 6 * int((~self._fixed).sum()) + 3 * len(self.points)
+
+    def given_values(self, names: Sequence[str]) -> Tensor:
+        """Values of parameters with which the map was built, float64, shape :math:`(C,)`."""
+        return torch.tensor(get_values(self._camera, self._readout, names), dtype=torch.float64)
+
+    def minimise(self, names: Sequence[str], start: Tensor | None = None) -> tuple[Tensor, AdjustedMap]:
+        """Find the values of parameters with the lowest cost.
+
+        Args:
+            names: Free parameters.
+            start: Initial values; None for the given ones.
+
+        Returns:
+            Values, float64, shape :math:`(C,)`, and the map adjusted for them.
+        """
+
+        def linearise(state: State) -> tuple[float, AdjustedMap]:
+            return self.linearise(names, *state)
+
+        def step(state: State, at: AdjustedMap, damping: float) -> State:
+            return _damped_step(names, state[0], at, damping), at.T_cw, at.points
+
+        values = self.given_values(names) if start is None else start
+        found = levenberg_marquardt((values, self.T_cw, self.points), linearise, step, _MAX_STEPS, _TOLERANCE)
+        return found.state[0], found.system
+
+    def linearise(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> tuple[float, AdjustedMap]:
+        """Adjust poses and points for given values of parameters, and differentiate the minimum cost.
+
+        Args:
+            names: Free parameters.
+            values: Their values, float64, shape :math:`(C,)`.
+            T_cw: Initial poses, float64, shape :math:`(K, 4, 4)`.
+            points: Initial points, float64, shape :math:`(P, 3)`.
+
+        Returns:
+            Cost, and the adjusted map.
+        """
+        observations, camera = self._measured_with(names, values)
+        adjusted = bundle_adjust(T_cw, points, observations, camera, self._fixed, _INNER_STEPS, _TOLERANCE)
+        T_cw, points = adjusted.T_cw, adjusted.points
+        jacobian = self.jacobian(names, values, T_cw, points)
+        derivatives = reduced_cost_derivatives(T_cw, points, observations, camera, self._fixed, jacobian)
+        return adjusted.cost_after, AdjustedMap(T_cw, points, *derivatives)
+
+    def residuals(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
+        """Whitened residuals of pixels and inverse depth, float64, shape :math:`(M, 3)`."""
+        observations, camera = self._measured_with(names, values)
+        T = T_cw[observations.pose]
+        in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
+        return whiten(observations, camera).residuals(perspective(in_camera.T)).T
+
+    def jacobian(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
+        """Derivatives of the whitened residuals by the parameters, by central differences, shape :math:`(M, 3, C)`."""
+        columns = []
+        for index, name in enumerate(names):
+            step = torch.zeros_like(values).index_fill_(0, torch.tensor(index), DERIVATIVE_STEPS[name])
+            ahead, behind = (self.residuals(names, values + sign * step, T_cw, points) for sign in (1, -1))
+            columns.append((ahead - behind) / (2 * DERIVATIVE_STEPS[name]))
+        return torch.stack(columns, dim=-1)
+
+    def _measured_with(self, names: Sequence[str], values: Tensor) -> tuple[Observations, PinholeCamera]:
+        """Observations as they would have been measured with other parameters, and a camera with these parameters."""
+        of_name = dict(zip(names, values.tolist(), strict=True))
+        readout = of_name.pop("readout", self._readout)
+        camera = with_values(self._camera, of_name)
+        change = camera.inverse_depth_offset - self._camera.inverse_depth_offset
+        uv, scale = _undistort_with_scale(camera, self._pixel)
+        measured = self.observations.inverse_depth
+        observations = replace(
+            self.observations,
+            uv=uv + (readout - self._readout) * self._readout_jacobian,
+            inverse_depth=torch.where(measured > 0, measured + change, 0.0),
+            pixel_sigma=scale * self.observations.pixel_sigma,
+        )
+        return observations, camera
+
+    def _adjust_with_given_camera(self) -> None:
+        adjusted = bundle_adjust(
+            self.T_cw, self.points, self.observations, self._camera, self._fixed, _MAX_STEPS, _TOLERANCE
+        )
+        self.T_cw, self.points = adjusted.T_cw, adjusted.points
+
+    def _with_estimated_noise(self) -> Observations:
+        """The observations with standard deviations that agree with their residuals."""
+        observations = self.observations
+        residuals = self.residuals((), torch.zeros(0), self.T_cw, self.points).abs()
+        depth = residuals[observations.inverse_depth > 0, 2]
+        freedom = math.sqrt(self.residual_count / max(self.residual_count - self.unknown_count, 1))
+        pixel, inverse_depth = (
+            float(errors.median()) * freedom / _NORMAL_MAD if len(errors) else 1.0
+            for errors in (residuals[:, :2].flatten(), depth)
+        )
+        return replace(
+            observations,
+            pixel_sigma=pixel * observations.pixel_sigma,
+            inverse_depth_sigma=inverse_depth * observations.inverse_depth_sigma,
+        )
+
+
+def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Undistort pixels, and return the scale of undistortion around them.
+
+    The noise of the recorded pixels is known, and undistortion scales it. If the scaling were left out, a distortion
+    that shrinks the image would shrink the residuals, too, and always seem to fit better.
+
+    Returns:
+        Undistorted pixels, shape :math:`(N, 2)`, and the square root of the determinant of the Jacobian, shape
+        :math:`(N,)`.
+    """
+    uv = camera.undistort(pixel)
+    by_u, by_v = (camera.undistort(pixel + torch.tensor(step)) - uv for step in ((_SCALE_STEP, 0.0), (0.0, _SCALE_STEP)))
+    determinant = by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0]
+    return uv, determinant.abs().sqrt() / _SCALE_STEP
+
+
+def _damped_step(names: Sequence[str], values: Tensor, at: AdjustedMap, damping: float) -> Tensor:
+    """Values of the parameters after a damped Gauss-Newton step, within their limits."""
+    gradient, hessian = at.gradient.sum(dim=0), at.hessian.sum(dim=0)
+    diagonal = damping * hessian.diagonal() + torch.finfo(torch.float64).tiny
+    values = values - torch.linalg.solve(hessian + diagonal.diag(), gradient)
+    low, high = torch.tensor([LIMITS.get(name, (-torch.inf, torch.inf)) for name in names], dtype=torch.float64).T
+    return values.clamp(low, high)

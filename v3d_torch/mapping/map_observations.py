@@ -1,0 +1,68 @@
+"""Observations of a part of the map, as the input of a bundle adjustment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v3d_torch.config import Config
+from v3d_torch.features.features import pixel_sigma
+from v3d_torch.mapping.bundle_adjustment import Observations
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.tensor_table import unique_ids
+
+
+@dataclass(frozen=True)
+class MapObservations:
+    """Observations of K keyframes and P landmarks of a map.
+
+    Attributes:
+        rows: Rows of the observations in the table of the map, int64, shape :math:`(M,)`.
+        keyframes: Indices of the keyframes, ascending, int64, shape :math:`(K,)`.
+        landmarks: IDs of the landmarks, ascending, int64, shape :math:`(P,)`.
+        observations: The observations; their poses and points are positions in ``keyframes`` and ``landmarks``.
+        readout_jacobian: Derivative of the pixels with respect to the readout, pixels/s, float64, shape :math:`(M, 2)`.
+    """
+
+    rows: Tensor
+    keyframes: Tensor
+    landmarks: Tensor
+    observations: Observations
+    readout_jacobian: Tensor
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def select_observations(tables: MapTables, window: Tensor, config: Config) -> MapObservations:
+    """Select all observations of the active landmarks that some keyframes observe and that are observed twice.
+
+    Args:
+        tables: Data of the map.
+        window: Indices of the keyframes, int64, shape :math:`(W,)`. Other keyframes that observe the same landmarks are
+            included.
+        config: Configuration of the whole system: measurement noise.
+    """
+    # NumPy is faster than torch here.
+    table, count = tables.observations, len(tables.landmarks)
+    keyframe, landmark, valid = (table[name].numpy() for name in ("keyframe", "landmark", "valid"))
+    usable = valid & tables.landmarks["active"].numpy().take(landmark)
+    in_window, observed = np.zeros(len(tables.keyframes), np.bool_), np.zeros(count, np.bool_)
+    in_window[window.numpy()] = True
+    observed[landmark[usable & in_window.take(keyframe)]] = True
+    times = np.bincount(landmark[usable], minlength=count)
+    rows = torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))
+    keyframes, pose = unique_ids(table["keyframe"][rows], len(tables.keyframes))
+    landmarks, point = unique_ids(table["landmark"][rows], count)
+    observations = Observations(
+        uv=table["uv"].index_select(0, rows),
+        inverse_depth=table["inverse_depth"][rows],
+        pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
+        inverse_depth_sigma=config.tracking.inverse_depth_sigma,
+        pose=pose,
+        point=point,
+    )
+    return MapObservations(rows, keyframes, landmarks, observations, table["readout_jacobian"].index_select(0, rows))
