@@ -72,7 +72,8 @@ class RGBDFrame:
                 are accepted.
             depth: Depth registered to the colour image, shape :math:`(H, W)`: metres if floating point, else in the
                 units of the camera; 0 or NaN = no measurement.
-            camera: Camera of both images, which gives the depth units; without a camera they are millimetres.
+            camera: Camera of both images, which gives the units and the correction of whole-number depth; without a
+                camera the units are millimetres.
             depth_delay: Time of the depth image minus time of the colour image, seconds.
 
         Raises:
@@ -106,7 +107,7 @@ class RGBDFrame:
             )
         metres = torch.from_numpy(measured.astype(np.float32))
         if measured.dtype.kind != "f":
-            metres = metres / (camera.depth_scale if camera is not None else 1000)
+            metres = metres / 1000 if camera is None else camera.correct_depth(metres / camera.depth_scale)
         metres = metres.where(metres.isfinite() & (metres > 0), 0.0)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
         return RGBDFrame(

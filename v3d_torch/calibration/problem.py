@@ -69,9 +69,11 @@ class SelfCalibration:
         tables: Data of the map.
         camera: Camera with which the map was built.
         config: Configuration of the run: measurement noise.
+        given: Camera whose values parameters have that are not free; None for the same camera.
         max_keyframes: Maximum number of keyframes, the newest ones; None for all.
 
     Attributes:
+        given: Camera whose values parameters have that are not free.
         observations: Observations of the map, with noise estimated from its residuals.
         T_cw: World-to-camera poses of the keyframes, adjusted with the given camera, float64, shape
             :math:`(K, 4, 4)`.
@@ -79,20 +81,29 @@ class SelfCalibration:
     """
 
     def __init__(
-        self, tables: MapTables, camera: PinholeCamera, config: Config, max_keyframes: int | None = None
+        self,
+        tables: MapTables,
+        camera: PinholeCamera,
+        config: Config,
+        given: PinholeCamera | None = None,
+        max_keyframes: int | None = None,
     ) -> None:
         active = torch.tensor([keyframe.index for keyframe in tables.active_keyframes], dtype=torch.int64)
         window = active if max_keyframes is None else active[-max_keyframes:]
-        selected = select_observations(tables, window, config)
+        selected = select_observations(tables, window, config, with_neighbours=False)
+        self.given = camera if given is None else given
         self._camera, self._readout = camera, tables.readout.seconds
-        self._fixed = ~torch.isin(selected.keyframes, window)
-        self._fixed[:1] = True  # the gauge
+        self._given_readout = self._readout if self.given.readout is None else self.given.readout
+        self._fixed = torch.arange(len(selected.keyframes)) == 0  # the gauge
         self._pixel = camera.distort(selected.observations.uv)  # in the recorded image
         self._readout_jacobian = selected.readout_jacobian
         self.observations = selected.observations
         self.T_cw, self.points = tables.T_cw[selected.keyframes], tables.landmarks["point"][selected.landmarks]
         for _ in range(2):
-            self._adjust_with_given_camera()
+            adjusted = bundle_adjust(
+                self.T_cw, self.points, self.observations, camera, self._fixed, _MAX_STEPS, _TOLERANCE
+            )
+            self.T_cw, self.points = adjusted.T_cw, adjusted.points
             self.observations = self._with_estimated_noise()
 
     @property
@@ -106,8 +117,8 @@ class SelfCalibration:
         return 6 * int((~self._fixed).sum()) + 3 * len(self.points)
 
     def given_values(self, names: Sequence[str]) -> Tensor:
-        """Values of parameters with which the map was built, float64, shape :math:`(C,)`."""
-        return torch.tensor(get_values(self._camera, self._readout, names), dtype=torch.float64)
+        """Values of parameters that are not free, float64, shape :math:`(C,)`; an unknown readout is the map's."""
+        return torch.tensor(get_values(self.given, self._given_readout, names), dtype=torch.float64)
 
     def minimise(self, names: Sequence[str], start: Tensor | None = None) -> tuple[Tensor, AdjustedMap]:
         """Find the values of parameters with the lowest cost.
@@ -130,7 +141,9 @@ class SelfCalibration:
         found = levenberg_marquardt((values, self.T_cw, self.points), linearise, step, _MAX_STEPS, _TOLERANCE)
         return found.state[0], found.system
 
-    def linearise(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> tuple[float, AdjustedMap]:
+    def linearise(
+        self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor
+    ) -> tuple[float, AdjustedMap]:
         """Adjust poses and points for given values of parameters, and differentiate the minimum cost.
 
         Args:
@@ -151,10 +164,7 @@ class SelfCalibration:
 
     def residuals(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
         """Whitened residuals of pixels and inverse depth, float64, shape :math:`(M, 3)`."""
-        observations, camera = self._measured_with(names, values)
-        T = T_cw[observations.pose]
-        in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
-        return whiten(observations, camera).residuals(perspective(in_camera.T)).T
+        return _whitened_residuals(*self._measured_with(names, values), T_cw, points)
 
     def jacobian(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
         """Derivatives of the whitened residuals by the parameters, by central differences, shape :math:`(M, 3, C)`."""
@@ -168,11 +178,11 @@ class SelfCalibration:
     def _measured_with(self, names: Sequence[str], values: Tensor) -> tuple[Observations, PinholeCamera]:
         """Observations as they would have been measured with other parameters, and a camera with these parameters."""
         of_name = dict(zip(names, values.tolist(), strict=True))
-        readout = of_name.pop("readout", self._readout)
-        camera = with_values(self._camera, of_name)
-        change = camera.inverse_depth_offset - self._camera.inverse_depth_offset
+        readout = of_name.pop("readout", self._given_readout)
+        camera = with_values(self.given, of_name)
         uv, scale = _undistort_with_scale(camera, self._pixel)
         measured = self.observations.inverse_depth
+        change = camera.inverse_depth_offset - self._camera.inverse_depth_offset
         observations = replace(
             self.observations,
             uv=uv + (readout - self._readout) * self._readout_jacobian,
@@ -181,16 +191,10 @@ class SelfCalibration:
         )
         return observations, camera
 
-    def _adjust_with_given_camera(self) -> None:
-        adjusted = bundle_adjust(
-            self.T_cw, self.points, self.observations, self._camera, self._fixed, _MAX_STEPS, _TOLERANCE
-        )
-        self.T_cw, self.points = adjusted.T_cw, adjusted.points
-
     def _with_estimated_noise(self) -> Observations:
-        """The observations with standard deviations that agree with their residuals."""
+        """The observations with standard deviations that agree with their residuals in the given map."""
         observations = self.observations
-        residuals = self.residuals((), torch.zeros(0), self.T_cw, self.points).abs()
+        residuals = _whitened_residuals(observations, self._camera, self.T_cw, self.points).abs()
         depth = residuals[observations.inverse_depth > 0, 2]
         freedom = math.sqrt(self.residual_count / max(self.residual_count - self.unknown_count, 1))
         pixel, inverse_depth = (
@@ -204,6 +208,13 @@ class SelfCalibration:
         )
 
 
+def _whitened_residuals(observations: Observations, camera: PinholeCamera, T_cw: Tensor, points: Tensor) -> Tensor:
+    """Whitened residuals of all observations, float64, shape :math:`(M, 3)`."""
+    T = T_cw[observations.pose]
+    in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
+    return whiten(observations, camera).residuals(perspective(in_camera.T)).T
+
+
 def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor, Tensor]:
     """Undistort pixels, and return the scale of undistortion around them.
 
@@ -215,7 +226,8 @@ def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor,
         :math:`(N,)`.
     """
     uv = camera.undistort(pixel)
-    by_u, by_v = (camera.undistort(pixel + torch.tensor(step)) - uv for step in ((_SCALE_STEP, 0.0), (0.0, _SCALE_STEP)))
+    steps = torch.tensor([[_SCALE_STEP, 0.0], [0.0, _SCALE_STEP]])
+    by_u, by_v = (camera.undistort(pixel + step) - uv for step in steps)
     determinant = by_u[:, 0] * by_v[:, 1] - by_u[:, 1] * by_v[:, 0]
     return uv, determinant.abs().sqrt() / _SCALE_STEP
 

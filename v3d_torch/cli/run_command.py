@@ -185,6 +185,8 @@ def _print_summary(
         console.print(stage_table(record))
     for note in evaluation.notes if evaluation is not None else ():
         console.print(f"note: {note}", markup=False)
+    for warning in record.warnings:
+        console.print(f"warning: {warning}", markup=False)
     if record.save_error is not None:
         console.print(f"note: no checkpoint was saved, {record.save_error}", markup=False)
     console.print(f"results: {folder}", markup=False)  # the name can contain brackets

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from v3d_torch.config.validation import first_error
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
+from v3d_torch.geometry.camera import MAX_DEPTH_DELAY, MAX_INVERSE_DEPTH_OFFSET, MAX_READOUT, PinholeCamera
 from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
 from v3d_torch.io.text import read_text
@@ -47,6 +47,8 @@ class _CameraFile(BaseModel):
     distortion: tuple[_Finite, _Finite, _Finite, _Finite, _Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
     readout: Annotated[float, Field(ge=-MAX_READOUT, le=MAX_READOUT)] | None = None
+    depth_delay: Annotated[float, Field(ge=-MAX_DEPTH_DELAY, le=MAX_DEPTH_DELAY)] = 0.0
+    inverse_depth_offset: Annotated[float, Field(ge=-MAX_INVERSE_DEPTH_OFFSET, le=MAX_INVERSE_DEPTH_OFFSET)] = 0.0
 
 
 def load_camera(path_or_name: str | Path) -> PinholeCamera:

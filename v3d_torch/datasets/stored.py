@@ -88,7 +88,7 @@ class StoredSequence(ABC):
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, index {index} is out of range")
         image, depth = self._read(index)
-        stamp = float(self.stamps[index])
+        depth, stamp = self.camera.correct_depth(depth), float(self.stamps[index])
         return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._depth_delays[index])
 
     def check_first_frame(self, source: object) -> None:

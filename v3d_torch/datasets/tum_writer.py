@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.datasets.images import SATURATED_DEPTH
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import OutputError
@@ -39,8 +39,8 @@ class TUMWriter:
         self.folder = folder
         self.camera = camera
         self._written: list[tuple[str, str]] = []
-        fields = asdict(camera) | {"distortion": list(camera.distortion)}
-        write_text(folder / "camera.yaml", yaml.safe_dump(fields, sort_keys=False))
+        corrected = replace(camera, inverse_depth_offset=0.0)  # the depth of the frames is corrected already
+        write_text(folder / "camera.yaml", camera_text(corrected))
         if groundtruth is not None:
             write_trajectory(folder / "groundtruth.txt", groundtruth)
 

@@ -72,7 +72,7 @@ def local_bundle_adjust(
         The result, or None if there are fewer than two keyframes or no observations to adjust.
     """
     window = sparse_map.covisible_keyframes(keyframe.observed_landmarks, config.mapping.bundle_keyframes)
-    selected = select_observations(sparse_map, window, config)
+    selected = select_observations(sparse_map, window, config, with_neighbours=True)
     if len(window) < 2 or len(selected) == 0:
         return None
     T_cw, keyframes = sparse_map.T_cw, selected.keyframes

@@ -37,14 +37,14 @@ class MapObservations:
         return len(self.rows)
 
 
-def select_observations(tables: MapTables, window: Tensor, config: Config) -> MapObservations:
-    """Select all observations of the active landmarks that some keyframes observe and that are observed twice.
+def select_observations(tables: MapTables, window: Tensor, config: Config, *, with_neighbours: bool) -> MapObservations:
+    """Select the observations of the active landmarks that some keyframes observe and that are observed twice.
 
     Args:
         tables: Data of the map.
-        window: Indices of the keyframes, int64, shape :math:`(W,)`. Other keyframes that observe the same landmarks are
-            included.
+        window: Indices of the keyframes, int64, shape :math:`(W,)`.
         config: Configuration of the whole system: measurement noise.
+        with_neighbours: True to include the observations of the same landmarks by other keyframes.
     """
     # NumPy is faster than torch here.
     table, count = tables.observations, len(tables.landmarks)
@@ -52,7 +52,9 @@ def select_observations(tables: MapTables, window: Tensor, config: Config) -> Ma
     usable = valid & tables.landmarks["active"].numpy().take(landmark)
     in_window, observed = np.zeros(len(tables.keyframes), np.bool_), np.zeros(count, np.bool_)
     in_window[window.numpy()] = True
-    observed[landmark[usable & in_window.take(keyframe)]] = True
+    by_window = usable & in_window.take(keyframe)
+    observed[landmark[by_window]] = True
+    usable = usable if with_neighbours else by_window
     times = np.bincount(landmark[usable], minlength=count)
     rows = torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))
     keyframes, pose = unique_ids(table["keyframe"][rows], len(tables.keyframes))

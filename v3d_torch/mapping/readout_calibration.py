@@ -49,15 +49,13 @@ def calibrate_readout(
     if not _is_due(sparse_map, config) or current.is_certain:
         return current
     active = torch.tensor([keyframe.index for keyframe in sparse_map.active_keyframes])
-    selected = select_observations(sparse_map, active[-_MAX_KEYFRAMES:], config)
-    fixed = ~torch.isin(selected.keyframes, active[-_MAX_KEYFRAMES:])
-    fixed[0] = True
+    selected = select_observations(sparse_map, active[-_MAX_KEYFRAMES:], config, with_neighbours=False)
     gradient, hessian = reduced_cost_derivatives(
         adjustment.T_cw[selected.keyframes],
         adjustment.points_of(sparse_map)[selected.landmarks],
         selected.observations,
         camera,
-        fixed,
+        torch.arange(len(selected.keyframes)) == 0,  # the gauge
         whitened_readout_jacobian(selected),
     )
     readout = combine(Readout.from_camera(camera, config.rolling_shutter), current.seconds, gradient, hessian)

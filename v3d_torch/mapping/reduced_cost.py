@@ -83,4 +83,8 @@ def reduced_cost_derivatives(
     pose = observations.pose[problem.order]
     gradient = torch.einsum("cim,im->mc", weighted, residuals.whitened)
     hessian = torch.einsum("cim,dim->mcd", weighted, remaining)
-    return tuple(each.new_zeros(len(T_cw), *each.shape[1:]).index_add_(0, pose, each) for each in (gradient, hessian))
+    K, C = len(T_cw), len(columns)
+    return (
+        gradient.new_zeros(K, C).index_add_(0, pose, gradient),
+        hessian.new_zeros(K, C, C).index_add_(0, pose, hessian),
+    )

@@ -23,11 +23,13 @@ class StaticView:
         depth_units: Depth in units of `StaticViews.UNIT`, 0 = no measurement or not static, uint16,
             shape :math:`(h, w)`.
         colour: RGB, uint8, shape :math:`(3, h, w)`.
+        depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
     """
 
     keyframe: Keyframe
     depth_units: Tensor
     colour: Tensor
+    depth_delay: float = 0.0
 
     @property
     def T_cw(self) -> Tensor:
@@ -90,7 +92,7 @@ class StaticViews:
     def __iter__(self) -> Iterator[StaticView]:
         return iter(self._views)
 
-    def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor) -> None:
+    def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor, depth_delay: float = 0.0) -> None:
         """Store the static pixels of a keyframe as a view.
 
         Args:
@@ -98,11 +100,12 @@ class StaticViews:
             image: RGB image, uint8, shape :math:`(3, H, W)`.
             depth: Depth image, metres, shape :math:`(1, H, W)`.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
+            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
         """
         units = (depth[0, self._v, self._u] / self.UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
         units = torch.where(keep, units, 0).to(torch.uint16)
-        self.append(StaticView(keyframe, units, image[:, self._v, self._u]))
+        self.append(StaticView(keyframe, units, image[:, self._v, self._u], depth_delay))
 
     def append(self, view: StaticView) -> None:
         """Append a view, and remove the views of keyframes that were culled.

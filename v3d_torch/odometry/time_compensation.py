@@ -20,6 +20,7 @@ class TimeCompensation:
     """
 
     def __init__(self, config: Config, camera: PinholeCamera) -> None:
+        self._depth_delay = camera.depth_delay
         self._compensate_depth_delay = DepthDelayCompensation(config, camera)
         self._compensate_rolling_shutter = RollingShutterCompensation(camera)
 
@@ -31,10 +32,11 @@ class TimeCompensation:
         Args:
             features: Features as observed, or compensated with the same readout and another velocity.
             depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            depth_delay: Time of the depth image minus time of the colour image, seconds.
+            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds; the
+                camera's own delay is added.
             velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
             readout: Readout of the camera.
         """
-        features = self._compensate_depth_delay(features, depth, velocity, depth_delay)
+        features = self._compensate_depth_delay(features, depth, velocity, depth_delay + self._depth_delay)
         return self._compensate_rolling_shutter(features, velocity, readout)

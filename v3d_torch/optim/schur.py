@@ -6,8 +6,9 @@ With the free poses first and the points second, :math:`H = J^T W J` has the blo
     \begin{pmatrix} U & W^T \\ W & V \end{pmatrix}
     \begin{pmatrix} \xi \\ \delta \end{pmatrix} = - \begin{pmatrix} g_{pose} \\ g_{point} \end{pmatrix}
 
-for one or several right-hand sides, with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points are eliminated; the reduced camera
-system, 6 unknowns per pose, is solved densely (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
+for one or several right-hand sides, with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points
+are eliminated; the reduced camera system, 6 unknowns per pose, is solved densely (Triggs et al., Bundle Adjustment - A
+Modern Synthesis, 2000).
 """
 
 from __future__ import annotations

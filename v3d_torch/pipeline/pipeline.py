@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import torch
 
+from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
@@ -33,6 +34,10 @@ _SNAPSHOTS = 6
 
 _TRIM_INTERVAL = 200
 """Frames between two calls of `trim_memory`, which takes some milliseconds."""
+
+_CHECKED_KEYFRAMES = 15
+"""Number of keyframes at which camera and depth are first checked: some seconds of a moving camera. They are checked
+again at the end."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
@@ -165,8 +170,9 @@ class Pipeline:
 
     @torch.inference_mode()
     def flush(self) -> None:
-        """Apply the pending result of the back end and show the final state; call this after the last frame."""
+        """Apply the pending result of the back end, check the camera and show the final state, after the last frame."""
         self.slam.flush()
+        self._check_plausibility()
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:
@@ -196,8 +202,21 @@ class Pipeline:
             write_png(self._masks / f"{frame.stamp:.6f}.png", masked.numpy())
         keyframes = self.slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
-            self.views.add(keyframes[-1], frame.image, frame.depth, result.static_without_people)
+            static = result.static_without_people
+            self.views.add(keyframes[-1], frame.image, frame.depth, static, frame.depth_delay)
+            if len(self.views) >= _CHECKED_KEYFRAMES and not self.record.was_checked:
+                self._check_plausibility()
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
+
+    def _check_plausibility(self) -> None:
+        """Check whether camera and depth agree with the map so far, and record what does not."""
+        slam, record = self.slam, self.record
+        with slam.timer("plausibility"):
+            warnings = check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config)
+        for warning in warnings:
+            if warning not in record.warnings:
+                _LOG.warning(warning)
+        record.warnings, record.was_checked = warnings, True
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
         """Keep the most dynamic frame, and frames at equal intervals, which grow with the length of a live stream."""

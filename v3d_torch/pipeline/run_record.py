@@ -142,6 +142,8 @@ class RunRecord:
         interrupted: True if the user interrupted the run.
         mask_error: Reason why the masks were not evaluated although there are true masks; None if there is none.
         save_error: Reason why a checkpoint could not be written; None if there is none.
+        warnings: Contradictions between the images and the camera, one sentence each, from the latest check.
+        was_checked: True once the map had enough keyframes for the first check of the camera.
     """
 
     times: FrameTimes = field(default_factory=FrameTimes)
@@ -154,3 +156,5 @@ class RunRecord:
     interrupted: bool = False
     mask_error: str | None = None
     save_error: str | None = None
+    warnings: list[str] = field(default_factory=list)
+    was_checked: bool = False

@@ -88,7 +88,7 @@ def run_with_progress(
         sequence = run.pipeline.sequence
         total = len(sequence) if isinstance(sequence, Sized) else None
         done = 0 if checkpoint is None else checkpoint.frames
-        evaluation = run(_TrackingBar(progress, total, interrupted, done))
+        evaluation = run(TrackingBar(progress, total, interrupted, done))
     run.pipeline.record.interrupted |= interrupted.is_set()  # also after the last frame, while results were written
     return run.pipeline, evaluation
 
@@ -151,17 +151,32 @@ class ProgressBar:
         self._progress.update(self._task, completed=done, total=total)
 
 
-class _TrackingBar:
-    """Progress bar of a run: frame rate, tracking status and moving objects."""
+class TrackingBar:
+    """Progress bar of a run: frame rate, tracking status and moving objects.
 
-    def __init__(self, progress: Progress, frames: int | None, interrupted: Event, done: int) -> None:
+    Args:
+        progress: Progress bars of the console.
+        frames: Number of frames; None for a live stream.
+        interrupted: Event that ends the run after the current frame.
+        done: Number of frames processed earlier.
+        description: Text to the left of the bar.
+    """
+
+    def __init__(
+        self, progress: Progress, frames: int | None, interrupted: Event, done: int = 0, description: str = "tracking"
+    ) -> None:
         self._progress = progress
         self._interrupted = interrupted
-        self._task = progress.add_task("tracking", total=frames, completed=done, note="starting")
+        self._task = progress.add_task(description, total=frames, completed=done, note="starting")
         self._start: float | None = None
         self._frames = 0
 
     def __call__(self, frame: RGBDFrame, result: FrameResult) -> None:
+        """Update the bar after a frame.
+
+        Raises:
+            KeyboardInterrupt: If the run was interrupted.
+        """
         now, note = time.perf_counter(), f"{result.status.value}  {describe_motion(result)}"
         if self._start is None:
             self._start = now  # the first frame is not counted, because it waits for the network

@@ -179,6 +179,8 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
+        "readout_sigma": slam.map.readout.sigma,
+        "warnings": run.warnings,
         "failure": failure,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,

@@ -100,10 +100,8 @@ class RealSenseStream:
             )
         # librealsense reuses the memory of both images: convert_to_rgb and depth_to_metres copy it.
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOUR_ENCODINGS[encoding][0])
-        units = np.asanyarray(depth.get_data())
-        return RGBDFrame(
-            index, stamp, convert_to_rgb(encoding, pixels), depth_to_metres(units, depth_scale), camera=self.camera
-        )
+        metres = self.camera.correct_depth(depth_to_metres(np.asanyarray(depth.get_data()), depth_scale))
+        return RGBDFrame(index, stamp, convert_to_rgb(encoding, pixels), metres, camera=self.camera)
 
 
 def open_realsense_camera(name: str, camera: CameraChoice = None, *, fps: float | None = None) -> RealSenseStream:

@@ -1,0 +1,99 @@
+"""Calibration of a camera from a finished run: intrinsics, depth, readout and delay, each with its uncertainty."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from v3d_torch.calibration.edge_alignment import EdgeAlignment
+from v3d_torch.calibration.metric_scale import metric_scale
+from v3d_torch.calibration.parameters import with_values
+from v3d_torch.calibration.problem import SelfCalibration
+from v3d_torch.calibration.selection import Estimate, ParameterSelection, decide
+from v3d_torch.config import Config
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.types import Trajectory
+
+_DELAY_TOLERANCE = 0.003
+"""Largest accepted standard deviation of the depth delay, seconds: 3 pixels of an image that moves by 1000 pixels per
+second."""
+
+_SCALE_TOLERANCE = 0.01
+"""Largest accepted relative standard deviation of the depth scale."""
+
+_MAX_SHIFT = 0.01
+"""Largest shift between depth and colour at which their delay is estimated, relative to the width of the image."""
+
+_MIN_VIEWS = 5
+"""Smallest number of views from which the depth delay is estimated."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibrated camera.
+
+    Attributes:
+        camera: The given camera with the values that were taken.
+        estimates: Estimates of all parameters.
+    """
+
+    camera: PinholeCamera
+    estimates: tuple[Estimate, ...]
+
+
+def calibrate_camera(
+    tables: MapTables,
+    views: StaticViews,
+    trajectory: Trajectory,
+    groundtruth: Trajectory | None,
+    camera: PinholeCamera,
+    given: PinholeCamera,
+    config: Config,
+) -> Calibration:
+    """Estimate the parameters of a camera from a run, and take those that the recording tells.
+
+    Args:
+        tables: Data of the map of the run.
+        views: Static views of its keyframes.
+        trajectory: Poses of all frames.
+        groundtruth: Measured poses in metres, which tell the depth scale; None if there are none.
+        camera: Camera with which the run was made.
+        given: Camera as it was given; its values are kept where the recording tells no others.
+        config: Configuration of the run.
+    """
+    estimates = [
+        *ParameterSelection(SelfCalibration(tables, camera, config, given)).estimates,
+        _estimate_delay(views, trajectory, camera, given),
+        _estimate_scale(groundtruth, trajectory, camera, given),
+    ]
+    taken = {each.name: each.value for each in estimates if each.taken}
+    return Calibration(with_values(given, taken), tuple(estimates))
+
+
+def _estimate_delay(
+    views: StaticViews, trajectory: Trajectory, camera: PinholeCamera, given: PinholeCamera
+) -> Estimate:
+    """Estimate the delay of depth from occlusion boundaries and edges of the colour images."""
+    alignment = EdgeAlignment(views, trajectory, camera.depth_delay)
+    value, sigma = math.nan, math.inf
+    if len(alignment) >= _MIN_VIEWS:
+        starts = alignment.search(), torch.zeros(3, dtype=torch.float64)
+        found = max(map(alignment.refine, starts), key=lambda each: alignment.total_score(each.values))
+        # A larger shift means that the depth is not registered, or that other edges fit by chance.
+        if float(found.values[:2].norm()) < _MAX_SHIFT * camera.width:
+            value, sigma = camera.depth_delay + float(found.values[2]), float(found.sigma[2])
+    return decide("depth_delay", given.depth_delay, value, sigma, _DELAY_TOLERANCE)
+
+
+def _estimate_scale(
+    groundtruth: Trajectory | None, trajectory: Trajectory, camera: PinholeCamera, given: PinholeCamera
+) -> Estimate:
+    """Estimate the depth scale from measured poses."""
+    measured = None if groundtruth is None else metric_scale(groundtruth, trajectory)
+    ratio, sigma = (math.nan, math.inf) if measured is None else measured
+    value = camera.depth_scale / ratio
+    return decide("depth_scale", given.depth_scale, value, value * sigma / ratio, _SCALE_TOLERANCE * given.depth_scale)

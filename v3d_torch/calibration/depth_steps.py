@@ -1,0 +1,53 @@
+"""Steps of the depth images of cameras that measure disparity in whole steps.
+
+A camera with structured light measures disparity in steps of a fraction of a pixel. Inverse depth then has equal steps:
+the step of disparity divided by focal length and baseline of the sensor (Khoshelham and Elberink, Accuracy and
+Resolution of Kinect Depth Data, Sensors 2012). So these images contain a length, the baseline.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_BIN = 5e-5
+"""Width of the bins of inverse depth, 1/m: a tenth of the finest step, and of a millimetre at 1.5 m."""
+
+_MAX_INVERSE_DEPTH = 8.0
+"""Largest inverse depth, 1/m: a depth of 0.125 m."""
+
+_MIN_STEP, _MAX_STEP = 4e-4, 2e-2
+"""Range of the steps that are searched, 1/m."""
+
+_MIN_STRENGTH = 0.25
+"""Smallest strength of steps, 1 = all measurements lie on them. Depth without steps has less than 0.05."""
+
+_HARMONIC = 0.5
+"""Steps of a fraction of the true step fit as well. The true one is the largest with this fraction of the best
+strength."""
+
+
+def disparity_step(depth: Tensor) -> float | None:
+    """Find the step of inverse depth in depth images.
+
+    Args:
+        depth: Depth of many pixels, metres, any shape; 0 = no measurement.
+
+    Returns:
+        Step, 1/m; None if the depth has no such steps.
+    """
+    inverse = 1 / depth[depth > 0].to(torch.float64)
+    inverse = inverse[inverse < _MAX_INVERSE_DEPTH]
+    if len(inverse) == 0:
+        return None
+    size = round(_MAX_INVERSE_DEPTH / _BIN)
+    histogram = torch.bincount((inverse / _BIN).long(), minlength=size).to(torch.float64)
+    strength = torch.fft.rfft(histogram).abs() / len(inverse)  # cycles per _MAX_INVERSE_DEPTH
+    cycles = torch.arange(len(strength))
+    searched = (cycles >= _MAX_INVERSE_DEPTH / _MAX_STEP) & (cycles <= _MAX_INVERSE_DEPTH / _MIN_STEP)
+    strength = strength.where(searched, 0.0)
+    if float(strength.max()) < _MIN_STRENGTH:
+        return None
+    first = int(torch.nonzero(strength >= _HARMONIC * strength.max())[0, 0])
+    around = strength[first : first + max(first // 50, 2)]  # the top of the first peak
+    return _MAX_INVERSE_DEPTH / (first + int(around.argmax()))

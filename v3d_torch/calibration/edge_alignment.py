@@ -1,0 +1,265 @@
+r"""Registration and delay of the depth image, from its occlusion boundaries and the edges of the colour image.
+
+An occlusion boundary mostly is an edge of the colour image, too. If the depth image is shifted against the colour
+image, so are its boundaries: by a constant shift if it is not registered, and by the image motion meanwhile if it was
+taken at another time. Both are found where most boundaries lie on edges (cf. Levinson and Thrun, Automatic Online
+Calibration of Cameras and Lasers, RSS 2013). A single view has many edges that are no boundaries, but these lie
+elsewhere in each view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from v3d_torch.calibration.view_edges import ViewEdges, find_edges
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.optim.jackknife import jackknife_covariance
+from v3d_torch.types import Trajectory
+
+_MIN_BOUNDARIES = 100
+"""Minimum number of boundaries of a view; with fewer, chance decides where they fit."""
+
+_SHIFTS = 48
+"""Largest shift of the coarse search, frame pixels, along both axes."""
+
+_DELAYS = torch.arange(-12, 13, dtype=torch.float64) / 100
+"""Delays of the coarse search, seconds."""
+
+_REACH = 64
+"""Largest displacement by shift and delay together, frame pixels; farther ones do not count in the coarse search."""
+
+_STEPS = torch.tensor([1.0, 1.0, 0.003], dtype=torch.float64)
+"""Steps of the finite differences by shift (frame pixels) and delay (seconds): small beside the blur of the edges."""
+
+_MAX_NEWTON_STEPS = 20
+_CONVERGED = 0.05
+"""Newton steps end below this fraction of the steps above."""
+
+_MIN_RATIO = 1.5
+"""Smallest ratio of two scores for one to be better: edges other than those of the boundaries give no more."""
+
+_MIN_T = 3.0
+"""Smallest t-statistic of the difference between two scores, over views and over parts of the image."""
+
+_PARTS = 4
+"""Number of parts of the image in each direction."""
+
+_MIN_PART = 0.01
+"""Smallest fraction of the boundaries in a part of the image that is counted."""
+
+_MIN_SAMPLES = 4
+"""Smallest number of views or parts for a test."""
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """Shift and delay with which most boundaries lie on edges.
+
+    Attributes:
+        values: Shift of the colour image against the depth image along u and v (frame pixels), and delay of the depth
+            image in addition to the assumed one (seconds), float64, shape :math:`(3,)`.
+        covariance: Covariance of the values, by the jackknife over views, shape :math:`(3, 3)`.
+    """
+
+    values: Tensor
+    covariance: Tensor
+
+    @property
+    def sigma(self) -> Tensor:
+        """Standard deviations of the values, shape :math:`(3,)`."""
+        return self.covariance.diagonal().clamp(min=0).sqrt()
+
+
+class EdgeAlignment:
+    """Search for the shift and the delay of the depth images of a run.
+
+    Args:
+        views: Static views of the keyframes. Views of an earlier run are left out.
+        trajectory: Poses of all frames.
+        depth_delay: Delay of all depth images in addition to that of their timestamps, seconds.
+        max_views: Maximum number of views, evenly spread over the run; None for all.
+    """
+
+    def __init__(
+        self, views: StaticViews, trajectory: Trajectory, depth_delay: float, max_views: int | None = None
+    ) -> None:
+        own = [view for view in views if not view.keyframe.is_from_earlier_run]
+        step = 1 if max_views is None else max(-(-len(own) // max_views), 1)
+        pairs = [(view, find_edges(view.colour, view.depth, views.stride)) for view in own[::step]]
+        pairs = [(view, edges) for view, edges in pairs if len(edges.axis) >= _MIN_BOUNDARIES]
+        self._camera, self._stride, self._trajectory = views.camera, views.stride, trajectory
+        self._edges = [edges for _, edges in pairs]
+        self._stamp = torch.tensor([view.keyframe.stamp for view, _ in pairs], dtype=torch.float64)
+        delays = torch.tensor([view.depth_delay + depth_delay for view, _ in pairs], dtype=torch.float64)
+        self._depth_stamp = self._stamp + delays
+        if not pairs:
+            return
+        self._T_cw = _poses_at(trajectory, self._stamp)
+        self._pixel, depth, self._axis = (
+            torch.cat([getattr(edges, name) for edges in self._edges]) for name in ("pixel", "depth", "axis")
+        )
+        self._points = views.camera.back_project(self._pixel, depth)
+        counts = torch.tensor([len(edges.axis) for edges in self._edges])
+        self._view = torch.arange(len(counts)).repeat_interleave(counts)
+        self._gradients = torch.stack([edges.gradients for edges in self._edges])  # (K, 2, h, w)
+
+    def __len__(self) -> int:
+        """Number of views with boundaries."""
+        return len(self._edges)
+
+    def search(self) -> Tensor:
+        """Find the best shift and delay on a coarse grid, as in `Misalignment`."""
+        reach, shifts = _REACH // self._stride, torch.arange(-(_SHIFTS // self._stride), _SHIFTS // self._stride + 1)
+        maps = torch.stack([_correlation(edges, reach) for edges in self._edges])
+        maps = pad(maps, (1, 1, 1, 1))  # beyond the reach, the mean: 0
+        motion = torch.stack([self._mean_motion(float(delay)) for delay in _DELAYS])  # (T, K, 2)
+        index = (motion[..., None] + shifts).round().long().clamp(-reach - 1, reach + 1) + reach + 1
+        column, row = index[:, :, 0, None, :], index[:, :, 1, :, None]
+        view = torch.arange(len(maps))[None, :, None, None]
+        total = maps[view, row, column].sum(dim=1)  # (T, shift v, shift u)
+        t, v, u = np.unravel_index(int(total.argmax()), total.shape)
+        return torch.stack([shifts[u] * self._stride, shifts[v] * self._stride, _DELAYS[t]]).to(torch.float64)
+
+    def refine(self, start: Tensor, free: Sequence[int] = (0, 1, 2)) -> Misalignment:
+        """Find the local maximum of the scores by Newton steps.
+
+        Args:
+            start: Initial values, as in `Misalignment`.
+            free: Indices of the values that change.
+        """
+        values, index = start.clone(), torch.tensor(free)
+        gradient, hessian = self._derivatives(values, index)
+        score = self.total_score(values)
+        for _ in range(_MAX_NEWTON_STEPS):
+            step = _ascent_step(gradient.sum(dim=0), hessian.sum(dim=0))
+            while step.abs().max() > _CONVERGED:
+                moved = values.index_add(0, index, step * _STEPS[index])
+                if (new := self.total_score(moved)) > score:
+                    break
+                step = step / 2
+            else:
+                break
+            values, score = moved, new
+            gradient, hessian = self._derivatives(values, index)
+        covariance, units = torch.zeros(3, 3, dtype=torch.float64), _STEPS[index]
+        covariance[index[:, None], index] = jackknife_covariance(-gradient, -hessian) * units[:, None] * units
+        return Misalignment(values, covariance)
+
+    def total_score(self, values: Tensor) -> float:
+        """Sum of the normalised gradients at all boundaries, moved by a shift and a delay as in `Misalignment`."""
+        return float(self._scores(values).sum())
+
+    def is_better(self, values: Tensor, other: Tensor) -> bool:
+        """Check whether more boundaries lie on edges with some values than with others, beyond chance.
+
+        Edges of one object can fit by chance in all views that show it, and those of one view in all its parts.
+        Therefore most views and most parts of the image have to agree, each in a t-test.
+
+        Args:
+            values: Values that should be better, as in `Misalignment`.
+            other: Values to compare with.
+        """
+        score, compared = self._scores(values), self._scores(other)
+        if score.sum() < _MIN_RATIO * compared.sum():
+            return False
+        height, width = self._gradients.shape[2:]
+        cell = (self._pixel * _PARTS / torch.tensor([width, height])).long().clamp(0, _PARTS - 1)
+        groups = self._view, cell[:, 1] * _PARTS + cell[:, 0]
+        return all(_t_statistic(_group_means(score - compared, group)) > _MIN_T for group in groups)
+
+    def _scores(self, values: Tensor) -> Tensor:
+        """Normalised gradient at each boundary after it is moved, (E,)."""
+        moved = self._at_time_of_colour(float(values[2])) + values[:2] / self._stride
+        height, width = self._gradients.shape[2:]
+        limit = torch.tensor([width - 1, height - 1], dtype=torch.float64)
+        moved = moved.clamp(torch.zeros_like(limit), limit)
+        corner = moved.long().clamp(max=limit.long() - 1)
+        (a, b), (column, row) = (moved - corner).unbind(dim=1), corner.unbind(dim=1)
+        top, bottom = (
+            (1 - a) * self._gradients[self._view, self._axis, row + k, column]
+            + a * self._gradients[self._view, self._axis, row + k, column + 1]
+            for k in (0, 1)
+        )
+        return (1 - b) * top + b * bottom
+
+    def _at_time_of_colour(self, delay: float) -> Tensor:
+        """Pixels of the boundaries at the time of the colour image, if depth has an additional delay, (E, 2)."""
+        T_cd = self._T_cw @ invert(_poses_at(self._trajectory, self._depth_stamp + delay))
+        R, t = T_cd[self._view, :3, :3], T_cd[self._view, :3, 3]
+        return self._camera.project((R @ self._points[..., None])[..., 0] + t)
+
+    def _mean_motion(self, delay: float) -> Tensor:
+        """Mean motion of the boundaries from depth to colour image, for each view, (K, 2)."""
+        motion = self._at_time_of_colour(delay) - self._pixel
+        return torch.stack([_group_means(component, self._view) for component in motion.T], dim=1)
+
+    def _derivatives(self, values: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+        """First (K, C) and second derivatives (K, C, C) of the score of each view, in units of the steps."""
+
+        def of_views(*moves: tuple[int, int]) -> Tensor:
+            moved = values.clone()
+            for i, sign in moves:
+                moved[index[i]] += sign * _STEPS[index[i]]
+            return torch.bincount(self._view, weights=self._scores(moved), minlength=len(self))
+
+        count, centre = len(index), of_views()
+        gradient = torch.zeros(len(self), count, dtype=torch.float64)
+        hessian = torch.zeros(len(self), count, count, dtype=torch.float64)
+        for i in range(count):
+            ahead, behind = of_views((i, 1)), of_views((i, -1))
+            gradient[:, i], hessian[:, i, i] = (ahead - behind) / 2, ahead - 2 * centre + behind
+            for j in range(i):
+                same, opposite = (of_views((i, 1), (j, k)) + of_views((i, -1), (j, -k)) for k in (1, -1))
+                hessian[:, i, j] = hessian[:, j, i] = (same - opposite) / 4
+        return gradient, hessian
+
+
+def _group_means(values: Tensor, group: Tensor) -> Tensor:
+    """Means of values by group, without groups that have hardly any."""
+    counts = torch.bincount(group)
+    means = torch.bincount(group, weights=values) / counts
+    return means[counts > _MIN_PART * len(group)]
+
+
+def _t_statistic(values: Tensor) -> float:
+    """Mean of values divided by its standard error; 0 for so few values that chance decides."""
+    if len(values) < _MIN_SAMPLES:
+        return 0.0
+    return float(values.mean() / (values.std() / math.sqrt(len(values))).clamp(min=1e-12))
+
+
+def _ascent_step(gradient: Tensor, hessian: Tensor) -> Tensor:
+    """Newton step towards a maximum, with directions of positive curvature turned uphill; at most one unit long."""
+    curvature, directions = torch.linalg.eigh(hessian)
+    step = directions @ (directions.T @ gradient / curvature.abs().clamp(min=1e-9))
+    return step / max(float(step.abs().max()), 1.0)
+
+
+def _poses_at(trajectory: Trajectory, stamps: Tensor) -> Tensor:
+    """World-to-camera poses at given times, interpolated between the nearest frames, (K, 4, 4)."""
+    known = trajectory.stamps
+    after = torch.searchsorted(known, stamps).clamp(1, len(known) - 1)
+    fraction = ((stamps - known[after - 1]) / (known[after] - known[after - 1])).clamp(0, 1)
+    first, second = (invert(trajectory.T_wc[index]) for index in (after - 1, after))
+    return se3_exp(fraction[:, None] * se3_log(second @ invert(first))) @ first
+
+
+def _correlation(edges: ViewEdges, reach: int) -> Tensor:
+    """Sum of the gradients at all boundaries after they are moved by (v, u) in [-reach, reach], by FFT."""
+    height, width = edges.gradients.shape[1:]
+    size = (height + reach, width + reach)
+    column, row = edges.pixel.long().unbind(dim=1)
+    boundaries = torch.zeros_like(edges.gradients)
+    boundaries[edges.axis, row, column] = 1.0
+    spectra = [torch.fft.rfft2(each, s=size) for each in (boundaries, edges.gradients)]
+    correlation = torch.fft.irfft2((spectra[0].conj() * spectra[1]).sum(dim=0), s=size)
+    index = torch.arange(-reach, reach + 1)
+    return correlation[index[:, None], index]

@@ -1,0 +1,39 @@
+"""Depth scale from measured poses. Images alone do not tell it: a room of half the size gives the same images."""
+
+from __future__ import annotations
+
+import torch
+
+from v3d_torch.evaluation.association import associate_trajectories
+from v3d_torch.evaluation.ate import align, spans_plane
+from v3d_torch.optim.jackknife import jackknife_covariance
+from v3d_torch.types import Trajectory
+
+_MIN_PAIRS = 10
+"""Minimum number of pairs of poses."""
+
+
+def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, float] | None:
+    """Size of a measured trajectory relative to an estimated one (Umeyama, PAMI 1991).
+
+    Args:
+        groundtruth: Measured poses, in metres.
+        estimate: Estimated poses, in the metres of the depth images.
+
+    Returns:
+        Ratio and its standard deviation, by the jackknife over blocks of time; None if the trajectories have too few
+        common poses, or if the positions do not span a plane.
+    """
+    matches = associate_trajectories(groundtruth, estimate)
+    if len(matches) < _MIN_PAIRS:
+        return None
+    T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
+    if not spans_plane(T_gc[:, :3, 3]):
+        return None
+    aligned = align(T_gc, T_ec).T_ge @ T_ec
+    measured, estimated = (T[:, :3, 3] - T[:, :3, 3].mean(dim=0) for T in (T_gc, aligned))
+    squared = estimated.square().sum(dim=1)
+    scale = float((measured * estimated).sum() / squared.sum())
+    gradient = -2 * (estimated * (measured - scale * estimated)).sum(dim=1)
+    variance = jackknife_covariance(gradient[:, None], 2 * squared[:, None, None])
+    return scale, float(torch.sqrt(variance[0, 0]))

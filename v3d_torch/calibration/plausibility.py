@@ -1,0 +1,169 @@
+"""Plausibility of the camera and of the depth images, without ground truth.
+
+Each check compares the images with themselves or with a property of all scenes or sensors, and warns only if they
+contradict the camera significantly.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from v3d_torch.calibration.depth_steps import disparity_step
+from v3d_torch.calibration.edge_alignment import EdgeAlignment
+from v3d_torch.calibration.problem import SelfCalibration
+from v3d_torch.calibration.selection import covariance
+from v3d_torch.config import Config
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.types import Trajectory
+
+_MAX_VIEWS = 12
+"""Maximum number of views that are compared with each other: enough for a test, and a fraction of a second."""
+
+_MIN_SHIFT = 0.01
+"""Smallest shift of depth that is reported, relative to the width of the image: 6 pixels of 640. Registration by
+a driver is accurate to a third of that."""
+
+_MIN_DELAY = 0.05
+"""Smallest delay of depth that is reported, seconds: more than half a frame period, within which cameras without
+synchronisation stay."""
+
+_MIN_FOCAL_CHANGE = 0.15
+"""Smallest relative error of the focal length that is reported: cameras of one model differ by a tenth of that."""
+
+_SIGNIFICANCE = 3.0
+"""Standard deviations by which an estimate has to differ from the camera beyond the limits above."""
+
+_KINECT_STEP = 0.0029
+"""Step of inverse depth of the Kinect and of other cameras with its sensor (Xtion, Structure), 1/m: an eighth of a
+pixel, divided by a focal length of 575 pixels and a baseline of 0.075 m."""
+
+_STEP_TOLERANCE = 1.14
+"""Accepted ratio of the steps to those of a Kinect, and its inverse."""
+
+_MAX_STEP_RATIO = 1.5
+"""Finer steps than those of a Kinect divided by this are those of other cameras."""
+
+_KINECT_FOCAL_LENGTHS = (0.75, 1.0)
+"""Focal length of cameras with the sensor of the Kinect, relative to the width of the image."""
+
+_MIN_VIEWS = 5
+"""Smallest number of keyframes for a check."""
+
+_DEPTH_VIEWS = 4
+"""Number of views whose depth is examined."""
+
+_FAR = (2.5, 12.0)
+"""Depth that 99% and 1% of the measurements exceed if the depth is too large, metres: RGB-D cameras measure up to about
+10 m."""
+
+_NEAR = 0.3
+"""Depth that half of the measurements do not reach if the depth is too small, metres: most RGB-D cameras do not measure
+below it."""
+
+
+def check_plausibility(
+    tables: MapTables, views: StaticViews, trajectory: Trajectory, camera: PinholeCamera, config: Config
+) -> list[str]:
+    """Check whether the camera and the depth images agree with a map that was built with them.
+
+    Args:
+        tables: Data of the map.
+        views: Static views of its keyframes.
+        trajectory: Poses of all frames so far.
+        camera: Camera of the frames.
+        config: Configuration of the run.
+
+    Returns:
+        One sentence with the likely cause for each contradiction.
+    """
+    registration = _check_registration(views, trajectory, camera)
+    # Depth that belongs to other pixels makes any focal length fit badly.
+    focal_length = [] if registration else _check_focal_length(tables, camera, config)
+    return [*_check_depth_scale(views, camera), *registration, *focal_length]
+
+
+def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
+    """Compare depth with the range of RGB-D cameras, and its steps with those of the Kinect."""
+    own = [view for view in views if not view.keyframe.is_from_earlier_run]
+    depth = torch.cat(
+        [torch.zeros(0), *(view.depth[view.depth > 0] for view in own[:: -(-len(own) // _DEPTH_VIEWS) or 1])]
+    )
+    if not len(depth):
+        return []
+    ratio = _kinect_step_ratio(depth, camera)
+    if ratio is not None and not 1 / _STEP_TOLERANCE < ratio < _STEP_TOLERANCE:
+        return [
+            f"the steps of the depth images are {ratio:.3g} times those of a Kinect or Xtion, whose field of view the"
+            f" camera has; the depth_scale {camera.depth_scale:g} seems to be {ratio:.3g} times too large"
+            if ratio > 1
+            else f"the steps of the depth images are {ratio:.3g} times those of a Kinect or Xtion, whose field of view"
+            f" the camera has; the depth_scale {camera.depth_scale:g} seems to be {1 / ratio:.3g} times too small"
+        ]
+    low, median, high = (float(depth.quantile(q)) for q in (0.01, 0.5, 0.99))
+    if low > _FAR[0] and high > _FAR[1]:
+        return [
+            f"the depth images range from {low:.2g} to {high:.2g} m, but RGB-D cameras measure up to about 10 m; the"
+            f" depth_scale {camera.depth_scale:g} seems to be too small"
+        ]
+    if median < _NEAR:
+        return [
+            f"half of the depth is nearer than {median:.2g} m, where most RGB-D cameras do not measure; the depth_scale"
+            f" {camera.depth_scale:g} seems to be too large"
+        ]
+    return []
+
+
+def _kinect_step_ratio(depth: Tensor, camera: PinholeCamera) -> float | None:
+    """Steps of the depth relative to those of a Kinect; None for another camera, or if there are no steps."""
+    low, high = _KINECT_FOCAL_LENGTHS
+    if not low < camera.fx / camera.width < high:
+        return None
+    step = disparity_step(depth)
+    return None if step is None or step * _MAX_STEP_RATIO < _KINECT_STEP else step / _KINECT_STEP
+
+
+def _check_registration(views: StaticViews, trajectory: Trajectory, camera: PinholeCamera) -> list[str]:
+    """Compare occlusion boundaries with edges of the colour images."""
+    alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _MAX_VIEWS)
+    if len(alignment) < _MIN_VIEWS:
+        return []
+    found = alignment.refine(alignment.search())
+    shift, delay = found.values[:2], float(found.values[2])
+    margin = _SIGNIFICANCE * found.sigma
+    if float(shift.norm() - margin[:2].norm()) > _MIN_SHIFT * camera.width:
+        registered = alignment.refine(torch.tensor([0.0, 0.0, delay], dtype=torch.float64), free=(2,))
+        if alignment.is_better(found.values, registered.values):
+            u, v = (-shift).round().int().tolist()
+            return [
+                f"the depth images seem to be shifted by ({u}, {v}) pixels against the colour images; export depth that"
+                " is registered to the colour image"
+            ]
+    if abs(delay) - float(margin[2]) > _MIN_DELAY:
+        simultaneous = alignment.refine(torch.zeros(3, dtype=torch.float64), free=(0, 1))
+        if alignment.is_better(found.values, simultaneous.values):
+            side = "after" if delay > 0 else "before"
+            return [
+                f"the depth images seem to be taken {abs(delay):.2f} s {side} the time of their timestamps, relative to"
+                " the colour images; correct the timestamps, or state depth_delay in the camera file"
+            ]
+    return []
+
+
+def _check_focal_length(tables: MapTables, camera: PinholeCamera, config: Config) -> list[str]:
+    """Estimate the focal length by a bundle adjustment of the newest keyframes."""
+    problem = SelfCalibration(tables, camera, config, max_keyframes=_MAX_VIEWS)
+    if len(problem.T_cw) < _MIN_VIEWS:
+        return []
+    names = ("fx", "fy")
+    values, at = problem.minimise(names)
+    given, sigma = problem.given_values(names), covariance(problem, at).diagonal().sqrt()
+    change = (values / given).log().abs()
+    if not bool((change - _SIGNIFICANCE * sigma / values > _MIN_FOCAL_CHANGE).any()):
+        return []
+    return [
+        f"the focal lengths seem to be {values[0]:.0f} and {values[1]:.0f} pixels instead of {camera.fx:g} and"
+        f" {camera.fy:g}; correct the camera, whose parameters must belong to {camera.width}x{camera.height} pixels"
+    ]

@@ -1,0 +1,230 @@
+"""Selection of the camera parameters that a recording tells.
+
+A group of parameters is free only if the recording determines it, and all groups before it, within their tolerances;
+and it replaces the given values only if it differs from them significantly. What is not taken is left as given.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from scipy.stats import chi2
+from torch import Tensor
+
+from v3d_torch.calibration.parameters import (
+    DERIVATIVE_STEPS,
+    GROUPS,
+    PIXEL_TOLERANCE,
+    ParameterGroup,
+    get_values,
+    with_values,
+)
+from v3d_torch.calibration.problem import AdjustedMap, SelfCalibration
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.optim.jackknife import jackknife_covariance
+
+MAX_P_VALUE = 1e-3
+"""Largest probability of an equal difference by chance at which new values are taken."""
+
+_GRID = 9
+"""Rows and columns of the pixels at which the effect of parameters is measured."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate of one camera parameter.
+
+    Attributes:
+        name: Name of the parameter.
+        given: Value of the given camera; None if it states none.
+        value: Estimated value; NaN if there is none.
+        sigma: Standard deviation of the estimate; infinite if the recording does not tell the parameter.
+        taken: True if the estimate replaces the given value.
+        reason: Reason why it was taken or left.
+    """
+
+    name: str
+    given: float | None
+    value: float
+    sigma: float
+    taken: bool
+    reason: str
+
+
+NOT_TOLD, AGREES = "not told by the recording", "agrees with the given value"
+"""Reasons why parameters are left as given."""
+
+
+def decide(name: str, given: float, value: float, sigma: float, tolerance: float) -> Estimate:
+    """Decide whether the estimate of a single parameter replaces the given value.
+
+    Args:
+        name: Name of the parameter.
+        given: Given value.
+        value: Estimated value.
+        sigma: Standard deviation of the estimate.
+        tolerance: Largest accepted standard deviation.
+    """
+    if not sigma <= tolerance:
+        return Estimate(name, given, value, sigma, taken=False, reason=NOT_TOLD)
+    if chi2.sf(((value - given) / sigma) ** 2, 1) > MAX_P_VALUE:
+        return Estimate(name, given, value, sigma, taken=False, reason=AGREES)
+    return Estimate(name, given, value, sigma, taken=True, reason="")
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Minimum of the cost for some free groups.
+
+    Attributes:
+        values: Value of each free parameter.
+        covariance: Covariance of the free parameters, shape (C, C).
+    """
+
+    values: dict[str, float]
+    covariance: Tensor
+
+    def sigma(self, name: str) -> float:
+        """Standard deviation of a parameter."""
+        index = list(self.values).index(name)
+        return math.sqrt(max(float(self.covariance[index, index]), 0.0))
+
+    def covariance_of(self, group: ParameterGroup) -> Tensor:
+        """Covariance of the parameters of a group."""
+        index = torch.tensor([list(self.values).index(name) for name in group.parameters])
+        return self.covariance[index[:, None], index]
+
+
+class ParameterSelection:
+    """Fits the parameters of a camera group by group.
+
+    Args:
+        problem: Calibration problem.
+
+    Attributes:
+        free: Groups that are taken.
+        fit: Fit with these groups free.
+        left: Estimates of the parameters that are left as given.
+    """
+
+    def __init__(self, problem: SelfCalibration) -> None:
+        self._problem = problem
+        self.free: list[ParameterGroup] = []
+        self.fit = _Fit({}, torch.zeros(0, 0, dtype=torch.float64))
+        self.left: list[Estimate] = []
+        for group in GROUPS:
+            self._free_if_told(group)
+        while (confirmed := self._most_confirmed()) is not None:
+            self._leave(confirmed, self.fit, AGREES)
+            self.free.remove(confirmed)
+            self.fit = self._fit(self.free)
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Estimates of all parameters, those that are taken first."""
+        taken = [
+            Estimate(name, self._given(name), value, self.fit.sigma(name), taken=True, reason="")
+            for name, value in self.fit.values.items()
+        ]
+        return taken + self.left
+
+    def _given(self, name: str) -> float | None:
+        """Value of the given camera; None for an unknown readout."""
+        unknown = name == "readout" and self._problem.given.readout is None
+        return None if unknown else float(self._problem.given_values([name])[0])
+
+    def _free_if_told(self, group: ParameterGroup) -> None:
+        fit = self._fit([*self.free, group])
+        if all(self._is_told(each, fit) for each in (*self.free, group)):
+            self.free.append(group)
+            self.fit = fit
+        else:
+            self._leave(group, fit, NOT_TOLD)
+
+    def _fit(self, groups: Sequence[ParameterGroup]) -> _Fit:
+        names = [name for group in groups for name in group.parameters]
+        if not names:
+            return _Fit({}, torch.zeros(0, 0, dtype=torch.float64))
+        given = self._problem.given_values(names).tolist()
+        start = [self.fit.values.get(name, value) for name, value in zip(names, given, strict=True)]
+        values, at = self._problem.minimise(names, torch.tensor(start, dtype=torch.float64))
+        return _Fit(dict(zip(names, values.tolist(), strict=True)), covariance(self._problem, at))
+
+    def _is_told(self, group: ParameterGroup, fit: _Fit) -> bool:
+        """Check whether a fit determines a group within its tolerance."""
+        of_group = fit.covariance_of(group)
+        if not of_group.isfinite().all():
+            return False
+        if group.tolerance is not None:
+            return all(fit.sigma(name) <= group.tolerance for name in group.parameters)
+        camera = self._problem.given
+        effect = pixel_effect(camera, group.parameters, of_group)
+        return effect <= PIXEL_TOLERANCE * camera.width
+
+    def _most_confirmed(self) -> ParameterGroup | None:
+        """The free group with the least significant difference from its given values; None if all are significant."""
+        known = [group for group in self.free if self._given(group.parameters[0]) is not None]
+        if not known:
+            return None
+        p_values = {group: self._p_value(group) for group in known}
+        least = max(known, key=lambda group: p_values[group])
+        return least if p_values[least] > MAX_P_VALUE else None
+
+    def _p_value(self, group: ParameterGroup) -> float:
+        """Probability that a difference from the given values as large as this one occurs by chance (Wald test)."""
+        names = list(group.parameters)
+        difference = torch.tensor([self.fit.values[name] for name in names]) - self._problem.given_values(names)
+        statistic = difference @ torch.linalg.solve(self.fit.covariance_of(group), difference)
+        return float(chi2.sf(float(statistic), len(names)))
+
+    def _leave(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
+        for name in group.parameters:
+            self.left.append(
+                Estimate(name, self._given(name), fit.values[name], fit.sigma(name), taken=False, reason=reason)
+            )
+
+
+def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
+    """Covariance of the free parameters at the minimum.
+
+    It is the jackknife over keyframes, corrected for the residuals' degrees of freedom that poses and points take, and
+    at least the inverse of the normal matrix, from which poses and points are marginalised by the Schur complement.
+
+    Args:
+        problem: Calibration problem.
+        at: Map adjusted for the minimum.
+
+    Returns:
+        Shape :math:`(C, C)`.
+    """
+    freedom = problem.residual_count / max(problem.residual_count - problem.unknown_count, 1)
+    jackknife = freedom * jackknife_covariance(at.gradient, at.hessian)
+    if not jackknife.isfinite().all():
+        return jackknife
+    independent = torch.linalg.inv(at.hessian.sum(dim=0) / 2).diagonal()
+    growth = (independent / jackknife.diagonal()).clamp(min=1).sqrt()
+    return growth[:, None] * jackknife * growth
+
+
+def pixel_effect(camera: PinholeCamera, names: Sequence[str], covariance: Tensor) -> float:
+    """Standard deviation of where parameters move the pixels of an image, root mean square, pixels.
+
+    Args:
+        camera: Camera.
+        names: Names of the parameters.
+        covariance: Covariance of the parameters, shape :math:`(C, C)`.
+    """
+    u, v = (torch.linspace(0, size - 1, _GRID, dtype=torch.float64) for size in (camera.width, camera.height))
+    rays = camera.normalise(camera.undistort(torch.cartesian_prod(u, v)))
+    rays = torch.cat([rays, torch.ones_like(rays[:, :1])], dim=1)
+    columns = []
+    for name in names:
+        step, value = DERIVATIVE_STEPS[name], get_values(camera, 0.0, [name])[0]
+        ahead, behind = (with_values(camera, {name: value + sign * step}) for sign in (1, -1))
+        moved = ahead.distort(ahead.project(rays)) - behind.distort(behind.project(rays))
+        columns.append(moved / (2 * step))
+    by_parameter = torch.stack(columns, dim=-1)  # (pixels, 2, C)
+    return float(((by_parameter @ covariance) * by_parameter).sum(dim=(1, 2)).mean().sqrt())

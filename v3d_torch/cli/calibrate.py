@@ -1,0 +1,81 @@
+"""Command ``v3d-torch calibrate``: calibrate the camera of a recording from its images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from v3d_torch.cli.errors import exit_on_error
+from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
+from v3d_torch.io.paths import expand_user_paths
+
+if TYPE_CHECKING:
+    from v3d_torch.datasets import RGBDSequence
+    from v3d_torch.geometry.camera import PinholeCamera
+
+app = make_app()
+
+
+@app.command()
+@expand_user_paths
+def main(
+    seq: Annotated[
+        str, typer.Option(help="Recording: a folder, bag or video of RGB-D images, a TUM sequence, or demo.")
+    ],
+    out: Annotated[Path, typer.Option(help="Camera file to write; must be new.")] = Path("camera.yaml"),
+    data_root: DataRoot = None,
+    camera: Camera = None,
+    rgb_topic: RgbTopic = None,
+    depth_topic: DepthTopic = None,
+    info_topic: InfoTopic = None,
+    fps: Fps = None,
+    segmenter: Annotated[str | None, typer.Option(help="Source of instances: yolo or none.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Set one value of the configuration, such as features.count=2000.")
+    ] = None,
+) -> None:
+    """Calibrate the camera of a recording from its images.
+
+    Tracks the camera, calibrates it by a bundle adjustment of the map, and repeats both until the camera does not
+    change. Writes a camera file; what the recording does not tell is left as given.
+    """
+    from v3d_torch.datasets.locate import check_name
+
+    with exit_on_error():
+        check_name(seq, data_root)  # before the imports below, which take seconds
+
+    from rich.console import Console
+
+    from v3d_torch.config.loading import load_config
+    from v3d_torch.datasets import SourceOptions, load_sequence
+    from v3d_torch.errors import OutputError
+    from v3d_torch.io.files import check_writable, write_text
+    from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
+    from v3d_torch.runs.console import TrackingBar, compile_kernels, interrupts_between_frames, progress_bars
+    from v3d_torch.segmentation import make_segmenter
+
+    console = Console(soft_wrap=True)
+    options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
+    overrides = [*(set_ or []), *([f"segmentation.source={segmenter}"] if segmenter is not None else [])]
+
+    def open_sequence(calibrated: PinholeCamera | None) -> RGBDSequence:
+        return load_sequence(seq, data_root=data_root, camera=calibrated or camera, options=options)
+
+    with exit_on_error():
+        if out.exists():
+            raise OutputError(f"{out}: already exists; choose another file with --out")
+        check_writable(out)
+        config = load_config(overrides=overrides)
+        compile_kernels(console)
+        with progress_bars(console) as progress, interrupts_between_frames() as interrupted:
+            calibration = calibrate_sequence(
+                open_sequence,
+                lambda: make_segmenter(config.segmentation),
+                config,
+                lambda number, frames: TrackingBar(progress, frames, interrupted, description=f"run {number}"),
+            )
+        write_text(out, calibration_text(calibration, seq))
+        console.print(calibration_table(calibration))
+        console.print(f"camera: {out}", markup=False)

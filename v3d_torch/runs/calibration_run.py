@@ -1,0 +1,141 @@
+"""Calibration of the camera of a sequence: runs with a better camera each time, until it does not change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from rich.table import Table
+
+from v3d_torch.calibration.camera_calibration import Calibration, calibrate_camera
+from v3d_torch.calibration.parameters import DISTORTION
+from v3d_torch.calibration.selection import Estimate
+from v3d_torch.config import Config
+from v3d_torch.datasets.base import RGBDSequence
+from v3d_torch.datasets.camera_text import camera_text
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.runtime.process import set_num_threads
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import Segmenter
+
+_MAX_RUNS = 4
+"""Maximum number of runs. A wrong focal length costs matches, which the next run with a better one finds."""
+
+_CONVERGED = 0.5
+"""Largest change of an estimate between two runs at its convergence, in standard deviations."""
+
+UNITS = {
+    **dict.fromkeys(("fx", "fy", "cx", "cy"), "{}, pixels"),
+    **dict.fromkeys(("readout", "depth_delay"), "{}, s"),
+    "inverse_depth_offset": "{}, 1/m",
+    "depth_scale": "{}, units/m",
+}
+"""Names of the parameters with their units."""
+
+OpenSequence = Callable[[PinholeCamera | None], RGBDSequence]
+"""Opens a sequence with a given camera, or with its own."""
+
+
+def calibrate_sequence(
+    open_sequence: OpenSequence,
+    make_segmenter: Callable[[], Segmenter],
+    config: Config,
+    on_run: Callable[[int, int], FrameCallback],
+) -> Calibration:
+    """Calibrate the camera of a sequence.
+
+    Args:
+        open_sequence: Opens the sequence.
+        make_segmenter: Makes the segmenter of a run.
+        config: Configuration of the runs.
+        on_run: Called before each run with its number, from 1, and the number of frames; returns a function that is
+            called after each frame.
+
+    Raises:
+        InputError: If a frame cannot be read.
+    """
+    set_num_threads(config.threads)
+    sequence = open_sequence(None)
+    given = camera = sequence.camera
+    previous: Calibration | None = None
+    for number in range(1, _MAX_RUNS + 1):
+        torch.manual_seed(config.seed)
+        pipeline = Pipeline(sequence, V3DSLAM(camera, make_segmenter(), config), evaluate_masks=False)
+        record = pipeline(on_run(number, len(sequence)))
+        if record.failure is not None:
+            raise InputError(record.failure)
+        pipeline.flush()
+        calibration = calibrate_camera(
+            pipeline.slam.map,
+            pipeline.views,
+            pipeline.slam.poses.trajectory(),
+            sequence.groundtruth,
+            camera,
+            given,
+            config,
+        )
+        if _is_converged(calibration, previous):
+            break
+        previous, camera = calibration, calibration.camera
+        sequence = open_sequence(camera)
+    return calibration
+
+
+def _is_converged(calibration: Calibration, previous: Calibration | None) -> bool:
+    """Check whether the last two runs told the same values, up to a part of their uncertainty."""
+    if previous is None:
+        return not any(each.taken for each in calibration.estimates)
+    before = {each.name: each for each in previous.estimates}
+    return all(
+        each.taken == before[each.name].taken
+        and (not each.taken or abs(each.value - before[each.name].value) <= _CONVERGED * each.sigma)
+        for each in calibration.estimates
+    )
+
+
+def calibration_text(calibration: Calibration, name: str) -> str:
+    """Return the text of a camera file with the uncertainty of each value as a comment.
+
+    Args:
+        calibration: Calibrated camera.
+        name: Name of the sequence.
+    """
+    comments: dict[str, list[str]] = {}
+    for each in calibration.estimates:
+        field = "distortion" if each.name in DISTORTION else each.name
+        comments.setdefault(field, []).append(
+            f"{each.name} {_describe(each)}" if field != each.name else _describe(each)
+        )
+    heading = f"# Calibrated by v3d-torch calibrate from {name}. Values are taken if the recording tells them.\n"
+    return heading + camera_text(calibration.camera, {field: "; ".join(texts) for field, texts in comments.items()})
+
+
+def calibration_table(calibration: Calibration) -> Table:
+    """Return a table of all parameters: given, estimated, standard deviation, taken or left."""
+    table = Table(title="camera")
+    for column in ("parameter", "given", "estimated", "+-", "result"):
+        table.add_column(column, justify="left" if column in ("parameter", "result") else "right")
+    for each in calibration.estimates:
+        given = "unknown" if each.given is None else f"{each.given:.6g}"
+        told = math.isfinite(each.sigma) and math.isfinite(each.value)
+        value, sigma = (f"{each.value:.6g}", f"{each.sigma:.2g}") if told else ("-", "-")
+        table.add_row(UNITS.get(each.name, "{}").format(each.name), given, value, sigma, _result(each))
+    return table
+
+
+def _result(estimate: Estimate) -> str:
+    return "taken" if estimate.taken else f"left: {estimate.reason}"
+
+
+def _describe(estimate: Estimate) -> str:
+    """Describe an estimate in a few words, for a comment."""
+    if not math.isfinite(estimate.sigma) or not math.isfinite(estimate.value):
+        return f"left: {estimate.reason}"
+    value = f"{estimate.value:.6g} +- {estimate.sigma:.2g}"
+    if not estimate.taken:
+        return f"left: {estimate.reason} ({value})"
+    given = "unknown" if estimate.given is None else f"{estimate.given:.6g}"
+    return f"{value}, given {given}"
