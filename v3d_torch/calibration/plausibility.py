@@ -30,8 +30,9 @@ _MIN_DELAY = 0.05
 """Smallest delay of depth that is reported, seconds: more than half a frame period, within which cameras without
 synchronisation stay."""
 
-_MIN_FOCAL_CHANGE = 0.15
-"""Smallest relative error of the focal length that is reported: cameras of one model differ by a tenth of that."""
+_MIN_FOCAL_CHANGE = 0.1
+"""Smallest relative error of the focal length that is reported: cameras of one model differ by a fifth of that, and a
+lens distortion that is not modelled changes the estimate by half of it."""
 
 _SIGNIFICANCE = 3.0
 """Standard deviations by which an estimate has to differ from the camera beyond the limits above."""
@@ -157,13 +158,14 @@ def _check_focal_length(tables: MapTables, camera: PinholeCamera, config: Config
     problem = SelfCalibration(tables, camera, config, max_keyframes=_MAX_VIEWS)
     if len(problem.T_cw) < _MIN_VIEWS:
         return []
-    names = ("fx", "fy")
+    names = ("fx", "fy", "cx", "cy")  # a wrong principal point would change the focal lengths
     values, at = problem.minimise(names)
-    given, sigma = problem.given_values(names), covariance(problem, at).diagonal().sqrt()
-    change = (values / given).log().abs()
-    if not bool((change - _SIGNIFICANCE * sigma / values > _MIN_FOCAL_CHANGE).any()):
+    given, sigma = problem.given_values(names), covariance(problem, at).diagonal().clamp(min=0).sqrt()
+    change = (values / given).log().abs() - _SIGNIFICANCE * sigma / values
+    if not bool((change[:2] > _MIN_FOCAL_CHANGE).any()):
         return []
     return [
-        f"the focal lengths seem to be {values[0]:.0f} and {values[1]:.0f} pixels instead of {camera.fx:g} and"
-        f" {camera.fy:g}; correct the camera, whose parameters must belong to {camera.width}x{camera.height} pixels"
+        f"the focal lengths {camera.fx:g} and {camera.fy:g} do not explain how the images move, {values[0]:.0f} and"
+        f" {values[1]:.0f} would be better; give the camera of images with {camera.width}x{camera.height} pixels, or"
+        " calibrate it with v3d-torch calibrate"
     ]

@@ -23,8 +23,9 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.optim.jackknife import jackknife_covariance
 
-_LATE_INTERVAL = 10
-"""Interval in keyframes of the calibration after the first keyframes, for later rotations of the camera."""
+_MIN_INFLATION = 2.0
+"""Smallest factor by which the standard deviation exceeds that of independent errors. Errors of velocity and depth are
+correlated between observations, which few keyframes do not show."""
 
 _MAX_KEYFRAMES = 60
 """Maximum number of keyframes, the newest ones, whose observations are used: the time grows with their cube."""
@@ -46,7 +47,7 @@ def calibrate_readout(
         current estimate used older keyframes and is more certain.
     """
     current = sparse_map.readout
-    if not _is_due(sparse_map, config) or current.is_certain:
+    if not config.rolling_shutter.enabled or current.is_certain or not _is_due(sparse_map):
         return current
     active = torch.tensor([keyframe.index for keyframe in sparse_map.active_keyframes])
     selected = select_observations(sparse_map, active[-_MAX_KEYFRAMES:], config, with_neighbours=False)
@@ -79,21 +80,21 @@ def combine(expected: Readout, seconds: float, gradient: Tensor, hessian: Tensor
         hessian: Second derivatives, shape :math:`(K, 1, 1)`.
 
     Returns:
-        Mean of both, weighted with their information. The variance of the minimum is the larger one of the jackknife
-        over keyframes and of the Hessian, so that it is infinite if the camera stood still or moved uniformly.
+        Mean of both, weighted with their information. The variance of the minimum is that of the jackknife over
+        keyframes, but at least a multiple of that of independent errors. It is infinite if the camera stood still or
+        moved uniformly.
     """
     curvature = float(hessian.sum())
     if curvature <= 0:
         return expected
     minimum = seconds - float(gradient.sum()) / curvature
-    variance = max(float(jackknife_covariance(gradient, hessian)), 2 / curvature)
+    variance = max(float(jackknife_covariance(gradient, hessian)), _MIN_INFLATION**2 * 2 / curvature)
     total = expected.information + 1 / variance
     bounded = min(max(minimum, -MAX_READOUT), MAX_READOUT)
     return Readout((expected.information * expected.seconds + bounded / variance) / total, total)
 
 
-def _is_due(sparse_map: SparseMap, config: Config) -> bool:
-    """Check whether the newest keyframe calibrates the readout."""
-    newest = sparse_map.keyframes[-1].index
-    is_due = newest <= config.rolling_shutter.calibration_keyframes or newest % _LATE_INTERVAL == 0
-    return is_due and config.rolling_shutter.enabled
+def _is_due(sparse_map: SparseMap) -> bool:
+    """Check whether the number of keyframes has doubled: each change of the readout disturbs the map."""
+    count = len(sparse_map.keyframes)
+    return count & (count - 1) == 0

@@ -1,0 +1,77 @@
+"""Jackknife covariance against leaving data out, and against the scatter of estimates."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from v3d_torch.optim.jackknife import jackknife_covariance
+
+
+def make_groups(groups: int, seed: int, common: float = 0.0, size: int = 20) -> tuple[Tensor, Tensor]:
+    """Derivatives of the squared errors of a linear regression, at 0, for groups with a common error.
+
+    Args:
+        groups: Number of groups.
+        seed: Seed of the data.
+        common: Standard deviation of the error that all measurements of a group share; that of their own is 1.
+        size: Number of measurements of a group.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    A = 1 + torch.randn(groups, size, 2, generator=generator, dtype=torch.float64)
+    error = torch.randn(groups, size, generator=generator, dtype=torch.float64)
+    shared = common * torch.randn(groups, 1, generator=generator, dtype=torch.float64)
+    b = A @ torch.tensor([0.5, -2.0], dtype=torch.float64) + error + shared
+    return -2 * (A.mT @ b[..., None])[..., 0], 2 * A.mT @ A
+
+
+def minimum(gradient: Tensor, hessian: Tensor) -> Tensor:
+    return torch.linalg.solve(hessian.sum(dim=0), -gradient.sum(dim=0))
+
+
+def test_covariance_equals_that_of_minima_without_one_group() -> None:
+    gradient, hessian = make_groups(8, seed=1)
+    without = torch.stack([minimum(gradient[torch.arange(8) != k], hessian[torch.arange(8) != k]) for k in range(8)])
+    change = without - minimum(gradient, hessian)
+    expected = 7 / 8 * (change.T @ change) * 7 / 5
+    torch.testing.assert_close(jackknife_covariance(gradient, hessian), expected)
+
+
+def test_covariance_does_not_depend_on_the_point_of_linearisation() -> None:
+    gradient, hessian = make_groups(8, seed=2)
+    moved = gradient + hessian @ torch.tensor([3.0, -1.0], dtype=torch.float64)
+    torch.testing.assert_close(jackknife_covariance(moved, hessian), jackknife_covariance(gradient, hessian))
+
+
+@pytest.mark.parametrize("common", [0.0, 2.0])
+def test_errors_agree_with_the_covariance_although_groups_have_common_errors(common: float) -> None:
+    true = torch.tensor([0.5, -2.0], dtype=torch.float64)
+    jackknife, inverse = [], []
+    for seed in range(200):
+        gradient, hessian = make_groups(10, seed, common)
+        error = minimum(gradient, hessian) - true
+        jackknife.append(float(error @ torch.linalg.solve(jackknife_covariance(gradient, hessian), error)) / 2)
+        inverse.append(float(error @ (hessian.sum(dim=0) / 2) @ error) / 2)
+    assert 0.6 < sum(jackknife) / len(jackknife) < 1.6
+    assert (sum(inverse) / len(inverse) > 5) is (common > 0)
+
+
+def test_successive_groups_are_merged_to_ten_blocks() -> None:
+    gradient, hessian = make_groups(40, seed=3)
+    blocks = [each.unflatten(0, (10, 4)).sum(dim=1) for each in (gradient, hessian)]
+    torch.testing.assert_close(jackknife_covariance(gradient, hessian), jackknife_covariance(*blocks))
+
+
+def test_covariance_is_infinite_for_few_groups_or_if_one_has_all_information() -> None:
+    gradient, hessian = make_groups(3, seed=4)
+    assert jackknife_covariance(gradient, hessian).isinf().all()
+    gradient, hessian = make_groups(6, seed=4)
+    hessian[1:, 1, :], hessian[1:, :, 1] = 0.0, 0.0
+    assert jackknife_covariance(gradient, hessian).isinf().all()
+
+
+def test_groups_without_information_do_not_count() -> None:
+    gradient, hessian = make_groups(6, seed=5)
+    with_empty = [torch.cat([each, torch.zeros_like(each[:3])]) for each in (gradient, hessian)]
+    torch.testing.assert_close(jackknife_covariance(*with_empty), jackknife_covariance(gradient, hessian))
