@@ -26,6 +26,16 @@ _HARMONIC = 0.5
 """Steps of a fraction of the true step fit as well. The true one is the largest with this fraction of the best
 strength."""
 
+_PEAK_WIDTH = 1.06
+"""Ratio between the steps at the two sides of a peak."""
+
+_NEIGHBOURHOOD = 1.6
+"""Ratio between steps that are compared: up to it, steps do not resemble the true one."""
+
+_MIN_PROMINENCE = 6.0
+"""Smallest strength relative to the median of those in the neighbourhood. A few parallel walls, each at one depth, have
+the same strength for many steps."""
+
 
 def disparity_step(depth: Tensor) -> float | None:
     """Find the step of inverse depth in depth images.
@@ -49,5 +59,6 @@ def disparity_step(depth: Tensor) -> float | None:
     if float(strength.max()) < _MIN_STRENGTH:
         return None
     first = int(torch.nonzero(strength >= _HARMONIC * strength.max())[0, 0])
-    around = strength[first : first + max(first // 50, 2)]  # the top of the first peak
-    return _MAX_INVERSE_DEPTH / (first + int(around.argmax()))
+    peak = first + int(strength[first : int(first * _PEAK_WIDTH) + 1].argmax())
+    around = strength[int(peak / _NEIGHBOURHOOD) : int(peak * _NEIGHBOURHOOD) + 1]
+    return _MAX_INVERSE_DEPTH / peak if strength[peak] > _MIN_PROMINENCE * around.median() else None

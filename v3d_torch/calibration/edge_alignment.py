@@ -36,11 +36,15 @@ _DELAYS = torch.arange(-12, 13, dtype=torch.float64) / 100
 _REACH = 64
 """Largest displacement by shift and delay together, frame pixels; farther ones do not count in the coarse search."""
 
-_STEPS = torch.tensor([1.0, 1.0, 0.003], dtype=torch.float64)
-"""Steps of the finite differences by shift (frame pixels) and delay (seconds): small beside the blur of the edges."""
+_STEP = 2.0
+"""Step of the finite differences, frame pixels: the blur of the edges."""
+
+_DELAY_STEPS = (0.001, 0.02)
+"""Range of the step of the finite differences by the delay, in which the image mostly moves by the step above,
+seconds."""
 
 _MAX_NEWTON_STEPS = 20
-_CONVERGED = 0.05
+_CONVERGED = 0.02
 """Newton steps end below this fraction of the steps above."""
 
 _MIN_RATIO = 1.5
@@ -53,7 +57,7 @@ _PARTS = 4
 """Number of parts of the image in each direction."""
 
 _MIN_PART = 0.01
-"""Smallest fraction of the boundaries in a part of the image that is counted."""
+"""Smallest fraction of the boundaries in a view or a part of the image that is counted."""
 
 _MIN_SAMPLES = 4
 """Smallest number of views or parts for a test."""
@@ -110,6 +114,10 @@ class EdgeAlignment:
         counts = torch.tensor([len(edges.axis) for edges in self._edges])
         self._view = torch.arange(len(counts)).repeat_interleave(counts)
         self._gradients = torch.stack([edges.gradients for edges in self._edges])  # (K, 2, h, w)
+        longest = _DELAY_STEPS[1]
+        motion = (self._at_time_of_colour(longest) - self._at_time_of_colour(0.0)).norm(dim=1).median()
+        delay_step = longest * _STEP / max(float(motion) * views.stride, _STEP)
+        self._steps = torch.tensor([_STEP, _STEP, max(delay_step, _DELAY_STEPS[0])], dtype=torch.float64)
 
     def __len__(self) -> int:
         """Number of views with boundaries."""
@@ -141,7 +149,7 @@ class EdgeAlignment:
         for _ in range(_MAX_NEWTON_STEPS):
             step = _ascent_step(gradient.sum(dim=0), hessian.sum(dim=0))
             while step.abs().max() > _CONVERGED:
-                moved = values.index_add(0, index, step * _STEPS[index])
+                moved = values.index_add(0, index, step * self._steps[index])
                 if (new := self.total_score(moved)) > score:
                     break
                 step = step / 2
@@ -149,7 +157,7 @@ class EdgeAlignment:
                 break
             values, score = moved, new
             gradient, hessian = self._derivatives(values, index)
-        covariance, units = torch.zeros(3, 3, dtype=torch.float64), _STEPS[index]
+        covariance, units = torch.zeros(3, 3, dtype=torch.float64), self._steps[index]
         covariance[index[:, None], index] = jackknife_covariance(-gradient, -hessian) * units[:, None] * units
         return Misalignment(values, covariance)
 
@@ -173,7 +181,7 @@ class EdgeAlignment:
         height, width = self._gradients.shape[2:]
         cell = (self._pixel * _PARTS / torch.tensor([width, height])).long().clamp(0, _PARTS - 1)
         groups = self._view, cell[:, 1] * _PARTS + cell[:, 0]
-        return all(_t_statistic(_group_means(score - compared, group)) > _MIN_T for group in groups)
+        return all(_t_statistic(_large_group_means(score - compared, group)) > _MIN_T for group in groups)
 
     def _scores(self, values: Tensor) -> Tensor:
         """Normalised gradient at each boundary after it is moved, (E,)."""
@@ -207,7 +215,7 @@ class EdgeAlignment:
         def of_views(*moves: tuple[int, int]) -> Tensor:
             moved = values.clone()
             for i, sign in moves:
-                moved[index[i]] += sign * _STEPS[index[i]]
+                moved[index[i]] += sign * self._steps[index[i]]
             return torch.bincount(self._view, weights=self._scores(moved), minlength=len(self))
 
         count, centre = len(index), of_views()
@@ -223,10 +231,13 @@ class EdgeAlignment:
 
 
 def _group_means(values: Tensor, group: Tensor) -> Tensor:
+    """Means of values by group."""
+    return torch.bincount(group, weights=values) / torch.bincount(group)
+
+
+def _large_group_means(values: Tensor, group: Tensor) -> Tensor:
     """Means of values by group, without groups that have hardly any."""
-    counts = torch.bincount(group)
-    means = torch.bincount(group, weights=values) / counts
-    return means[counts > _MIN_PART * len(group)]
+    return _group_means(values, group)[torch.bincount(group) > _MIN_PART * len(group)]
 
 
 def _t_statistic(values: Tensor) -> float:

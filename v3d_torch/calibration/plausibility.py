@@ -56,7 +56,7 @@ _MIN_VIEWS = 5
 _DEPTH_VIEWS = 4
 """Number of views whose depth is examined."""
 
-_FAR = (2.5, 12.0)
+_FAR = (2.5, 10.0)
 """Depth that 99% and 1% of the measurements exceed if the depth is too large, metres: RGB-D cameras measure up to about
 10 m."""
 

@@ -1,0 +1,43 @@
+"""Size of a measured trajectory relative to an estimated one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from v3d_torch.calibration.metric_scale import metric_scale
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.types import Trajectory
+
+
+def make_trajectory(
+    count: int = 60, scale: float = 1.0, noise: float = 0.0, seed: int = 0, size: float = 1.0
+) -> Trajectory:
+    """A hand-held camera that moves by some decimetres, with noisy positions."""
+    time = torch.arange(count, dtype=torch.float64) / 10
+    waves = torch.stack([torch.sin(k * time + k) for k in (1.0, 0.7, 1.3)], dim=1)
+    T_wc = se3_exp(torch.cat([0.3 * size * waves, 0.2 * waves], dim=1))
+    error = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    T_wc[:, :3, 3] = scale * T_wc[:, :3, 3] + noise * error
+    return Trajectory(time, T_wc)
+
+
+def test_scale_is_found() -> None:
+    moved = make_trajectory(scale=1.25)
+    world = se3_exp(torch.tensor([1.0, -2.0, 0.5, 0.3, 0.9, -0.4], dtype=torch.float64))
+    scale, sigma = metric_scale(Trajectory(moved.stamps, world @ moved.T_wc), make_trajectory())  # type: ignore[misc]
+    assert scale == pytest.approx(1.25, rel=1e-6) and sigma < 1e-6
+
+
+def test_errors_agree_with_the_uncertainty() -> None:
+    squared = []
+    for seed in range(20):
+        found = metric_scale(make_trajectory(), make_trajectory(noise=0.005, seed=seed))
+        assert found is not None
+        squared.append(((found[0] - 1) / found[1]) ** 2)
+    assert 0.3 < sum(squared) / len(squared) < 2.0
+
+
+def test_few_poses_and_a_camera_that_only_turns_tell_no_scale() -> None:
+    assert metric_scale(make_trajectory(5), make_trajectory(5)) is None
+    assert metric_scale(make_trajectory(size=0.0), make_trajectory(size=0.0)) is None

@@ -1,0 +1,103 @@
+"""Each warning on a map and views that contradict the camera, and none where they agree."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.board_room import CAMERA, make_views
+from helpers.calibration_map import TRUE, make_map
+from torch import Tensor
+
+from v3d_torch.calibration.plausibility import check_plausibility
+from v3d_torch.config import Config
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.types import Trajectory
+
+KINECT = CAMERA  # has its field of view
+
+
+def check(
+    views: StaticViews, trajectory: Trajectory, tables: MapTables | None = None, camera: PinholeCamera = CAMERA
+) -> list[str]:
+    return check_plausibility(tables or MapTables(), views, trajectory, camera, Config())
+
+
+def no_views() -> tuple[StaticViews, Trajectory]:
+    return StaticViews(CAMERA, 2), make_views(1, moving=False)[1]
+
+
+def slanted_depth() -> Tensor:
+    """Depth of slanted surfaces between 0.8 and 4 m, metres, (120, 160)."""
+    rows, columns = torch.linspace(0, 1, 120)[:, None], torch.linspace(0, 1, 160)
+    return torch.where(columns < 0.5, 0.8 + 1.5 * columns + rows, 2 + 1.5 * columns + 0.5 * rows)
+
+
+def step_views(factor: float) -> tuple[StaticViews, Trajectory]:
+    """Views of slanted surfaces by a Kinect whose depth is too large by a factor."""
+    views, trajectory = make_views(6)
+    stepped = StaticViews(CAMERA, 2)
+    for view in views:
+        inverse = 0.0029 * (1 / (0.0029 * slanted_depth())).round()
+        units = (factor / inverse / StaticViews.UNIT).round().clamp(0, 65535).to(torch.uint16)
+        stepped.append(replace(view, depth_units=units))
+    return stepped, trajectory
+
+
+def test_no_warning_if_camera_and_depth_agree() -> None:
+    assert check(*make_views(6)) == []
+    assert check(*step_views(1.0), camera=KINECT) == []
+    assert check(*no_views(), make_map(TRUE), TRUE) == []
+    assert check(*make_views(6, delay=0.03)) == []  # within half a frame period
+
+
+def test_no_warning_without_data() -> None:
+    assert check(*no_views()) == []
+
+
+def test_warning_about_depth_that_is_not_registered() -> None:
+    (warning,) = check(*make_views(6, shift=(20, -10)))
+    found = re.fullmatch(
+        r"the depth images seem to be shifted by \((\d+), -(\d+)\) pixels against the colour images; export depth that is"
+        " registered to the colour image",
+        warning,
+    )
+    assert found is not None and int(found[1]) == pytest.approx(20, abs=1) and int(found[2]) == pytest.approx(10, abs=1)
+
+
+@pytest.mark.parametrize(("delay", "text"), [(0.1, "0.10 s after"), (-0.08, "0.08 s before")])
+def test_warning_about_depth_of_another_time(delay: float, text: str) -> None:
+    (warning,) = check(*make_views(6, delay=delay))
+    assert warning.startswith(f"the depth images seem to be taken {text} the time of their timestamps")
+
+
+@pytest.mark.parametrize("factors", [(2.0, 2.0), (0.5, 1.0)])
+def test_warning_about_a_wrong_focal_length(factors: tuple[float, float]) -> None:
+    wrong = replace(
+        TRUE, fx=factors[0] * TRUE.fx, fy=factors[1] * TRUE.fy, cx=factors[0] * TRUE.cx, cy=factors[1] * TRUE.cy
+    )
+    (warning,) = check(*no_views(), make_map(wrong, noise=0.3), wrong)
+    assert warning.startswith(f"the focal lengths {wrong.fx:g} and {wrong.fy:g} do not explain how the images move")
+
+
+@pytest.mark.parametrize(
+    ("factor", "text"), [(1.25, "1.25 times too small"), (0.8, "1.25 times too large"), (0.2, "5 times too large")]
+)
+def test_warning_about_a_depth_scale_that_contradicts_the_steps_of_a_kinect(factor: float, text: str) -> None:
+    warnings = [each for each in check(*step_views(factor), camera=KINECT) if "depth_scale" in each]
+    assert len(warnings) == 1 and "steps of the depth images" in warnings[0] and text in warnings[0]
+
+
+def test_steps_of_other_cameras_are_not_compared_with_a_kinect() -> None:
+    assert not any("steps" in warning for warning in check(*step_views(1.25), camera=replace(CAMERA, fx=192.0)))
+    assert not any("steps" in warning for warning in check(*step_views(2.0), camera=KINECT))
+
+
+@pytest.mark.parametrize(("scale", "text"), [(5.0, "too small"), (0.06, "too large")])
+def test_warning_about_depth_outside_the_range_of_cameras(scale: float, text: str) -> None:
+    warnings = [each for each in check(*make_views(6, scale=scale)) if "depth_scale" in each]
+    assert len(warnings) == 1 and warnings[0].endswith(f"the depth_scale 5000 seems to be {text}")

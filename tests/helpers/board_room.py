@@ -1,0 +1,88 @@
+"""Views of boards that hang in front of a wall, with depth that can be shifted and delayed against colour."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from helpers.sparse_maps import no_features
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.types import Trajectory
+
+CAMERA = PinholeCamera(260.0, 260.0, 159.5, 119.5, width=320, height=240)
+RATE = 30.0
+BOARDS = 10
+
+
+def _uniform(*shape: int, seed: int) -> Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+_CENTRE = (_uniform(BOARDS, 2, seed=1) - 0.5) * torch.tensor([2.8, 2.0])
+_HALF = 0.12 + 0.2 * _uniform(BOARDS, 2, seed=2)
+_DISTANCE = 1.3 + 1.0 * _uniform(BOARDS, seed=3)
+_COLOUR = 40 + 180 * _uniform(BOARDS + 1, 3, seed=4)
+_WAVES = 25 * (_uniform(BOARDS + 1, 2, seed=5) - 0.5)
+_WALL = 3.5
+
+
+def pose_at(time: float) -> Tensor:
+    """World-to-camera pose of a hand-held camera, float64, (4, 4)."""
+    phase = torch.arange(6, dtype=torch.float64)
+    amplitude = torch.tensor([0.10, 0.06, 0.08, 0.08, 0.12, 0.06], dtype=torch.float64)
+    return se3_exp(amplitude * torch.sin((3 + 0.7 * phase) * time + phase))
+
+
+@cache
+def render_at(time: float) -> tuple[Tensor, Tensor]:
+    """Exact colour, uint8 (3, H, W), and depth, metres (1, H, W), of the hand-held camera at a time."""
+    T_wc = invert(pose_at(time))
+    rays = CAMERA.rays.double() @ T_wc[:3, :3].T  # (H, W, 3)
+    planes = torch.cat([_DISTANCE, torch.tensor([_WALL])])
+    depth = (planes - T_wc[2, 3]) / rays[..., 2:]  # (H, W, boards + wall)
+    xy = T_wc[:2, 3] + depth[..., None] * rays[..., None, :2]
+    inside = ((xy[..., :-1, :] - _CENTRE).abs() <= _HALF).all(dim=-1)
+    inside = torch.cat([inside, torch.ones_like(inside[..., :1])], dim=-1)
+    z, board = torch.where(inside, depth, torch.inf).min(dim=-1)
+    on_board = xy.gather(2, board[..., None, None].expand(*board.shape, 1, 2))[..., 0, :]
+    pattern = 1 + 0.1 * torch.sin((on_board * _WAVES[board]).sum(dim=-1))
+    colour = (_COLOUR[board] * pattern[..., None]).clamp(0, 255).to(torch.uint8).permute(2, 0, 1)
+    return colour, z[None].float()
+
+
+def make_views(
+    count: int = 6,
+    *,
+    shift: tuple[int, int] = (0, 0),
+    delay: float = 0.0,
+    stated_delay: float = 0.0,
+    scale: float = 1.0,
+    moving: bool = True,
+) -> tuple[StaticViews, Trajectory]:
+    """Make the views of a camera that moves in front of the boards, and its trajectory.
+
+    Args:
+        count: Number of views, a third of a second apart.
+        shift: Shift of the depth images along u and v, pixels.
+        delay: Time of the depth image minus time of the colour image, seconds.
+        stated_delay: The same by the timestamps.
+        scale: Factor of the depth.
+        moving: False for a camera that stands still.
+    """
+    speed = RATE if moving else torch.inf
+    stamps = torch.arange(10 * count + 10, dtype=torch.float64)
+    T_cw = torch.stack([pose_at(float(stamp) / speed) for stamp in stamps])
+    views = StaticViews(CAMERA, 2)
+    for index in range(count):
+        frame = 5 + 10 * index
+        time = frame / speed
+        colour, _ = render_at(time)
+        depth = render_at(time + delay * RATE / speed)[1].roll(shift, (2, 1)) * scale
+        keyframe = Keyframe(index, frame, frame / RATE, T_cw[frame], no_features(), torch.zeros(0).long())
+        views.add(keyframe, colour, depth, torch.ones(240, 320, dtype=torch.bool), stated_delay)
+    return views, Trajectory(stamps / RATE, invert(T_cw))
