@@ -9,7 +9,6 @@ elsewhere in each view.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,11 +55,8 @@ _MIN_T = 3.0
 _PARTS = 4
 """Number of parts of the image in each direction."""
 
-_MIN_PART = 0.01
-"""Smallest fraction of the boundaries in a view or a part of the image that is counted."""
-
-_MIN_SAMPLES = 4
-"""Smallest number of views or parts for a test."""
+_MIN_CLUSTERS = 4
+"""Smallest number of views or parts of the image for a test."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +165,7 @@ class EdgeAlignment:
         """Check whether more boundaries lie on edges with some values than with others, beyond chance.
 
         Edges of one object can fit by chance in all views that show it, and those of one view in all its parts.
-        Therefore most views and most parts of the image have to agree, each in a t-test.
+        Therefore views and parts of the image have to agree, each in a t-test with clusters.
 
         Args:
             values: Values that should be better, as in `Misalignment`.
@@ -180,8 +176,8 @@ class EdgeAlignment:
             return False
         height, width = self._gradients.shape[2:]
         cell = (self._pixel * _PARTS / torch.tensor([width, height])).long().clamp(0, _PARTS - 1)
-        groups = self._view, cell[:, 1] * _PARTS + cell[:, 0]
-        return all(_t_statistic(_large_group_means(score - compared, group)) > _MIN_T for group in groups)
+        clusters = self._view, cell[:, 1] * _PARTS + cell[:, 0]
+        return all(_t_statistic(score - compared, cluster) > _MIN_T for cluster in clusters)
 
     def _scores(self, values: Tensor) -> Tensor:
         """Normalised gradient at each boundary after it is moved, (E,)."""
@@ -235,16 +231,19 @@ def _group_means(values: Tensor, group: Tensor) -> Tensor:
     return torch.bincount(group, weights=values) / torch.bincount(group)
 
 
-def _large_group_means(values: Tensor, group: Tensor) -> Tensor:
-    """Means of values by group, without groups that have hardly any."""
-    return _group_means(values, group)[torch.bincount(group) > _MIN_PART * len(group)]
+def _t_statistic(values: Tensor, cluster: Tensor) -> float:
+    """Mean of values divided by its standard error, for values that are correlated within clusters.
 
-
-def _t_statistic(values: Tensor) -> float:
-    """Mean of values divided by its standard error; 0 for so few values that chance decides."""
-    if len(values) < _MIN_SAMPLES:
+    Liang and Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986. It is 0 for so few
+    clusters that chance decides.
+    """
+    count = len(cluster.unique())
+    if count < _MIN_CLUSTERS:
         return 0.0
-    return float(values.mean() / (values.std() / math.sqrt(len(values))).clamp(min=1e-12))
+    mean = values.mean()
+    errors = torch.bincount(cluster, weights=values - mean)
+    variance = count / (count - 1) * errors.square().sum() / len(values) ** 2
+    return float(mean / variance.clamp(min=1e-24).sqrt())
 
 
 def _ascent_step(gradient: Tensor, hessian: Tensor) -> Tensor:

@@ -19,8 +19,15 @@ from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.types import Trajectory
 
-_MAX_VIEWS = 12
-"""Maximum number of views that are compared with each other: enough for a test, and a fraction of a second."""
+_FIRST_VIEWS, _MAX_VIEWS = 8, 32
+"""Number of views whose edges are compared first, which takes a tenth of a second, and of a closer look, if the first
+ones do not seem to fit."""
+
+_MAX_KEYFRAMES = 12
+"""Maximum number of keyframes whose bundle adjustment tells the focal length."""
+
+_SUSPICION = 0.5
+"""Fraction of the following limits above which a first, inaccurate estimate is followed by a closer look."""
 
 _MIN_SHIFT = 0.01
 """Smallest shift of depth that is reported, relative to the width of the image: 6 pixels of 640. Registration by
@@ -89,19 +96,16 @@ def check_plausibility(
 def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
     """Compare depth with the range of RGB-D cameras, and its steps with those of the Kinect."""
     own = [view for view in views if not view.keyframe.is_from_earlier_run]
-    depth = torch.cat(
-        [torch.zeros(0), *(view.depth[view.depth > 0] for view in own[:: -(-len(own) // _DEPTH_VIEWS) or 1])]
-    )
+    step = max(-(-len(own) // _DEPTH_VIEWS), 1)
+    depth = torch.cat([torch.zeros(0), *(view.depth[view.depth > 0] for view in own[::step])])
     if not len(depth):
         return []
     ratio = _kinect_step_ratio(depth, camera)
     if ratio is not None and not 1 / _STEP_TOLERANCE < ratio < _STEP_TOLERANCE:
+        error = f"{ratio:.3g} times too large" if ratio > 1 else f"{1 / ratio:.3g} times too small"
         return [
             f"the steps of the depth images are {ratio:.3g} times those of a Kinect or Xtion, whose field of view the"
-            f" camera has; the depth_scale {camera.depth_scale:g} seems to be {ratio:.3g} times too large"
-            if ratio > 1
-            else f"the steps of the depth images are {ratio:.3g} times those of a Kinect or Xtion, whose field of view"
-            f" the camera has; the depth_scale {camera.depth_scale:g} seems to be {1 / ratio:.3g} times too small"
+            f" camera has; the depth_scale {camera.depth_scale:g} seems to be {error}"
         ]
     low, median, high = (float(depth.quantile(q)) for q in (0.01, 0.5, 0.99))
     if low > _FAR[0] and high > _FAR[1]:
@@ -128,9 +132,13 @@ def _kinect_step_ratio(depth: Tensor, camera: PinholeCamera) -> float | None:
 
 def _check_registration(views: StaticViews, trajectory: Trajectory, camera: PinholeCamera) -> list[str]:
     """Compare occlusion boundaries with edges of the colour images."""
-    alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _MAX_VIEWS)
+    alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _FIRST_VIEWS)
     if len(alignment) < _MIN_VIEWS:
         return []
+    first = alignment.search()
+    if float(first[:2].norm()) < _SUSPICION * _MIN_SHIFT * camera.width and abs(first[2]) < _SUSPICION * _MIN_DELAY:
+        return []
+    alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _MAX_VIEWS)
     found = alignment.refine(alignment.search())
     shift, delay = found.values[:2], float(found.values[2])
     margin = _SIGNIFICANCE * found.sigma
@@ -155,12 +163,17 @@ def _check_registration(views: StaticViews, trajectory: Trajectory, camera: Pinh
 
 def _check_focal_length(tables: MapTables, camera: PinholeCamera, config: Config) -> list[str]:
     """Estimate the focal length by a bundle adjustment of the newest keyframes."""
-    problem = SelfCalibration(tables, camera, config, max_keyframes=_MAX_VIEWS)
+    problem = SelfCalibration(tables, camera, config, max_keyframes=_MAX_KEYFRAMES)
     if len(problem.T_cw) < _MIN_VIEWS:
         return []
     names = ("fx", "fy", "cx", "cy")  # a wrong principal point would change the focal lengths
+    given = problem.given_values(names)
+    _, at = problem.linearise(names, given, problem.T_cw, problem.points)
+    step = torch.linalg.pinv(at.hessian.sum(dim=0), hermitian=True) @ at.gradient.sum(dim=0)
+    if not bool(((step / given).abs()[:2] > _SUSPICION * _MIN_FOCAL_CHANGE).any()):
+        return []
     values, at = problem.minimise(names)
-    given, sigma = problem.given_values(names), covariance(problem, at).diagonal().clamp(min=0).sqrt()
+    sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
     change = (values / given).log().abs() - _SIGNIFICANCE * sigma / values
     if not bool((change[:2] > _MIN_FOCAL_CHANGE).any()):
         return []

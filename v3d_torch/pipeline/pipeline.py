@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import torch
 
+from v3d_torch.calibration.colour_order import check_colour_order
 from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
 from v3d_torch.datasets.stored import StoredSequence
@@ -173,6 +174,8 @@ class Pipeline:
         """Apply the pending result of the back end, check the camera and show the final state, after the last frame."""
         self.slam.flush()
         self._check_plausibility()
+        with self.slam.timer("plausibility"):
+            self._warn(check_colour_order(self.views, self.slam.segment))
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:
@@ -213,10 +216,14 @@ class Pipeline:
         slam, record = self.slam, self.record
         with slam.timer("plausibility"):
             warnings = check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config)
+        record.was_checked, record.warnings = True, [each for each in record.warnings if each in warnings]
+        self._warn(each for each in warnings if each not in record.warnings)
+
+    def _warn(self, warnings: Iterable[str]) -> None:
+        """Log and record warnings."""
         for warning in warnings:
-            if warning not in record.warnings:
-                _LOG.warning(warning)
-        record.warnings, record.was_checked = warnings, True
+            _LOG.warning(warning)
+            self.record.warnings.append(warning)
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
         """Keep the most dynamic frame, and frames at equal intervals, which grow with the length of a live stream."""

@@ -43,6 +43,9 @@ class UprightSegmenter:
 
     Args:
         segment: Segmenter of frames of any size.
+
+    Attributes:
+        segment: That segmenter.
     """
 
     def __init__(self, segment: Segmenter) -> None:
