@@ -7,10 +7,10 @@ from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import pack_masks
 from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.objects.packed_masks import pack_masks
 from v3d_torch.objects.track import Detection3D, Track
 
 CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)

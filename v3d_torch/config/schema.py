@@ -202,7 +202,7 @@ class ObjectsConfig(Section):
 class FeaturesConfig(Section):
     """ORB features (paper, Sec. III-A and III-E)."""
 
-    count: int = Field(1700, gt=0)
+    count: int = Field(1500, gt=0)
     """Number of features per frame. More than the 1000 of ORB-SLAM2, because masks remove some of them."""
     levels: int = Field(8, gt=0, le=20)
     """Levels of the scale pyramid (ORB-SLAM2)."""

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.types import Instances
@@ -82,7 +82,7 @@ class InstanceTracker(torch.nn.Module):
         """
         step = self._stride
         detections = [self._detection(stamp, clouds, i, T_wc) for i in range(len(instances))]
-        coarse_masks = pack_masks(instances.masks[:, ::step, ::step])
+        coarse_masks = pack_masks(instances.masks, step)
 
         # Predict each track, and check whether the object is visible there.
         predicted = self._predict_silhouettes(stamp, T_wc)
@@ -111,7 +111,7 @@ class InstanceTracker(torch.nn.Module):
             if track.id not in detected:
                 mask = self._predict_mask(predicted[track], depth)
                 track.set_masks(mask, mask & has_depth, predicted_coarse[track], missed=True)
-        self._remove_duplicates(pack_masks(has_depth[::step, ::step]))
+        self._remove_duplicates(pack_masks(has_depth, step))
         return list(self.tracks)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from v3d_torch.objects.packed_masks import count_common_pixels, count_pixels, pack_masks
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (8, 8), (120, 160), (67, 120)])
@@ -22,3 +22,8 @@ def test_one_mask_is_packed_alone() -> None:
     mask = torch.tensor([[True, False, True]])
     assert pack_masks(mask).shape == (8,)
     assert count_pixels(pack_masks(mask)) == 2
+
+
+def test_every_nth_row_and_column_is_packed() -> None:
+    masks = torch.rand(3, 21, 34, generator=torch.Generator().manual_seed(0)) < 0.5
+    assert torch.equal(pack_masks(masks, 4), pack_masks(masks[:, ::4, ::4]))

@@ -1,4 +1,4 @@
-"""Masks with one bit for each pixel, for overlaps of many masks."""
+"""Masks with one bit for each pixel, for the overlaps of many masks."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ _WORD = 8
 """Bytes that are compared at a time; packed masks are padded to a multiple of it."""
 
 
-def pack_masks(masks: Tensor) -> Tensor:
+def pack_masks(masks: Tensor, stride: int = 1) -> Tensor:
     """Pack masks.
 
     Args:
         masks: Masks, bool, shape :math:`(*, H, W)`.
+        stride: Every n-th row and column is packed.
 
     Returns:
-        Packed masks, uint8, shape :math:`(*, B)`; masks of the same size can be compared.
+        Packed masks, uint8, shape :math:`(*, B)`. Masks of the same size can be compared.
     """
-    packed = np.packbits(masks.flatten(-2).numpy(), axis=-1)
+    rows = np.ascontiguousarray(masks.numpy()[..., ::stride, :])[..., ::stride]  # faster than both strides at once
+    packed = np.packbits(rows.reshape(*rows.shape[:-2], rows.shape[-2] * rows.shape[-1]), axis=-1)
     padding = -packed.shape[-1] % _WORD
     return torch.from_numpy(np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, padding)]) if padding else packed)
 
