@@ -10,19 +10,22 @@ from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig
 from v3d_torch.features import brief
-from v3d_torch.features.corner_selection import select_corners
+from v3d_torch.features.corner_selection import select_corners, select_strong_corners
 from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.features.scale_pyramid import ScalePyramid
 from v3d_torch.geometry.camera import PinholeCamera
 
 Ints = NDArray[np.int64]
 
-_THRESHOLD, _LOW_THRESHOLD = 20, 7
-"""Difference of brightness between a corner and its surroundings, grey levels; the low one is used if there are few
-corners (ORB-SLAM2)."""
+_THRESHOLD, _MIN_THRESHOLD = 20, 7
+"""Difference of brightness between a corner and its surroundings, grey levels; the low one is used in cells without
+other corners (ORB-SLAM2)."""
 
-_MIN_CORNERS = 10
-"""Number of corners of a level below which the low threshold is used."""
+_CELL = 32
+"""Side of these cells, pixels of a level (ORB-SLAM2 has 30 or 35). Between two levels lies a margin that is wider."""
+
+_WHITE = 255
+"""Grey level of white. The response of kornia-rs is a fraction of it."""
 
 _ARC = 9
 """Number of adjacent pixels on the circle around a corner that are brighter, or darker (FAST-9)."""
@@ -34,8 +37,8 @@ _SMOOTHING_SIZE, _SMOOTHING_SIGMA = (7, 7), (2.0, 2.0)
 class ORB:
     """Detector and descriptor of ORB features.
 
-    FAST and the smoothing are those of kornia-rs. Its own ORB gives nearly the same features, but takes several times
-    as long, most of it for the rotation of the pattern.
+    FAST and the smoothing are those of kornia-rs. Its own ORB takes longer, selects several pixels of one corner, and
+    leaves surfaces with little contrast without features.
 
     Args:
         config: Number of features, scale pyramid, maximum depth.
@@ -80,19 +83,12 @@ class ORB:
 
     def _detect(self, canvas: NDArray[np.uint8]) -> tuple[Ints, Ints]:
         """Return the corners (column, row) in the image of all levels, (N, 2), and the level of each, sorted, (N,)."""
-        corners, response, level = self._fast(canvas, _THRESHOLD)
-        is_dim = np.bincount(level, minlength=len(self._counts)) < _MIN_CORNERS
-        if is_dim.any():
-            low = self._fast(canvas, _LOW_THRESHOLD)
-            columns = zip((corners, response, level), low, strict=True)
-            corners, response, level = (np.concatenate([a[~is_dim[level]], b[is_dim[low[2]]]]) for a, b in columns)
-        in_level = corners - np.stack([np.zeros_like(level), self._pyramid.tops[level]], axis=1)
-        selected = select_corners(in_level, response, level, self._pyramid.sizes, self._counts)
+        pyramid = self._pyramid
+        found, response = kornia_rs.features.fast_detect(canvas, _MIN_THRESHOLD, _ARC, brief.MARGIN)
+        strength = (response * _WHITE).round().astype(np.uint8)
+        strong = select_strong_corners(found, strength, pyramid.is_inside, _THRESHOLD, _CELL)
+        corners, strength = found[strong].astype(np.int64), strength[strong].astype(np.int64)
+        level = pyramid.level_of_row[corners[:, 1]]
+        in_level = corners - np.stack([np.zeros_like(level), pyramid.tops[level]], axis=1)
+        selected = select_corners(in_level, strength, level, pyramid.sizes, self._counts)
         return corners[selected], level[selected]
-
-    def _fast(self, canvas: NDArray[np.uint8], threshold: int) -> tuple[Ints, Ints, Ints]:
-        """Return the FAST corners (column, row), (N, 2), their response in grey levels, (N,), and their level, (N,)."""
-        found, response = kornia_rs.features.fast_detect(canvas, threshold, _ARC, brief.MARGIN)
-        corners = found.reshape(-1, 2).astype(np.int64)
-        inside, level = self._pyramid.locate(corners[:, 0], corners[:, 1])
-        return corners[inside], np.rint(255 * response[inside]).astype(np.int64), level[inside]

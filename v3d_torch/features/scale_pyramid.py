@@ -20,6 +20,8 @@ class ScalePyramid:
     Attributes:
         sizes: Width and height of each level, pixels.
         tops: First row of each level in the image of all levels.
+        is_inside: True for pixels of the image of all levels that lie in a level outside of its margin, bool.
+        level_of_row: Level of each row of the image of all levels, int64.
     """
 
     def __init__(self, width: int, height: int, levels: int, scale: float, margin: int) -> None:
@@ -28,11 +30,10 @@ class ScalePyramid:
         rows = [size[1] for size in self.sizes]
         self.tops = np.cumsum([0, *rows[:-1]])
         self._shape = sum(rows), width
-        self._level_of_row = np.arange(len(rows)).repeat(rows)
-        inside = np.zeros(self._shape, np.bool_)
+        self.level_of_row = np.arange(len(rows)).repeat(rows)
+        self.is_inside = np.zeros(self._shape, np.bool_)
         for top, (columns, height) in zip(self.tops.tolist(), self.sizes, strict=True):
-            inside[top + margin : top + height - margin, margin : columns - margin] = True
-        self._is_inside = inside.ravel()
+            self.is_inside[top + margin : top + height - margin, margin : columns - margin] = True
 
     def build(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the image of all levels of a grey image, uint8."""
@@ -45,11 +46,3 @@ class ScalePyramid:
             rows[:, :width] = level
             rows[:, width:] = level[:, -1:]  # no edge beside the level
         return canvas
-
-    def locate(self, column: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Locate pixels of the image of all levels.
-
-        Returns:
-            True for pixels of a level outside of its margin, bool, and the level, int64, each of shape :math:`(N,)`.
-        """
-        return self._is_inside[row * self._shape[1] + column], self._level_of_row[row]
