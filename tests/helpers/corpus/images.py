@@ -244,7 +244,7 @@ CASES = [
         "colour smaller than depth",
         every(RGB, lambda i: png(cv2.resize(colour(*camera_position(i)), (WIDTH // 2, HEIGHT // 2)))),
         Fails(
-            "{seq}/depth/1305031102.000000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            "{seq}/depth/1305031102.000000.png: has 128x96 pixels, but its colour image has 64x48; export depth"
             " that is registered to the colour image"
         ),
     ),
@@ -252,7 +252,7 @@ CASES = [
         "depth smaller than colour",
         every(DEPTH, lambda i: png(depth()[::2, ::2])),
         Fails(
-            "{seq}/depth/1305031102.000000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            "{seq}/depth/1305031102.000000.png: has 64x48 pixels, but its colour image has 128x96; export depth"
             " that is registered to the colour image"
         ),
     ),
@@ -260,7 +260,7 @@ CASES = [
         "both images smaller than the camera",
         all_of(every(RGB, lambda i: png(SMALL)), every(DEPTH, lambda i: png(depth()[::2, ::2]))),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, but the camera has 80x60; pass the camera of"
+            "{seq}/rgb/1305031102.000000.png: has 64x48 pixels, but the camera has 128x96; pass the camera of"
             " these images with --camera"
         ),
     ),
@@ -269,7 +269,7 @@ CASES = [
         write(RGB[3], png(SMALL)),
         fails_at_frame(
             3,
-            "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            "{seq}/depth/1305031102.300000.png: has 128x96 pixels, but its colour image has 64x48; export depth"
             " that is registered to the colour image",
         ),
     ),
@@ -278,7 +278,7 @@ CASES = [
         write(DEPTH[3], png(depth()[::2, ::2])),
         fails_at_frame(
             3,
-            "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            "{seq}/depth/1305031102.300000.png: has 64x48 pixels, but its colour image has 128x96; export depth"
             " that is registered to the colour image",
         ),
     ),
@@ -287,7 +287,7 @@ CASES = [
         write(DEPTH[3], png(depth().T.copy())),
         fails_at_frame(
             3,
-            "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
+            "{seq}/depth/1305031102.300000.png: has 96x128 pixels, but its colour image has 128x96; export depth"
             " that is registered to the colour image",
         ),
     ),

@@ -214,8 +214,8 @@ CASES = [
         "depth of another size",
         bag("mcap", replace_messages(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
         Fails(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, but its colour"
-            " image has 80x60; choose depth registered to colour with --depth-topic"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 128x48 pixels, but its colour"
+            " image has 128x96; choose depth registered to colour with --depth-topic"
         ),
     ),
     Case("depth with NaN", bag("mcap", replace_messages(DEPTH, depth_with_nan)), Succeeds(max_ate=None)),
@@ -223,7 +223,7 @@ CASES = [
         "images with too little data",
         bag("mcap", replace_messages(RGB, image_shorter_than_its_height)),
         Fails(
-            "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 80x1000000"
+            "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 128x1000000"
             " pixels need; record the bag again"
         ),
     ),
