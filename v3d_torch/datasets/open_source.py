@@ -13,7 +13,7 @@ from v3d_torch.datasets.realsense import open_realsense_camera
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
-from v3d_torch.errors import GroundTruthWarning, InputError
+from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError
 from v3d_torch.io.download import Progress, cache_dir
 from v3d_torch.io.paths import StrPath, expand_user
 
@@ -55,9 +55,10 @@ def open_source(
 
     Warns:
         GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
+        DepthScaleWarning: If the depth scale is not stated, and was estimated from the images.
     """
     source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
-    _warn_about_groundtruth(source)
+    _warn(source)
     return source
 
 
@@ -86,7 +87,7 @@ def load_sequence(
             f"{name}: is a stream, whose frames cannot be indexed; record it first with"
             f" v3d-torch record --seq {name} --out FOLDER"
         )
-    _warn_about_groundtruth(source)
+    _warn(source)
     return source
 
 
@@ -134,7 +135,11 @@ def _open_by_name(
     return source
 
 
-def _warn_about_groundtruth(source: RGBDStream) -> None:
-    """Warn, at the line that called this module, if the ground truth of a source could not be read."""
-    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
+def _warn(source: RGBDStream) -> None:
+    """Warn, at the line that called this module, about what a source does not state or cannot be read from it."""
+    if not isinstance(source, StoredSequence):
+        return
+    if source.groundtruth_error is not None:
         warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)
+    if source.depth_scale_note is not None:
+        warnings.warn(f"{source.name}: {source.depth_scale_note}", DepthScaleWarning, stacklevel=3)

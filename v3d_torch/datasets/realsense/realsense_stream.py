@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.images import depth_to_metres
 from v3d_torch.datasets.realsense.camera import camera_from_intrinsics, depth_scale_from, import_librealsense
 from v3d_torch.datasets.realsense.device import Device, open_live_device, open_recorded_device
 from v3d_torch.datasets.ros import read_topic_types
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS, convert_to_rgb
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.types import RGBDFrame
 
 _WAIT_MS = 200
