@@ -15,12 +15,12 @@ from v3d_torch.geometry.camera import PinholeCamera
 def test_presets_have_published_parameters() -> None:
     assert PRESETS == ("d435i", "tum_fr1", "tum_fr2", "tum_fr3")
     assert load_camera("tum_fr1") == PinholeCamera(
-        517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+        517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633), depth_scale=5000
     )
     assert load_camera("tum_fr2") == PinholeCamera(
-        520.9, 521.0, 325.1, 249.7, distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
+        520.9, 521.0, 325.1, 249.7, distortion=(0.2312, -0.7849, -0.0033, -0.0001, 0.9172), depth_scale=5000
     )
-    assert load_camera("tum_fr3") == PinholeCamera(535.4, 539.2, 320.1, 247.6)
+    assert load_camera("tum_fr3") == PinholeCamera(535.4, 539.2, 320.1, 247.6, depth_scale=5000)
     assert load_camera("d435i").depth_scale == 1000
 
 

@@ -40,6 +40,10 @@ _NEAREST, _LEAST_FAR, _FARTHEST = 0.25, 1.0, 10.0
 """Distances in a room, metres: no camera for rooms measures nearer than the first, something is farther away than the
 second, and nothing than the third."""
 
+_FARTHEST_OF_OTHERS = 14.0
+"""Largest distance of an image, metres, with a depth scale that cannot be excluded: beyond the range of RGB-D
+cameras."""
+
 _NEARER_THAN_ANY_CAMERA = 0.1
 """Distance that no depth camera measures, metres."""
 
@@ -124,10 +128,11 @@ def estimate_depth_scale(images: Iterable[NDArray[Any]]) -> DepthScaleEstimate:
             candidates = whole_millimetres
     fitting = [scale for scale in candidates if _is_room(near / scale, far / scale)]
     steps = f", in steps of {step}" if step is not None else ""
-    return DepthScaleEstimate(
-        fitting[0] if len(fitting) == 1 and _is_certain(fitting[0], near, candidates) else None,
-        f"{len(samples)} depth {plural} with values from {near:.0f} to {far:.0f}, median {median:.0f}{steps}",
-    )
+    found = None
+    if len(fitting) == 1 and far / fitting[0] <= _FARTHEST:
+        found = fitting[0] if _is_certain(fitting[0], near, candidates) else None
+    evidence = f"{len(samples)} depth {plural} with values from {near:.0f} to {far:.0f}, median {median:.0f}{steps}"
+    return DepthScaleEstimate(found, evidence)
 
 
 def _find_step(values: NDArray[np.integer[Any]]) -> int | None:
@@ -181,5 +186,5 @@ def _missing_value(depth: NDArray[np.integer[Any]]) -> int:
 
 
 def _is_room(near: float, far: float) -> bool:
-    """Check whether near and far depth, metres, are distances in a room."""
-    return near >= _NEAREST and _LEAST_FAR <= far <= _FARTHEST
+    """Check whether near and far depth, metres, can be distances in a room."""
+    return near >= _NEAREST and _LEAST_FAR <= far <= _FARTHEST_OF_OTHERS

@@ -19,7 +19,7 @@ _OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
 
 
 def plain_yaml(text: str) -> str:
-    """Remove what makes the files of OpenCV and ROS invalid for a parser of single YAML documents.
+    """Remove what makes the files of OpenCV and ROS invalid for a parser of single YAML documents, and odd spaces.
 
     OpenCV's own parser is not robust against damaged files. ``rostopic echo`` ends each message with ``---``.
 
@@ -29,7 +29,7 @@ def plain_yaml(text: str) -> str:
     Returns:
         The first document, without OpenCV's header and its matrix tags: a matrix is a mapping with the key ``data``.
     """
-    text = text.strip().removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, "").strip()
+    text = replace_odd_spaces(text).strip().removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, "").strip()
     return re.split(r"^---\s*$", text.removeprefix("---"), maxsplit=1, flags=re.MULTILINE)[0]
 
 
@@ -37,8 +37,7 @@ def parse_yaml(text: str) -> Any:
     """Parse a YAML text.
 
     Like `yaml.safe_load` this rejects tags that create Python objects. It also rejects aliases, with which a few lines
-    can expand to gigabytes, and duplicate keys, of which PyYAML silently keeps the last. Spaces that other programs
-    insert, such as the no-break space, count as spaces.
+    can expand to gigabytes, and duplicate keys, of which PyYAML silently keeps the last.
 
     Args:
         text: YAML text, at most 100000 characters.
@@ -52,7 +51,7 @@ def parse_yaml(text: str) -> Any:
     if len(text) > _MAX_LENGTH:
         raise ValueError(f"it has {len(text)} characters, more than {_MAX_LENGTH}")
     try:
-        return yaml.load(replace_odd_spaces(text), _StrictLoader)  # noqa: S506 - derived from the safe loader
+        return yaml.load(text, _StrictLoader)  # noqa: S506 - derived from the safe loader
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark is not None else ""
         raise ValueError(f"{line}{error.problem}") from error
