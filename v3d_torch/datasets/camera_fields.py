@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -16,6 +17,9 @@ from v3d_torch.geometry.distortion import COEFFICIENTS, DistortionModel
 _Focal = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 _Pixels = Annotated[int, Field(gt=0, le=1 << 13)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+_MAX_TANGENT = math.tan(math.radians(85))
+"""Largest tangent of the angle between a ray and the optical axis: beyond, undistorted pixels are far too large."""
 
 DISTORTION_MODELS: Mapping[str, DistortionModel] = {
     **{name: name for name in COEFFICIENTS},
@@ -99,14 +103,13 @@ def check_distortion(camera: PinholeCamera, source: object) -> None:
     """
     right, bottom = camera.width - 1.0, camera.height - 1.0
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
-    projected = camera.distort(camera.undistort(corners))
-    if bool(((projected - corners).abs() < 1).all()):
+    undistorted = camera.undistort(corners)
+    is_inverse = bool(((camera.distort(undistorted) - corners).abs() < 1).all())
+    if is_inverse and bool((camera.normalise(undistorted).norm(dim=1) < _MAX_TANGENT).all()):
         return
-    fix = "correct the camera's distortion ({names}) or remove it"
-    if camera.distortion_model == "equidistant":
-        fix = "correct the camera's distortion ({names}), or crop the images to less than 180 degrees"
-    names = ", ".join(COEFFICIENTS[camera.distortion_model])
+    is_fisheye = camera.distortion_model == "equidistant"
+    remedy = ", or crop the images to less than 170 degrees" if is_fisheye else " or remove it"
     raise InputError(
-        f"{source}: the distortion {camera.distortion} cannot be inverted at the image corners;"
-        f" {fix.format(names=names)}"
+        f"{source}: the distortion {camera.distortion} cannot be inverted at the image corners; correct the camera's"
+        f" distortion ({', '.join(COEFFICIENTS[camera.distortion_model])}){remedy}"
     )

@@ -148,6 +148,8 @@ def _complete(fields: dict[str, Any], source: str, image_size: ImageSize | None)
         return camera_from_fields(fields, source)
     width, height = _DEFAULT_SIZE if image_size is None else image_size()
     camera = camera_from_fields(fields | {"width": width, "height": height}, source)
+    if image_size is None:
+        return camera
     # Images of another size than that of the calibration have another principal point.
     if abs(camera.cx - width / 2) > width / 4 or abs(camera.cy - height / 2) > height / 4:
         raise InputError(
