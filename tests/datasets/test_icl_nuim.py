@@ -133,9 +133,7 @@ def test_damaged_depth_of_the_original_files_is_rejected(original: Path, text: s
 
 def test_published_camera_with_negative_fy_is_explained(original: Path) -> None:
     (original / "K.txt").write_text("481.2 0 319.5\n0 -480 239.5\n0 0 1\n")
-    with pytest.raises(
-        InputError, match=r"K.txt: fy is -480.0; a negative fy, as published with ICL-NUIM, means"
-    ):
+    with pytest.raises(InputError, match=r"K.txt: fy is -480.0; a negative fy, as published with ICL-NUIM, means"):
         load_sequence(str(original))
     (original / "K.txt").write_text("481.2 0 319.5\n0 480 239.5\n0 0 1\n")
     assert load_sequence(str(original)).camera == PinholeCamera(481.2, 480, 319.5, 239.5, depth_scale=5000)

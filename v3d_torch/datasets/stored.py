@@ -120,7 +120,7 @@ class StoredSequence(ABC):
         if _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
             return
         found = f"{source}: the median depth of the first frame is {median:.2g} m"
-        if self.camera.depth_scale is None:
+        if self._read_depth(0).dtype.kind == "f" or self.camera.depth_scale is None:
             raise InputError(f"{found}, although depth in floating point is in metres; export it in metres")
         raise InputError(
             f"{found} at {self.camera.depth_scale:g} units per metre; correct the camera's depth_scale (1000 if depth"
