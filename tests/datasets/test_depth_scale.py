@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from v3d_torch.datasets import RGBDSequence, SourceOptions, load_sequence, open_source
-from v3d_torch.datasets.stored import StoredSequence
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.errors import DepthScaleWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -90,7 +90,7 @@ def test_depth_scale_that_is_not_stated_is_estimated_and_reported(
     ):
         sequence = load_sequence(str(folder), options=options)
     assert sequence.camera == PinholeCamera(60, 60, 31.5, 23.5, WIDTH, HEIGHT, depth_scale=scale)
-    assert isinstance(sequence, StoredSequence) and "state depth_scale in camera.yaml" in str(sequence.depth_scale_note)
+    assert isinstance(sequence, ImageSequence) and "state depth_scale in camera.yaml" in str(sequence.depth_scale_note)
     assert_metres(sequence)
 
 

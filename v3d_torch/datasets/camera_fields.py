@@ -18,8 +18,9 @@ _Focal = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 _Pixels = Annotated[int, Field(gt=0, le=1 << 13)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-_MAX_TANGENT = math.tan(math.radians(85))
-"""Largest tangent of the angle between a ray and the optical axis: beyond, undistorted pixels are far too large."""
+_MAX_FISHEYE_TANGENT = math.tan(math.radians(85))
+"""Largest tangent of the angle between the ray of a pixel and the optical axis of a fisheye lens: beyond, undistorted
+pixels are far away from the image."""
 
 DISTORTION_MODELS: Mapping[str, DistortionModel] = {
     **{name: name for name in COEFFICIENTS},
@@ -104,10 +105,11 @@ def check_distortion(camera: PinholeCamera, source: object) -> None:
     right, bottom = camera.width - 1.0, camera.height - 1.0
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
     undistorted = camera.undistort(corners)
-    is_inverse = bool(((camera.distort(undistorted) - corners).abs() < 1).all())
-    if is_inverse and bool((camera.normalise(undistorted).norm(dim=1) < _MAX_TANGENT).all()):
-        return
     is_fisheye = camera.distortion_model == "equidistant"
+    max_tangent = _MAX_FISHEYE_TANGENT if is_fisheye else math.inf
+    is_inverse = (camera.distort(undistorted) - corners).abs().amax(dim=1) < 1
+    if bool((is_inverse & (camera.normalise(undistorted).norm(dim=1) < max_tangent)).all()):
+        return
     remedy = ", or crop the images to less than 170 degrees" if is_fisheye else " or remove it"
     raise InputError(
         f"{source}: the distortion {camera.distortion} cannot be inverted at the image corners; correct the camera's"

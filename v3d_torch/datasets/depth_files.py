@@ -52,7 +52,7 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
 def _open_npy(path: Path) -> NDArray[np.generic]:
     """Map a NumPy array into memory; only its header is read."""
     try:
-        array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")  # never unpickles objects
     except OSError as error:
         if error.errno is None:
             raise InputError(f"{path}: is not a NumPy array; copy or export it again") from error

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
 from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.locate import find_or_download
 from v3d_torch.datasets.realsense import open_realsense_camera
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
@@ -130,16 +131,14 @@ def _open_by_name(
         return open_realsense_camera(name, camera, fps=options.fps)
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)
     source = open_path(path, camera, options, progress)
-    if isinstance(source, StoredSequence):
+    if isinstance(source, ImageSequence):
         source.check_first_frame(path)
     return source
 
 
 def _warn(source: RGBDStream) -> None:
     """Warn, at the line that called this module, about what a source does not state or cannot be read from it."""
-    if not isinstance(source, StoredSequence):
-        return
-    if source.groundtruth_error is not None:
+    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
         warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)
-    if source.depth_scale_note is not None:
+    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
         warnings.warn(f"{source.name}: {source.depth_scale_note}", DepthScaleWarning, stacklevel=3)

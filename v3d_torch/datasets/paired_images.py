@@ -10,14 +10,15 @@ from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.depth_files import read_depth_file
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
-from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence
+from v3d_torch.datasets.stored import ReadGroundTruth
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 
-class PairedImages(StoredSequence):
+class PairedImages(ImageSequence):
     """Sequence of paired colour and depth image files.
 
     Args:

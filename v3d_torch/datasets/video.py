@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
-from v3d_torch.datasets.stored import Cursor, StoredSequence
+from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
 from v3d_torch.io.timestamps import associate
@@ -37,7 +38,7 @@ _SAMPLED_FRAMES = 64
 _SUFFIXES = frozenset({".mkv", ".mp4", ".avi", ".mov", ".webm", ".m4v"})
 
 
-class VideoSequence(StoredSequence):
+class VideoSequence(ImageSequence):
     """RGB-D frames of a colour video and a depth video, paired by their timestamps.
 
     Depth needs lossless 16-bit video, such as FFV1 in an ``.mkv`` or ``.avi`` (``ffmpeg -c:v ffv1 -pix_fmt

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation
@@ -41,7 +42,7 @@ def open_sequence(name: str, data_root: Path | None, camera: str | None, console
 
 def print_assumptions(source: RGBDStream, console: Console) -> None:
     """Print what was assumed about a source because it is not stated: an estimated depth scale."""
-    if isinstance(source, StoredSequence) and source.depth_scale_note is not None:
+    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
         console.print(f"note: {source.name}: {source.depth_scale_note}", markup=False, highlight=False)
 
 

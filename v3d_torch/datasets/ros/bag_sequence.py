@@ -14,10 +14,11 @@ from torch import Tensor
 
 from v3d_torch.datasets.camera_fields import camera_from_fields
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
-from v3d_torch.datasets.stored import Cursor, StoredSequence
+from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.download import Progress
@@ -39,7 +40,7 @@ _REPAIR_COMMANDS = {
 """Command that repairs a bag, by file suffix; the folder of a ROS 2 bag has no suffix."""
 
 
-class BagSequence(StoredSequence):
+class BagSequence(ImageSequence):
     """RGB-D frames of a bag: colour and depth images of two topics, paired by their header stamps.
 
     The constructor reads the bag once for the stamps; images are decoded when a frame is requested.
