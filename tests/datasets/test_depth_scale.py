@@ -116,6 +116,13 @@ def test_layout_prescribes_the_depth_scale(
         assert_metres(sequence)
 
 
+def test_name_that_only_resembles_one_of_the_benchmark_prescribes_nothing(tmp_path: Path) -> None:
+    folder = tum(tmp_path / "fr1_my_office", 1000)
+    (folder / "K.txt").write_text(K)
+    with pytest.warns(DepthScaleWarning, match="depth scale 1000"):
+        assert_metres(load_sequence(str(folder)))
+
+
 def test_stated_depth_scale_is_used_whatever_the_images_look_like(tmp_path: Path) -> None:
     folder = tum(tmp_path / "rgbd_dataset_freiburg2_xyz", 1000)
     (folder / "camera.yaml").write_text(CAMERA + "depth_scale: 1000\n")

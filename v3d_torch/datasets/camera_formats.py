@@ -40,13 +40,12 @@ def fields_from_yaml(tree: Mapping[Any, Any], source: str) -> Fields | None:
     try:
         if any(name.startswith(("Camera.", "Camera1.")) for name in names):
             return _orb_slam(tree) | own
-        if cameras := [tree[name] for name in tree if _KALIBR_CAMERA.fullmatch(str(name))]:
+        if cameras := {name: tree[name] for name in tree if _KALIBR_CAMERA.fullmatch(str(name))}:
             if len(cameras) > 1:
                 raise InputError(
-                    f"{source}: contains {len(cameras)} cameras ({', '.join(sorted(names))}); keep only the colour"
-                    " camera"
+                    f"{source}: contains {len(cameras)} cameras ({', '.join(cameras)}); keep only the colour camera"
                 )
-            return _kalibr(cameras[0], source) | own
+            return _kalibr(next(iter(cameras.values())), source) | own
         if "intrinsics" in names and "resolution" in names:
             return _kalibr(tree, source) | own
         if "cameramatrix" in keys or ("k" in keys and "width" in keys):

@@ -13,6 +13,7 @@ from typing import Any
 
 from v3d_torch.datasets.camera_fields import camera_from_fields, check_distortion
 from v3d_torch.datasets.camera_formats import fields_from_numbers, fields_from_yaml
+from v3d_torch.datasets.sequence_names import canonical_name
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import expand_user
@@ -79,7 +80,7 @@ def choose_camera(
         folder: Folder of the sequence.
         published: Camera of the dataset, if all its sequences have the same.
         depth_scale: Depth units per metre that the layout prescribes, for a camera that does not state them; None for
-            those of the published camera.
+            those of the published camera, or of the TUM benchmark if the folder is named like one of its sequences.
         image_size: Function that gives the size of the images for a camera file that does not state it.
 
     Returns:
@@ -88,16 +89,18 @@ def choose_camera(
     Raises:
         InputError: If there is no camera, or the camera is invalid.
     """
-    published = published or _tum_preset(folder)
+    preset = _tum_preset(folder)
     if isinstance(camera, PinholeCamera):
         chosen = camera
     else:
-        chosen = _find_camera(camera, folder, published, image_size)
+        chosen = _find_camera(camera, folder, published or preset, image_size)
         check_distortion(chosen, camera or folder)
     if chosen.depth_scale is not None:
         return chosen
-    if depth_scale is None and published is not None:
-        depth_scale = published.depth_scale
+    is_tum = canonical_name(folder.resolve().name) is not None
+    known = published or (preset if is_tum else None)
+    if depth_scale is None and known is not None:
+        depth_scale = known.depth_scale
     return replace(chosen, depth_scale=depth_scale)
 
 

@@ -48,7 +48,8 @@ class RealSenseStream:
         device = open_device()
         calibrated = None if camera is not None else camera_from_intrinsics(name, device.intrinsics, device.depth_unit)
         self.name = name
-        self.camera: PinholeCamera = choose_camera(camera, Path(name), calibrated)
+        depth_scale = depth_scale_from(device.depth_unit)
+        self.camera: PinholeCamera = choose_camera(camera, Path(name), calibrated, depth_scale=depth_scale)
         self._open_device = open_device
 
     def __iter__(self) -> Iterator[RGBDFrame]:
