@@ -215,7 +215,10 @@ CASES = [
     Case(
         "distortion with four numbers",
         edit(YAML, lambda content: content + b"distortion: [0.1, 0.1, 0, 0]\n"),
-        Fails("{seq}/camera.yaml: distortion.4: field required, got [0.1, 0.1, 0, 0]; correct the camera"),
+        Fails(
+            "{seq}/camera.yaml: distortion has 4 numbers; write k1, k2, p1, p2, k3, or state distortion_model: one of"
+            " plumb_bob, rational_polynomial, equidistant"
+        ),
     ),
     Case(
         "distortion with NaN",
@@ -308,8 +311,8 @@ CASES = [
         "K.txt with a matrix, for 640x480 pixels",
         numbers("525 0 319.5\n0 525 239.5\n0 0 1\n"),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 128x96 pixels, but the camera has 640x480; pass the camera of"
-            " these images with --camera"
+            "{seq}/K.txt: the principal point (319.5, 239.5) is far outside the 128x96 image; correct cx and cy, or"
+            " width and height"
         ),
     ),
     Case(

@@ -272,10 +272,10 @@ CASES = [
     ),
     Case(
         "unsupported distortion model",
-        bag("mcap", replace_camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
+        bag("mcap", replace_camera(K, (0.1, 0.2, 0.3, 0.4), "thin_prism")),
         Fails(
-            "{root}/take/take.mcap: /camera/color/camera_info has the unsupported distortion model"
-            " equidistant; record rectified images, or pass --camera with k1, k2, p1, p2, k3"
+            "{root}/take/take.mcap: /camera/color/camera_info: the distortion model thin_prism is not supported;"
+            " calibrate with one of plumb_bob, rational_polynomial, equidistant"
         ),
     ),
     Case(
