@@ -17,7 +17,7 @@ from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("frames", "processed", *TrackingStatus, "keyframes", "loops"), pa.int64()),
+    **dict.fromkeys(("frames", "processed", "skipped", *TrackingStatus, "keyframes", "loops"), pa.int64()),
     **dict.fromkeys(("coverage", "ate.rmse", "ate.std"), pa.float64()),
     **dict.fromkeys(("rpe.trans.rmse", "rpe.trans.std", "rpe.rot.rmse", "rpe.rot.std"), pa.float64()),
     **dict.fromkeys(("masks.moving_masked", "masks.static_masked"), pa.float64()),

@@ -22,6 +22,13 @@ InfoTopic = Annotated[
     str | None, typer.Option(help="Topic of the camera info of the colour images in a bag [detected].")
 ]
 Fps = Annotated[float | None, typer.Option(help="Frame rate in Hz, for a live camera or a source without timestamps.")]
+SkipBroken = Annotated[
+    bool,
+    typer.Option(
+        "--skip-broken",
+        help="Pass over broken frames of a stored sequence with a warning, at most 5 % of the frames or 10.",
+    ),
+]
 Seeds = Annotated[
     int, typer.Option(min=1, help="Number of runs of each sequence and configuration, with seeds from 0.")
 ]

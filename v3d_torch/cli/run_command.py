@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import ProgressBar, progress_bars, run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.stage_table import stage_table
@@ -93,7 +94,7 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
 
     Args:
         folder: Folder of its results.
-        given: Options given with ``--resume``. Only the location of the sequence can differ from the run.
+        given: Options given with ``--resume``. Only those in `CHANGEABLE` can differ from those of the run.
         choice: Configuration given with ``--resume``.
         out: The same folder, or None.
         display: Output on the screen.
@@ -112,8 +113,8 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
         raise InputError(f"{option}: conflicts with the run in {folder}; remove this option")
     if (option := choice.conflict(request.config)) is not None:
         raise ConfigError(f"{option}: conflicts with the run in {folder}; remove this option")
-    moved = {name: value for name in ("seq", "data_root") if (value := getattr(given, name))}
-    _run(replace(request, **moved), folder, checkpoint, display)
+    changed = {name: value for name in CHANGEABLE if (value := getattr(given, name))}
+    _run(replace(request, **changed), folder, checkpoint, display)
 
 
 def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, display: Display) -> None:
@@ -137,7 +138,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if masks is not None and masks.resolve() == (folder / "masks").resolve():
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if checkpoint is not None:
-        console.print(f"resuming after {checkpoint.frames} of {checkpoint.sequence['frames']} frames", markup=False)
+        total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
+        console.print(f"resuming after {checkpoint.frames} of {total} frames", markup=False)
     pipeline, evaluation = run_with_progress(
         lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
         folder,
@@ -157,6 +159,7 @@ def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
             camera=request.camera,
             options=request.source_options,
             progress=ProgressBar(progress, "sequence"),
+            skip_broken=request.skip_broken,
         )
 
 
@@ -206,7 +209,8 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
     statuses = Counter(slam.poses.statuses)
     motion_states = record.dynamics.count_motion_states()
     table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
-    table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}")
+    broken = f", {len(record.broken)} broken ones passed over" if record.broken else ""
+    table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}{broken}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     active = slam.map.active_keyframes
     known = sum(keyframe.is_from_earlier_run for keyframe in active)

@@ -9,7 +9,6 @@ from torch import Tensor
 from v3d_torch.datasets.images import read_colour, read_depth
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence
-from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 
@@ -22,9 +21,6 @@ class PairedImages(StoredSequence):
         camera: Camera of all frames.
         groundtruth: Function that reads the measured poses of the camera.
         name: Name used in tables; None for the folder's name.
-
-    Raises:
-        InputError: If an image file is missing.
     """
 
     def __init__(
@@ -36,19 +32,17 @@ class PairedImages(StoredSequence):
         *,
         name: str | None = None,
     ) -> None:
-        missing = [file for pair in pairs for file in (pair.colour, pair.depth) if not (folder / file).is_file()]
-        if missing:
-            raise InputError(
-                f"{folder / missing[0]}: is listed but does not exist ({len(missing)} missing in total);"
-                " copy the whole sequence again"
-            )
         stamps, delays = [pair.stamp for pair in pairs], [pair.depth_delay for pair in pairs]
         super().__init__(name or folder.resolve().name, stamps, camera, groundtruth, delays)
         self.folder = folder
         self._pairs = pairs
 
+    def files(self, index: int) -> tuple[Path, Path]:
+        """Return the colour and the depth file of frame ``index``."""
+        return self.folder / self._pairs[index].colour, self.folder / self._pairs[index].depth
+
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
-        colour, depth = (self.folder / file for file in (self._pairs[index].colour, self._pairs[index].depth))
+        colour, depth = self.files(index)
         return self._check_registered(
             (colour, self._read_colour(colour)), (depth, read_depth(depth, self.camera.depth_scale))
         )

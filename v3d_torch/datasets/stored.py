@@ -5,7 +5,9 @@ from __future__ import annotations
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import torch
@@ -23,6 +25,15 @@ ReadGroundTruth = Callable[[], Trajectory | None]
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
 """Plausible range for the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
 wrong depth scale falls outside of it."""
+
+_MAX_BROKEN_FRACTION, _MIN_BROKEN_LIMIT = 0.05, 10
+"""Broken frames that are passed over on request: at most this fraction of the frames, or this number if it is more. A
+sequence with more of them was probably copied incompletely, or opened with the wrong camera."""
+
+
+def max_broken_frames(frames: int) -> int:
+    """Return how many broken frames can be passed over in a sequence of this length."""
+    return max(int(_MAX_BROKEN_FRACTION * frames), _MIN_BROKEN_LIMIT)
 
 
 class StoredSequence(ABC):
@@ -91,22 +102,40 @@ class StoredSequence(ABC):
         stamp = float(self.stamps[index])
         return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._depth_delays[index])
 
-    def check_first_frame(self, source: object) -> None:
-        """Decode the first frame, so that an error common to all frames is reported before anything is computed.
+    def files(self, index: int) -> tuple[Path, ...]:
+        """Return the files that only frame ``index`` is read from; empty if all frames share their files."""
+        return ()
+
+    def check(self, source: object, *, skip_broken: bool = False) -> None:
+        """Check that all files exist, and decode the first frame, so that errors are reported before a long run.
 
         Args:
             source: Path of the sequence, for messages.
+            skip_broken: True if files can be missing, and if frames at the start can be broken.
 
         Raises:
-            InputError: If the frame cannot be decoded or its median depth is implausible.
+            InputError: If a file is missing, the frame cannot be decoded, or its median depth is implausible.
         """
-        depth = self._read(0)[1]
+        missing = [file for index in range(len(self)) for file in self.files(index) if not file.is_file()]
+        if missing and not skip_broken:
+            raise InputError(
+                f"{missing[0]}: is listed but does not exist ({len(missing)} missing in total); copy the whole sequence"
+                " again"
+            )
+        depth = self._read_first(max_broken_frames(len(self)) if skip_broken else 0)[1]
         median = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
         if not _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
             raise InputError(
                 f"{source}: the median depth of the first frame is {median:.2g} m at {self.camera.depth_scale:g} units"
                 " per metre; correct the camera's depth_scale (1000 if depth is in millimetres) or the depth images"
             )
+
+    def _read_first(self, broken: int) -> tuple[Tensor, Tensor]:
+        """Read the images of the first frame that can be read; at most this number of frames before it is broken."""
+        for index in range(min(broken, len(self) - 1)):
+            with suppress(InputError):
+                return self._read(index)
+        return self._read(min(broken, len(self) - 1))
 
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:

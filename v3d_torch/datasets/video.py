@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import cv2
@@ -79,9 +79,13 @@ class VideoSequence(StoredSequence):
         Raises:
             InputError: As `__getitem__`; and after the last frame if a video is truncated.
         """
-        yield from super().frames_from(index)
+        return chain(super().frames_from(index), self._raise_truncation())
+
+    def _raise_truncation(self) -> Iterator[RGBDFrame]:
+        """Iterate over no frames; raise an error if a video is truncated."""
         if self._truncation is not None:
             raise InputError(self._truncation)
+        yield from ()
 
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         i, j = self._pairs[index]

@@ -35,6 +35,8 @@ class Outcome:
     def __str__(self) -> str:
         ate = self.get_metric("ate.rmse")
         score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth, not scored"
+        if skipped := self.get_metric("skipped"):
+            score += f", {skipped:.0f} broken frame{'s' if skipped > 1 else ''} passed over"
         result = score if self.failure is None else f"failed: {self.failure}"
         return f"{self.sequence}, {self.config}, seed {self.seed}: {result}"
 

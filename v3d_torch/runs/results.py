@@ -172,6 +172,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "sequence": pipeline.sequence.name,
         "frames": pipeline.frame_count,
         "processed": frames,
+        "skipped": len(run.broken),
         **counts,
         "status": [status.value for status in statuses],
         "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
@@ -213,7 +214,9 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
     keyframes = slam.map.active_keyframes
-    frames = [keyframe.frame for keyframe in keyframes]
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
+    positions = torch.searchsorted(trajectory.stamps, stamps).masked_fill(known, -1)
     statuses = [status.value for status in slam.poses.statuses]
-    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
+    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

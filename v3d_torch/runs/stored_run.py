@@ -34,6 +34,7 @@ class Metrics(BaseModel):
     sequence: str
     frames: int
     processed: int
+    skipped: int = 0
     status: list[TrackingStatus]
     keyframes: int
     landmarks: int
