@@ -35,6 +35,7 @@ _SCHEMA = pa.schema(
         ("config", pa.string()),
         ("seed", pa.int64()),
         *((key.replace(".", "_"), data_type) for key, data_type in METRIC_TYPES.items()),
+        ("difference", pa.string()),
         ("failure", pa.string()),
         ("path", pa.string()),
     ]
@@ -123,6 +124,7 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         "config": outcome.config,
         "seed": outcome.seed,
         **{key.replace(".", "_"): outcome.get_metric(key) for key in METRIC_TYPES},
+        "difference": outcome.difference,
         "failure": outcome.failure,
         "path": job.folder.relative_to(folder).as_posix(),
     }

@@ -14,6 +14,7 @@ from rich.table import Table
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDStream, open_source
+from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.paper_tables import make_paper_table
@@ -182,8 +183,12 @@ def _print_summary(
     """
     record = pipeline.record
     console.print(_summary_table(pipeline, evaluation))
-    if evaluation is not None and (table := make_paper_table(pipeline.sequence.name, evaluation)) is not None:
-        console.print(table)
+    difference = describe_difference(pipeline.sequence)
+    if record.failure is not None:
+        difference = difference or f"part: {len(pipeline.slam.poses)} of {pipeline.frame_count} frames"
+    paper = None if evaluation is None else make_paper_table(pipeline.sequence.name, evaluation, difference)
+    if paper is not None:
+        console.print(paper)
     if display.profile and record.times:
         console.print(stage_table(record))
     for note in evaluation.notes if evaluation is not None else ():

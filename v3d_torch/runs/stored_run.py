@@ -40,6 +40,7 @@ class Metrics(BaseModel):
     landmarks: int
     loops: int
     failure: str | None
+    difference: str | None = None
     fps: float | None
     seconds: float
     seconds_per_stage: dict[str, float]
