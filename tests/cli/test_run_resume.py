@@ -219,7 +219,8 @@ def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole
     out = tmp_path / "out"
     with full_from_frame(6):
         done = call(*run_arguments(sequence, out, "--save-masks", "--serial", *CHECKPOINT_EVERY_FRAME))
-    assert_error_line(done, "cannot be written (File too large); free the disk or choose another folder")
+    message = "cannot be written (File too large); free the disk or choose another folder"
+    assert_error_line(done, f"{message}; resume with --resume {out}\n")
     assert len((out / "trajectory.txt").read_text().splitlines()) == 6
     done = call("--resume", out)
     assert done.exit_code == 0 and f"resuming after 6 of {FRAMES} frames" in done.stdout, done.stderr

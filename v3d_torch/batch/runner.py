@@ -127,5 +127,5 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                 "interrupted twice: the running jobs were killed; repeat the command with --resume to continue"
             ) from interrupt
     if write_error is not None:
-        raise write_error
+        raise OutputError(f"{write_error}; then repeat the command with --resume to continue") from write_error
     return stop.is_set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,6 +35,17 @@ Seeds = Annotated[
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue the batch in --out: run only what is missing or has failed.")
+]
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"v3d-torch {version('v3d-torch')}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
 ]
 
 

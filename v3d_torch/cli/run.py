@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, SkipBroken, make_app
+from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, SkipBroken, Version, make_app
 from v3d_torch.io.paths import expand_user_paths
 
 app = make_app()
@@ -61,6 +61,7 @@ def main(
     resume: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run that wrote its results there.")
     ] = None,
+    version: Version = False,
 ) -> None:
     """Track an RGB-D camera, and map the static part of the scene."""
     from v3d_torch.datasets.locate import check_name

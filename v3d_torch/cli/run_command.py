@@ -17,6 +17,7 @@ from v3d_torch.datasets import RGBDStream, open_source
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
@@ -141,12 +142,15 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if checkpoint is not None:
         total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
         console.print(f"resuming after {checkpoint.frames} of {total} frames", markup=False)
-    pipeline, evaluation = run_with_progress(
-        lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
-        folder,
-        console,
-        checkpoint,
-    )
+    try:
+        pipeline, evaluation = run_with_progress(
+            lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
+            folder,
+            console,
+            checkpoint,
+        )
+    except OutputError as error:
+        raise OutputError(f"{error}{_way_to_resume(folder)}") from error
     if map_file is not None:
         save_map(map_file, pipeline.slam.map, pipeline.views)
     _print_summary(request, display, folder, pipeline, evaluation, console)
@@ -182,8 +186,8 @@ def _print_summary(
         InputError: If the run ended early, or its results are incomplete.
     """
     record = pipeline.record
-    console.print(_summary_table(pipeline, evaluation))
     difference = describe_difference(pipeline.sequence)
+    console.print(_summary_table(pipeline, evaluation, difference))
     if record.failure is not None:
         difference = difference or f"part: {len(pipeline.slam.poses)} of {pipeline.frame_count} frames"
     paper = None if evaluation is None else make_paper_table(pipeline.sequence.name, evaluation, difference)
@@ -198,8 +202,8 @@ def _print_summary(
     console.print(f"results: {folder}", markup=False)  # the name can contain brackets
     if record.failure is not None:
         frames = len(pipeline.slam.poses)
-        resume = f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
-        raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
+        results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"
+        raise InputError(f"{record.failure} ({results})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
         raise InputError(
             f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
@@ -209,11 +213,17 @@ def _print_summary(
         raise InputError(f"{problem} (the results are in {folder})")
 
 
-def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
+def _way_to_resume(folder: Path) -> str:
+    """Return the end of a message on a run that ended early: how to resume it; empty if it has no checkpoint."""
+    return f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
+
+
+def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference: str | None) -> Table:
     slam, record = pipeline.slam, pipeline.record
     statuses = Counter(slam.poses.statuses)
     motion_states = record.dynamics.count_motion_states()
-    table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
+    label = label_sequence(pipeline.sequence.name, difference)
+    table = Table(title=f"V3D-SLAM on {escape(label)}", show_header=False)
     broken = f", {len(record.broken)} broken ones passed over" if record.broken else ""
     table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}{broken}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
