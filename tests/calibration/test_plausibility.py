@@ -62,8 +62,8 @@ def test_no_warning_without_data() -> None:
 def test_warning_about_depth_that_is_not_registered() -> None:
     (warning,) = check(*make_views(6, shift=(20, -10)))
     found = re.fullmatch(
-        r"the depth images seem to be shifted by \((\d+), -(\d+)\) pixels against the colour images; export depth that is"
-        " registered to the colour image",
+        r"the depth images seem to be shifted by \((\d+), -(\d+)\) pixels against the colour images;"
+        " export depth that is registered to the colour image",
         warning,
     )
     assert found is not None and int(found[1]) == pytest.approx(20, abs=1) and int(found[2]) == pytest.approx(10, abs=1)

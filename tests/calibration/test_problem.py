@@ -9,13 +9,13 @@ import torch
 from helpers.calibration_map import PIXEL_SIGMA, TRUE, make_map
 from torch import Tensor
 
-from v3d_torch.calibration.parameters import GROUPS, get_values
+from v3d_torch.calibration.parameters import get_values, groups_of
 from v3d_torch.calibration.problem import SelfCalibration
 from v3d_torch.calibration.selection import covariance
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 
-ALL = tuple(name for group in GROUPS for name in group.parameters)
+ALL = tuple(name for group in groups_of(TRUE) for name in group.parameters)
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 

@@ -11,6 +11,7 @@ from helpers.rolling_camera import AT_REST, CAMERA, KINECT, VELOCITY, features_o
 from torch import Tensor
 
 from v3d_torch.config import Config
+from v3d_torch.mapping.readout_calibration import calibrate_readout
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, RollingShutterCompensation
 
 
@@ -67,6 +68,7 @@ def test_readout_of_a_camera_is_certain_if_given_else_the_prior() -> None:
     prior = Config().rolling_shutter
     assert Readout.from_camera(CAMERA, prior) == Readout(prior.readout, prior.readout_sigma**-2)
     assert Readout.from_camera(replace(CAMERA, readout=0.0), prior) == GLOBAL_SHUTTER
+    assert calibrate_readout(Readout.from_camera(replace(CAMERA, readout=0.025), prior), 5.0, 1e6).seconds == 0.025
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ LAYERS = (
         "calibration",
         "frame_result",
     ),
+    "stage_checks",
     *("slam", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
 )
 """Folders and modules of the package's root, from low to high: a layer imports only from itself and lower layers."""

@@ -22,9 +22,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.culling import cull_redundant_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
-from v3d_torch.mapping.readout_calibration import calibrate_readout
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runtime.stage_timer import StageTime, StageTimer
 
 
@@ -35,14 +33,12 @@ class BackEndResult:
     Attributes:
         keyframe: Keyframe that this result belongs to.
         adjustment: Local bundle adjustment around the keyframe; None if there was nothing to adjust.
-        readout: Estimate of the camera's readout after the adjustment.
         loop_correction: Loop that ends at the keyframe, with corrected poses; None if no loop was detected.
         times: Computation time of each stage, by name of the stage.
     """
 
     keyframe: Keyframe
     adjustment: LocalAdjustment | None
-    readout: Readout
     loop_correction: LoopCorrection | None
     times: dict[str, StageTime]
 
@@ -89,8 +85,6 @@ class BackEnd:
         self.keyframe = self._get_result = None
         if result.adjustment is not None:
             result.adjustment.apply(self._map)
-        if result.readout != self._map.readout:
-            self._map.set_readout(result.readout)
         T_new_old = None
         if result.loop_correction is not None:
             T_new_old = self._loop_closer.correct_loop(result.loop_correction, self._map)
@@ -119,10 +113,7 @@ class BackEnd:
         with torch.inference_mode(inference):
             with timer("bundle"):
                 adjustment = local_bundle_adjust(self._map, keyframe, self._config, self._camera)
-                readout = self._map.readout
-                if adjustment is not None:
-                    readout = calibrate_readout(self._map, adjustment, self._config, self._camera)
             with timer("loop"):
                 T_cw = self._map.T_cw if adjustment is None else adjustment.T_cw
                 loop_correction = self._loop_closer.detect_loop(keyframe, self._map, T_cw)
-        return BackEndResult(keyframe, adjustment, readout, loop_correction, timer.times)
+        return BackEndResult(keyframe, adjustment, loop_correction, timer.times)

@@ -68,7 +68,7 @@ def calibrate_camera(
     estimates = [
         *ParameterSelection(SelfCalibration(tables, camera, config, given)).estimates,
         _estimate_delay(views, trajectory, camera, given),
-        _estimate_scale(groundtruth, trajectory, camera, given),
+        *_estimate_scale(groundtruth, trajectory, camera, given),
     ]
     taken = {each.name: each.value for each in estimates if each.taken}
     return Calibration(with_values(given, taken), tuple(estimates))
@@ -91,9 +91,12 @@ def _estimate_delay(
 
 def _estimate_scale(
     groundtruth: Trajectory | None, trajectory: Trajectory, camera: PinholeCamera, given: PinholeCamera
-) -> Estimate:
-    """Estimate the depth scale from measured poses."""
+) -> list[Estimate]:
+    """Estimate the depth scale from measured poses; depth in floating point has none."""
+    if camera.depth_scale is None or given.depth_scale is None:
+        return []
     measured = None if groundtruth is None else metric_scale(groundtruth, trajectory)
     ratio, sigma = (math.nan, math.inf) if measured is None else measured
     value = camera.depth_scale / ratio
-    return decide("depth_scale", given.depth_scale, value, value * sigma / ratio, _SCALE_TOLERANCE * given.depth_scale)
+    tolerance = _SCALE_TOLERANCE * given.depth_scale
+    return [decide("depth_scale", given.depth_scale, value, value * sigma / ratio, tolerance)]

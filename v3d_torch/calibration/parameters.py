@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from v3d_torch.geometry.camera import MAX_INVERSE_DEPTH_OFFSET, MAX_READOUT, PinholeCamera
+from v3d_torch.geometry.distortion import COEFFICIENTS
 
-DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-"""Names of the distortion coefficients, in their order."""
+DISTORTION = frozenset(name for names in COEFFICIENTS.values() for name in names)
+"""Names of the distortion coefficients of all models."""
 
 DERIVATIVE_STEPS = {
     **dict.fromkeys(("fx", "fy", "cx", "cy"), 0.1),
@@ -58,13 +59,22 @@ GROUPS = (
     ParameterGroup("focal length", ("fx", "fy")),
     ParameterGroup("readout", ("readout",), tolerance=0.002),
     ParameterGroup("principal point", ("cx", "cy")),
-    ParameterGroup("radial distortion", ("k1", "k2", "k3")),
+    ParameterGroup("radial distortion", ("k1", "k2", "k3", "k4", "k5", "k6")),
     ParameterGroup("inverse-depth offset", ("inverse_depth_offset",), tolerance=0.005),
     ParameterGroup("tangential distortion", ("p1", "p2")),
 )
 """Groups in the order in which they are freed: by their effect on the images, and a group before those that resemble
 it. A tangential distortion can hardly be told from a shift of the principal point. The tolerances mean 2 pixels at
 the upper and lower border of an image that moves by 2000 pixels per second, and 2 cm at a depth of 2 m."""
+
+
+def groups_of(camera: PinholeCamera) -> list[ParameterGroup]:
+    """Return the groups with the parameters that a camera has: its model has only some of the coefficients."""
+    absent = DISTORTION - set(COEFFICIENTS[camera.distortion_model])
+    kept = [
+        replace(group, parameters=tuple(each for each in group.parameters if each not in absent)) for group in GROUPS
+    ]
+    return [group for group in kept if group.parameters]
 
 
 def get_values(camera: PinholeCamera, readout: float, names: Iterable[str]) -> list[float]:
@@ -75,7 +85,7 @@ def get_values(camera: PinholeCamera, readout: float, names: Iterable[str]) -> l
         readout: Readout, seconds; that of the camera can be unknown.
         names: Names of parameters.
     """
-    values = vars(camera) | dict(zip(DISTORTION, camera.distortion, strict=True)) | {"readout": readout}
+    values = vars(camera) | _coefficients(camera) | {"readout": readout}
     return [float(values[name]) for name in names]
 
 
@@ -86,7 +96,11 @@ def with_values(camera: PinholeCamera, values: Mapping[str, float]) -> PinholeCa
         camera: Camera.
         values: New values by name.
     """
-    coefficients = zip(DISTORTION, camera.distortion, strict=True)
     fields: dict[str, Any] = {name: value for name, value in values.items() if name not in DISTORTION}
-    fields["distortion"] = tuple(values.get(name, coefficient) for name, coefficient in coefficients)
+    fields["distortion"] = tuple(values.get(name, coefficient) for name, coefficient in _coefficients(camera).items())
     return replace(camera, **fields)
+
+
+def _coefficients(camera: PinholeCamera) -> dict[str, float]:
+    """Distortion coefficients by name, in their order."""
+    return dict(zip(COEFFICIENTS[camera.distortion_model], camera.distortion, strict=True))

@@ -94,7 +94,12 @@ def check_plausibility(
 
 
 def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
-    """Compare depth with the range of RGB-D cameras, and its steps with those of the Kinect."""
+    """Compare depth with the range of RGB-D cameras, and its steps with those of the Kinect.
+
+    Depth in floating point has no scale.
+    """
+    if camera.depth_scale is None:
+        return []
     own = [view for view in views if not view.keyframe.is_from_earlier_run]
     step = max(-(-len(own) // _DEPTH_VIEWS), 1)
     depth = torch.cat([torch.zeros(0), *(view.depth[view.depth > 0] for view in own[::step])])

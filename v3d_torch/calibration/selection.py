@@ -16,10 +16,10 @@ from torch import Tensor
 
 from v3d_torch.calibration.parameters import (
     DERIVATIVE_STEPS,
-    GROUPS,
     PIXEL_TOLERANCE,
     ParameterGroup,
     get_values,
+    groups_of,
     with_values,
 )
 from v3d_torch.calibration.problem import AdjustedMap, SelfCalibration
@@ -115,7 +115,7 @@ class ParameterSelection:
         self.free: list[ParameterGroup] = []
         self.fit = _Fit({}, torch.zeros(0, 0, dtype=torch.float64))
         self.left: list[Estimate] = []
-        for group in GROUPS:
+        for group in groups_of(problem.given):
             self._free_if_told(group)
         while (confirmed := self._most_confirmed()) is not None:
             self._leave(confirmed, self.fit, AGREES)

@@ -291,6 +291,8 @@ class RollingShutterConfig(Section):
     readout_sigma: float = Field(0.015, gt=0)
     """Standard deviation of the expected readout, seconds: a global shutter and the slowest one are both within 2 of
     it."""
+    calibration_keyframes: int = Field(20, ge=0)
+    """Number of first keyframes that update the readout; after them every tenth does."""
 
 
 class MappingConfig(Section):

@@ -133,67 +133,41 @@ def bundle_adjust(
     return T_cw, points, chi2, cost_before, cost, iteration
 
 
-@device
-def _subtract_explained(
-    T_cw: Array, points: Array, scale: Array, pose: Index, first: Index, row: Index, min_depth: float,
-    xi: Array, delta: Array, j: Array,
-) -> None:  # fmt: skip
-    """Add the change of the residuals by a step of poses and points to the residuals ``j``, (M, 3)."""
-    J = np.empty((3, 6))
-    for p in range(len(points)):
-        for m in range(first[p], first[p + 1]):
-            T = T_cw[pose[m]]
-            x, y, z = transform(T, points[p, 0], points[p, 1], points[p, 2])
-            w = 1 / max(z, min_depth)
-            perspective_jacobian(x * w, y * w, w, J)
-            for i in range(3):
-                change = 0.0
-                for k in range(3):
-                    change += (J[i, 0] * T[0, k] + J[i, 1] * T[1, k] + J[i, 2] * T[2, k]) * delta[p, k]
-                for k in range(6 if row[m] >= 0 else 0):
-                    change += J[i, k] * xi[row[m], k]
-                j[m, i] += scale[i, m] * change
-
-
-@kernel("(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,:,::1], f8, f8, f8)")
+@kernel("(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)")
 def reduced_cost_derivatives(
     T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, pose: Index, first: Index,
-    free: Index, jacobian: Array, damping: float, regularisation: float, min_depth: float,
-) -> tuple[Array, Array]:  # fmt: skip
-    """Derivatives of the minimum cost over poses and points by C parameters, as sums over each pose's observations.
+    free: Index, j: Array, damping: float, regularisation: float, min_depth: float,
+) -> tuple[float, float]:  # fmt: skip
+    """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
 
     Args:
-        T_cw: Poses, (K, 4, 4).
-        points: Points, world frame, (P, 3).
+        T_cw: Poses at the minimum, (K, 4, 4).
+        points: Points at the minimum, world frame, (P, 3).
         scale: Scale of the whitened residuals, (3, M).
         offset: Offset of the whitened residuals, (3, M).
         chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
         pose: Pose of each observation, sorted by point, (M,).
         first: First observation of each point, and M, (P + 1,).
         free: Indices of the poses that move, (F,).
-        jacobian: Derivatives of the whitened residuals by the parameters, (C, M, 3).
-        damping: Damping of the step that follows a change of a parameter.
+        j: Derivative of the whitened residuals by the parameter, (M, 3).
+        damping: Damping of the step that follows a change of the parameter.
         regularisation: Added to the diagonal of the normal equations.
         min_depth: Smallest depth of a projected point, metres.
 
     Returns:
-        First derivatives (K, C) and second derivatives (K, C, C).
+        First and second derivative.
     """
-    F, P, M, C = len(free), len(points), len(pose), len(jacobian)
-    row = _find_rows(pose, free, len(T_cw))
+    F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
     r, weights, chi2, W = np.empty((M, 3)), np.empty(M), np.empty(M), np.empty((M, 3, 6))
-    U, V, remaining = np.empty((F, 6, 7)), np.empty((P, 3, 4)), jacobian.copy()
-    gradient, hessian = np.zeros((len(T_cw), C)), np.zeros((len(T_cw), C, C))
+    U, V, j_U, j_V = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((F, 6, 7)), np.empty((P, 3, 4))
     _compute_residuals(T_cw, points, scale, offset, chi2_thresholds, pose, first, min_depth, r, weights, chi2)
-    for c in range(C):
-        _linearise(T_cw, points, scale, pose, first, row, min_depth, jacobian[c], weights, U, V, W)
-        xi, delta = solve_normal_equations(U, V, W, row, first, damping, regularisation)
-        _subtract_explained(T_cw, points, scale, pose, first, row, min_depth, xi, delta, remaining[c])
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, j, weights, j_U, j_V, W)
+    xi, delta = solve_normal_equations(j_U, j_V, W, row, first, damping, regularisation)
+    slope = (xi * U[:, :, 6]).sum() + (delta * V[:, :, 3]).sum()
+    curvature = (xi * j_U[:, :, 6]).sum() + (delta * j_V[:, :, 3]).sum()
     for m in range(M):
-        for c in range(C):
-            for i in range(3):
-                j = 2 * weights[m] * remaining[c, m, i]
-                gradient[pose[m], c] += j * r[m, i]
-                for d in range(C):
-                    hessian[pose[m], c, d] += j * remaining[d, m, i]
-    return gradient, hessian
+        for i in range(3):
+            slope += weights[m] * j[m, i] * r[m, i]
+            curvature += weights[m] * j[m, i] * j[m, i]
+    return 2 * slope, 2 * curvature

@@ -7,13 +7,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.config import Config
+from v3d_torch.config import Config, RollingShutterConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.map_observations import select_observations
+from v3d_torch.mapping.readout_calibration import calibrate_readout
+from v3d_torch.mapping.reduced_cost import readout_cost_derivatives
 from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.odometry.rolling_shutter import Readout
 
 _MAX_ITERATIONS = 5
 """Maximum number of Levenberg-Marquardt steps."""
@@ -21,6 +24,9 @@ _MAX_ITERATIONS = 5
 _COST_TOLERANCE = 1e-5
 """Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations:
 a smaller change is a small fraction of one, and the next keyframe continues from there."""
+
+_LATE_CALIBRATION_INTERVAL = 10
+"""Interval in keyframes of the readout calibration after the first keyframes, for later rotations of the camera."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +38,14 @@ class LocalAdjustment:
         landmarks: IDs of the adjusted landmarks, int64, shape :math:`(P,)`.
         points: Positions of the adjusted landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
         outliers: Rows of the outliers in the table of observations, int64, shape :math:`(O,)`.
+        readout: Estimate of the camera's readout after the adjustment.
     """
 
     T_cw: Tensor
     landmarks: Tensor
     points: Tensor
     outliers: Tensor
+    readout: Readout
 
     def apply(self, sparse_map: SparseMap) -> None:
         """Write the result to the map that was adjusted, in place; the map must have no newer keyframe.
@@ -49,10 +57,8 @@ class LocalAdjustment:
         sparse_map.move_keyframes(self.T_cw)
         sparse_map.landmarks["point"][self.landmarks] = self.points
         sparse_map.remove_observations(self.outliers)
-
-    def points_of(self, sparse_map: SparseMap) -> Tensor:
-        """Return the positions of all landmarks, adjusted or unchanged, float64, shape :math:`(L, 3)`."""
-        return sparse_map.landmarks["point"].index_copy(0, self.landmarks, self.points)
+        if self.readout != sparse_map.readout:
+            sparse_map.set_readout(self.readout)
 
 
 def local_bundle_adjust(
@@ -88,6 +94,18 @@ def local_bundle_adjust(
         iterations=_MAX_ITERATIONS,
         tolerance=_COST_TOLERANCE,
     )
+    readout = sparse_map.readout
+    if _is_calibration_due(sparse_map, keyframe, config.rolling_shutter):
+        derivatives = readout_cost_derivatives(
+            result.T_cw, result.points, selected.observations, camera, fixed, selected.readout_jacobian
+        )
+        readout = calibrate_readout(readout, *derivatives)
     T_cw[keyframes[~fixed]] = orthonormalise(result.T_cw[~fixed])
     outliers = selected.rows[result.chi2 > selected.observations.chi2_threshold]
-    return LocalAdjustment(T_cw, selected.landmarks, result.points, outliers)
+    return LocalAdjustment(T_cw, selected.landmarks, result.points, outliers, readout)
+
+
+def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: RollingShutterConfig) -> bool:
+    """Check whether the adjustment of a new keyframe calibrates the readout."""
+    is_due = keyframe.index <= config.calibration_keyframes or keyframe.index % _LATE_CALIBRATION_INTERVAL == 0
+    return is_due and config.enabled and not sparse_map.readout.is_certain

@@ -26,32 +26,7 @@ _NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
 
 
-def _reduced_cost_derivatives_compiled(
-    T_cw: Tensor,
-    points: Tensor,
-    observations: Observations,
-    camera: PinholeCamera,
-    fixed: Tensor,
-    jacobian: Tensor,
-) -> tuple[Tensor, Tensor]:
-    if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
-        return NotImplemented
-    order, problem = sort_by_point(observations, camera, fixed, len(points))
-    derivatives = kernels.reduced_cost_derivatives(
-        to_array(T_cw),
-        to_array(points),
-        *problem,
-        np.ascontiguousarray(jacobian.numpy()[order].transpose(2, 0, 1)),
-        _NEGLIGIBLE_DAMPING,
-        REGULARISATION,
-        MIN_DEPTH,
-    )
-    gradient, hessian = map(torch.from_numpy, derivatives)
-    return gradient, hessian
-
-
 @torch.no_grad()
-@compiled_by(_reduced_cost_derivatives_compiled)
 def reduced_cost_derivatives(
     T_cw: Tensor,
     points: Tensor,
@@ -88,3 +63,50 @@ def reduced_cost_derivatives(
         gradient.new_zeros(K, C).index_add_(0, pose, gradient),
         hessian.new_zeros(K, C, C).index_add_(0, pose, hessian),
     )
+
+
+def _readout_cost_derivatives_compiled(
+    T_cw: Tensor,
+    points: Tensor,
+    observations: Observations,
+    camera: PinholeCamera,
+    fixed: Tensor,
+    uv_jacobian: Tensor,
+) -> tuple[float, float]:
+    if T_cw.dtype != torch.float64 or points.dtype != torch.float64:
+        return NotImplemented
+    order, problem = sort_by_point(observations, camera, fixed, len(points))
+    derivative = np.zeros((len(order), 3))
+    derivative[:, :2] = to_array(-uv_jacobian / observations.pixel_sigma[:, None])[order]
+    return kernels.reduced_cost_derivatives(
+        to_array(T_cw), to_array(points), *problem, derivative, _NEGLIGIBLE_DAMPING, REGULARISATION, MIN_DEPTH
+    )
+
+
+@torch.no_grad()
+@compiled_by(_readout_cost_derivatives_compiled)
+def readout_cost_derivatives(
+    T_cw: Tensor,
+    points: Tensor,
+    observations: Observations,
+    camera: PinholeCamera,
+    fixed: Tensor,
+    uv_jacobian: Tensor,
+) -> tuple[float, float]:
+    """Derivatives of the minimum cost of a bundle adjustment with respect to one parameter of the measured pixels.
+
+    Args:
+        T_cw: World-to-camera poses at the minimum, float64, shape :math:`(K, 4, 4)`.
+        points: Positions of the landmarks at the minimum, world frame, metres, float64, shape :math:`(P, 3)`.
+        observations: Observations of the points by the poses.
+        camera: Intrinsics.
+        fixed: True for poses that stay unchanged, bool, shape :math:`(K,)`.
+        uv_jacobian: Derivative of the measured pixels with respect to the parameter, float64, shape :math:`(M, 2)`.
+
+    Returns:
+        First and second derivative of the minimum cost with respect to the parameter.
+    """
+    by_pixel = -uv_jacobian / observations.pixel_sigma[:, None]
+    whitened = torch.cat([by_pixel, torch.zeros_like(by_pixel[:, :1])], dim=1)[..., None]
+    gradient, hessian = reduced_cost_derivatives(T_cw, points, observations, camera, fixed, whitened)
+    return float(gradient.sum()), float(hessian.sum())

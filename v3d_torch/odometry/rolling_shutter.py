@@ -37,11 +37,6 @@ class Readout:
     information: float
 
     @property
-    def sigma(self) -> float:
-        """Standard deviation, seconds; 0 if the readout is known exactly."""
-        return self.information**-0.5
-
-    @property
     def is_certain(self) -> bool:
         """True if the readout is known exactly and needs no calibration."""
         return math.isinf(self.information)

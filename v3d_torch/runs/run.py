@@ -11,6 +11,7 @@ import torch
 
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets import RGBDStream
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_text
@@ -76,6 +77,7 @@ class Run:
             folder / "masks" if request.save_masks else None,
             viewer,
             None if known_map is None else known_map.views,
+            skip_broken=request.skip_broken,
         )
         if checkpoint is not None:
             remove_unfinished(folder)
@@ -97,6 +99,8 @@ class Run:
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
+        if isinstance(sequence, ImageSequence) and sequence.depth_scale_note is not None:
+            _LOG.warning(sequence.depth_scale_note)
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"
