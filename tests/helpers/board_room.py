@@ -14,7 +14,7 @@ from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.types import Trajectory
 
-CAMERA = PinholeCamera(260.0, 260.0, 159.5, 119.5, width=320, height=240)
+CAMERA = PinholeCamera(260.0, 260.0, 159.5, 119.5, width=320, height=240, depth_scale=5000.0)
 RATE = 30.0
 BOARDS = 10
 

@@ -20,7 +20,7 @@ def camera_text(camera: PinholeCamera, comments: Mapping[str, str] | None = None
     lines = []
     for name, value in asdict(camera).items():
         field = {name: list(value) if isinstance(value, tuple) else value}
-        text = yaml.safe_dump(field, default_flow_style=None, width=1000).rstrip()
+        text = yaml.safe_dump(field, default_flow_style=True, width=1000).strip()[1:-1]  # without the braces
         comment = (comments or {}).get(name)
         lines.append(text if comment is None else f"{text}  # {comment}")
     return "\n".join(lines) + "\n"

@@ -20,7 +20,7 @@ from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.mapping.bundle_adjustment import BundleProblem, Observations, sort_by_point
 from v3d_torch.optim.reprojection import MIN_DEPTH
-from v3d_torch.optim.schur import REGULARISATION
+from v3d_torch.optim.schur import REGULARISATION, solve_normal_equations
 
 _NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -106,7 +106,18 @@ def readout_cost_derivatives(
     Returns:
         First and second derivative of the minimum cost with respect to the parameter.
     """
-    by_pixel = -uv_jacobian / observations.pixel_sigma[:, None]
-    whitened = torch.cat([by_pixel, torch.zeros_like(by_pixel[:, :1])], dim=1)[..., None]
-    gradient, hessian = reduced_cost_derivatives(T_cw, points, observations, camera, fixed, whitened)
-    return float(gradient.sum()), float(hessian.sum())
+    problem = BundleProblem(observations, camera, fixed, len(points))
+    residuals = problem.residuals_at((T_cw, points))[1]
+    j = torch.zeros_like(residuals.whitened)
+    j[:2] = (-uv_jacobian / observations.pixel_sigma[:, None])[problem.order].T
+    change = problem.linearise(residuals, j[None])
+    pose_step, point_step = solve_normal_equations(change, _NEGLIGIBLE_DAMPING)
+    first, second = (  # j^T W r without the part that the step explains, and the same for j in place of r
+        float(
+            (residuals.weights * j * each).sum()
+            + (pose_step * equations.U[..., 6:]).sum()
+            + (point_step.permute(1, 2, 0) * equations.V[:, 3:]).sum()
+        )
+        for each, equations in ((residuals.whitened, residuals.normal_equations), (j, change))
+    )
+    return 2 * first, 2 * second
