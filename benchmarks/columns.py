@@ -34,6 +34,16 @@ LOST = {
     "passes": "passes",
 }
 
+CALIBRATION = {
+    "sequence": "sequence",
+    "change": "wrong in the camera file",
+    "parameter": "parameter",
+    "right": "right",
+    "given": "given",
+    "estimated": "estimated",
+    "result": "result",
+}
+
 SEGMENTATION = {
     "network": "network",
     "ms": "ms",

@@ -108,6 +108,18 @@ def lost_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield from part(text, flat(rows_of(measurements), columns.LOST), measurements, "sequence")
 
 
+def calibration_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on calibration."""
+    yield "## Calibration"
+    text = (
+        "The camera file of each sequence is made wrong, and `v3d-torch calibrate --segmenter none` estimates the camera"
+        " from the images. A parameter is taken if the recording tells it within its tolerance, and if it differs"
+        " significantly from the given one. The right values of a recording are those of its data set, which can differ"
+        " by some pixels from the truth."
+    )
+    yield from part(text, flat(rows_of(measurements), columns.CALIBRATION), measurements, "sequence")
+
+
 def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on masks and ids of objects."""
     yield "## Objects: masks and ids"
@@ -197,6 +209,7 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("speed", "stages"), speed_section),
     (("growth", "keyframes"), growth_section),
     (("lost",), lost_section),
+    (("calibration",), calibration_section),
     (("ablation",), objects_section),
     (("segmentation",), segmentation_section),
     (("maps", "map_costs"), maps_section),

@@ -38,8 +38,8 @@ _TRIM_INTERVAL = 200
 """Frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 _CHECKED_KEYFRAMES = 15
-"""Number of keyframes at which camera and depth are first checked: some seconds of a moving camera. They are checked
-again at the end."""
+"""Number of keyframes at which camera and depth are checked: some seconds of a moving camera. A shorter run is checked at
+its end. A check takes up to a second, so it is not repeated."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
@@ -180,7 +180,8 @@ class Pipeline:
     def flush(self) -> None:
         """Apply the pending result of the back end, check the camera and show the final state, after the last frame."""
         self.slam.flush()
-        self._check_plausibility()
+        if not self.record.was_checked:
+            self._check_plausibility()
         with self.slam.timer("plausibility"):
             self._warn(check_colour_order(self.views, self.slam.segment))
         try:
@@ -226,17 +227,21 @@ class Pipeline:
         if keyframes and keyframes[-1].frame == frame.index:
             static = result.static_without_people
             self.views.add(keyframes[-1], frame.image, frame.depth, static, frame.depth_delay)
-            if len(self.views) >= _CHECKED_KEYFRAMES and not self.record.was_checked:
+            if not self.record.was_checked and self._own_view_count() >= _CHECKED_KEYFRAMES:
                 self._check_plausibility()
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
 
     def _check_plausibility(self) -> None:
         """Check whether camera and depth agree with the map so far, and record what does not."""
-        slam, record = self.slam, self.record
+        slam = self.slam
         with slam.timer("plausibility"):
             warnings = check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config)
-        record.was_checked, record.warnings = True, [each for each in record.warnings if each in warnings]
-        self._warn(each for each in warnings if each not in record.warnings)
+        self.record.was_checked = True
+        self._warn(warnings)
+
+    def _own_view_count(self) -> int:
+        """Number of views of this run, without those of a known map."""
+        return sum(not view.keyframe.is_from_earlier_run for view in self.views)
 
     def _warn(self, warnings: Iterable[str]) -> None:
         """Log and record warnings."""

@@ -144,8 +144,8 @@ class RunRecord:
         interrupted: True if the user interrupted the run.
         mask_error: Reason why the masks were not evaluated although there are true masks; None if there is none.
         save_error: Reason why a checkpoint could not be written; None if there is none.
-        warnings: Contradictions between the images and the camera, one sentence each, from the latest check.
-        was_checked: True once the map had enough keyframes for the first check of the camera.
+        warnings: Contradictions between the images and the camera, one sentence each.
+        was_checked: True once camera and depth were checked.
     """
 
     times: FrameTimes = field(default_factory=FrameTimes)
