@@ -38,8 +38,8 @@ _TRIM_INTERVAL = 200
 """Frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 _CHECKED_KEYFRAMES = 15
-"""Number of keyframes at which camera and depth are checked: some seconds of a moving camera. A shorter run is checked at
-its end. A check takes up to a second, so it is not repeated."""
+"""Number of keyframes at which camera and depth are checked: some seconds of a moving camera. A shorter run is checked
+at its end. A check takes up to a second, so it is not repeated."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 

@@ -1,0 +1,48 @@
+"""Command ``v3d-torch calibrate`` as users call it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from helpers.commands import assert_error_line
+from typer.testing import CliRunner, Result
+
+from v3d_torch.cli import calibrate
+from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.camera_text import camera_text
+from v3d_torch.datasets.cameras import load_camera
+from v3d_torch.datasets.demo.sequence import write_sequence
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sequence") / "walk"
+    write_sequence(folder, range(0, 60, 4))
+    return folder
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(calibrate.app, list(map(str, arguments)), env={"COLUMNS": "200"})
+
+
+def test_wrong_focal_lengths_are_found_again(sequence: Path, tmp_path: Path) -> None:
+    right = load_sequence(str(sequence)).camera
+    (tmp_path / "wrong.yaml").write_text(camera_text(replace(right, fx=1.15 * right.fx, fy=1.15 * right.fy)))
+    out = tmp_path / "camera.yaml"
+    done = call("--seq", sequence, "--camera", tmp_path / "wrong.yaml", "--segmenter", "none", "--out", out)
+    assert done.exit_code == 0, done.stderr
+    found, text = load_camera(out), out.read_text()
+    assert found.fx == pytest.approx(right.fx, rel=0.03) and found.fy == pytest.approx(right.fy, rel=0.03)
+    assert "# Calibrated by v3d-torch calibrate from " in text and " +- " in text
+    assert "taken" in done.stdout and f"camera: {out}" in done.stdout
+
+
+def test_existing_file_and_unknown_sequence_are_errors(sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text("")
+    assert_error_line(
+        call("--seq", sequence, "--out", tmp_path / "camera.yaml"), "already exists; choose another file with --out"
+    )
+    assert_error_line(call("--seq", "gone_folder", "--out", tmp_path / "new.yaml"), "gone_folder")
+    assert not (tmp_path / "new.yaml").exists()
