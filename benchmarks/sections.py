@@ -114,8 +114,8 @@ def calibration_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     text = (
         "The camera file of each sequence is made wrong, and `v3d-torch calibrate --segmenter none` estimates the"
         " camera from the images. A parameter is taken if the recording tells it within its tolerance, and if it"
-        " differs significantly from the given one. The right values of a recording are those of its data set, which can differ"
-        " by some pixels from the truth."
+        " differs significantly from the given one. The right values of a recording are those of its data set, which"
+        " can differ by some pixels from the truth."
     )
     yield from part(text, flat(rows_of(measurements), columns.CALIBRATION), measurements, "sequence")
 
