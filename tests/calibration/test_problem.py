@@ -9,7 +9,7 @@ import torch
 from helpers.calibration_map import PIXEL_SIGMA, TRUE, make_map
 from torch import Tensor
 
-from v3d_torch.calibration.parameters import get_values, groups_of
+from v3d_torch.calibration.parameters import DERIVATIVE_STEPS, LIMITS, get_values, groups_of, with_values
 from v3d_torch.calibration.problem import SelfCalibration
 from v3d_torch.calibration.selection import covariance
 from v3d_torch.config import Config
@@ -108,3 +108,9 @@ def test_given_values_hold_for_parameters_that_are_not_free() -> None:
     assert float(problem.minimise(("cx",))[0][0]) == pytest.approx(TRUE.cx, abs=0.05)
     free = problem.minimise(("fx",))[0]
     assert abs(float(free[0]) - TRUE.fx) > 0.1  # biased by the wrong principal point
+
+
+def test_differences_at_the_limits_are_those_of_accepted_cameras() -> None:
+    for value in LIMITS["inverse_depth_offset"]:
+        for sign in (1, -1):
+            with_values(TRUE, {"inverse_depth_offset": value + sign * DERIVATIVE_STEPS["inverse_depth_offset"]})

@@ -26,9 +26,12 @@ tolerance of undistortion, 1e-6 pixels, does not matter, small enough that the r
 _MIN_FOCAL_LENGTH = 10.0
 """Smallest focal length of a step, pixels."""
 
+_MAX_OFFSET = MAX_INVERSE_DEPTH_OFFSET - 2 * DERIVATIVE_STEPS["inverse_depth_offset"]
+"""Largest inverse-depth offset of a step: the differences around it are still accepted by a camera, 1/m."""
+
 LIMITS = {
     "readout": (-MAX_READOUT, MAX_READOUT),
-    "inverse_depth_offset": (-MAX_INVERSE_DEPTH_OFFSET, MAX_INVERSE_DEPTH_OFFSET),
+    "inverse_depth_offset": (-_MAX_OFFSET, _MAX_OFFSET),
     "fx": (_MIN_FOCAL_LENGTH, math.inf),
     "fy": (_MIN_FOCAL_LENGTH, math.inf),
 }
