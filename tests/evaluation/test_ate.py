@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,7 +91,7 @@ def test_convention_positions_span_plane_from_one_millimetre(count: int) -> None
     corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64)
     corners = corners.repeat(count // 4, 1) + 5
     for spread, plane in (([1, 1.01e-3, 0], True), ([1, 0.99e-3, 0.99e-3], False), ([0, 1.01e-3, 1.01e-3], True)):
-        assert spans_plane(corners * torch.tensor(spread, dtype=torch.float64)) is plane
+        assert bool(spans_plane(corners * torch.tensor(spread, dtype=torch.float64))) is plane
 
 
 @pytest.mark.parametrize(("size", "is_error"), [(1.49, False), (1.51, True), (1 / 1.49, False), (1 / 1.51, True)])
@@ -112,7 +111,7 @@ def test_scale_error_requires_three_quarters_of_variance_explained() -> None:
         estimate = truth.clone()
         estimate[:, 1, 3] = noise * torch.tensor([1.0, 1, -1, -1])
         estimate[:, :3, 3] /= 3
-        alignment = replace(align(truth, truth), T_ge=torch.eye(4, dtype=torch.float64))
+        alignment = align(truth, truth)._replace(T_ge=torch.eye(4, dtype=torch.float64))
         assert (scale_error(truth, estimate, alignment) is not None) is is_error
 
 

@@ -109,7 +109,7 @@ def test_alignment_is_deterministic_for_any_number_of_threads() -> None:
     aligner = DenseAligner(DenseOdometryConfig(halvings=(4, 1), iterations=2), LENS)
 
     def run() -> DenseAlignment | None:
-        return aligner(aligner.view(*a, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), MOTION)
+        return aligner.align_views(aligner.view(*a, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), MOTION)
 
     first, second = run(), run()
     torch.set_num_threads(2)
@@ -121,7 +121,7 @@ def test_alignment_is_deterministic_for_any_number_of_threads() -> None:
         assert first is not None and other is not None
         assert torch.equal(first.T_ba, other.T_ba)
         assert torch.equal(first.information, other.information)
-        assert replace(first, T_ba=0, information=0) == replace(other, T_ba=0, information=0)
+        assert first._replace(T_ba=0, information=0) == other._replace(T_ba=0, information=0)
 
 
 # ---------------------------------------------------------------------------------------------- rejection
@@ -167,7 +167,7 @@ def test_too_little_overlap_gives_none() -> None:
     b = render(T_ba)
     for min_overlap, accepted in ((0.3, False), (0.1, True)):
         aligner = DenseAligner(DenseOdometryConfig(min_overlap=min_overlap, min_observability=1e-6), LENS)
-        alignment = aligner(aligner.view(*A, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), T_ba)
+        alignment = aligner.align_views(aligner.view(*A, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), T_ba)
         assert (alignment is not None) is accepted
 
 
@@ -204,4 +204,4 @@ def test_random_images_with_invalid_values_give_none(seed: int) -> None:
         return aligner.view(grey, depth, torch.rand(49, 67, generator=generator) < 0.9)
 
     T_ba = se3_exp(3 * torch.randn(6, generator=generator, dtype=torch.float64))
-    assert aligner(view(), view(), T_ba) is None
+    assert aligner.align_views(view(), view(), T_ba) is None

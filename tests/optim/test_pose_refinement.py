@@ -16,7 +16,7 @@ from v3d_torch.optim.reprojection import Measurements, reprojection_residuals
 
 
 def refine(T_cw: Tensor, points: Tensor, measured: Measurements) -> PoseRefinement:
-    return refine_pose(T_cw, points, measured, CAMERA)
+    return refine_pose(T_cw, points, K=CAMERA.K, **vars(measured))
 
 
 def perturb(T_cw: Tensor, scale: float = 0.03) -> Tensor:
@@ -30,7 +30,7 @@ def test_refined_pose_equals_the_optimum_of_scipy() -> None:
 
     def residuals(xi: np.ndarray) -> np.ndarray:
         T = se3_exp(torch.from_numpy(xi)) @ T_cw
-        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)[inliers].flatten().numpy()
+        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA.K)[inliers].flatten().numpy()
 
     best = scipy.optimize.least_squares(residuals, np.zeros(6), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     expected = se3_exp(torch.from_numpy(best.x)) @ T_cw
@@ -85,7 +85,7 @@ def test_one_measurement_with_depth_determines_the_distance() -> None:
         pixel_sigma=torch.ones(1, dtype=torch.float64),
         inverse_depth_sigma=INVERSE_DEPTH_SIGMA,
     )
-    refined = refine_pose(torch.eye(4, dtype=torch.float64), points, measured, CAMERA)
+    refined = refine(torch.eye(4, dtype=torch.float64), points, measured)
     in_camera = refined.T_cw[:3, :3] @ points[0] + refined.T_cw[:3, 3]
     assert abs(float(in_camera[2]) - 1.9) < 1e-3
     assert refined.inliers.tolist() == [True]

@@ -157,7 +157,7 @@ class PinholeCamera:
         Returns:
             Float64, shape :math:`(N, 2)`.
         """
-        return (uv.to(torch.float64) - self._principal_point) / self.focal_lengths
+        return (uv.to(torch.float64) - self._principal_point.to(uv.device)) / self.focal_lengths.to(uv.device)
 
     def _project_normalised(self, xy: Tensor) -> Tensor:
         """Distorted pixels at normalised image coordinates, by the Brown-Conrady model, both (N, 2) and float64."""
@@ -167,7 +167,7 @@ class PinholeCamera:
             r2 = xy.square().sum(dim=1, keepdim=True)
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             xy = xy * (radial + 2 * (xy @ tangential)[:, None]) + r2 * tangential
-        return xy * self.focal_lengths + self._principal_point
+        return xy * self.focal_lengths.to(xy.device) + self._principal_point.to(xy.device)
 
     def project(self, points: Tensor) -> Tensor:
         r"""Project points to undistorted pixels: :math:`u = f_x x / z + c_x,\; v = f_y y / z + c_y`.

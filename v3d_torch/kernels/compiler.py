@@ -15,6 +15,7 @@ from threading import Lock
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -139,11 +140,24 @@ def to_array(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
+def can_read(tensor: Tensor) -> bool:
+    """Check whether the values of a tensor can be read at once.
+
+    Those of another device would have to be waited for; those of meta tensors, and of tensors that `torch.func`
+    transforms or a compiler traces, do not exist.
+    """
+    is_traced = torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling()
+    return type(tensor) is Tensor and tensor.device.type == "cpu" and not is_traced
+
+
+def is_all_true(mask: Tensor) -> bool:
+    """Check whether a mask is true everywhere; False if its values cannot be read at once."""
+    return can_read(mask) and bool(mask.all())
+
+
 def _is_plain(argument: object) -> bool:
     """Check whether an argument is no tensor, or one on the CPU without gradients."""
-    if not isinstance(argument, Tensor):
-        return True
-    return type(argument) is Tensor and argument.device.type == "cpu" and not argument.requires_grad
+    return not isinstance(argument, Tensor) or (can_read(argument) and not argument.requires_grad)
 
 
 @cache
