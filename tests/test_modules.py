@@ -87,6 +87,7 @@ class Case:
         inputs: Function from batch size, number of elements and dtype to the inputs.
         masks: Name of the mask of each padded argument.
         differentiable: Names of the arguments with a gradient.
+        sampled: True if compiled code draws other random samples than torch.
         gradcheck: False for iterative solvers, whose tests compare the gradients with converged finite differences.
     """
 
@@ -96,6 +97,7 @@ class Case:
     masks: dict[str, str]
     differentiable: tuple[str, ...] = ()
     gradcheck: bool = True
+    sampled: bool = False
 
 
 CLOUD, PAIR = {"points": "valid"}, {"p": "p_valid", "q": "q_valid"}
@@ -137,6 +139,8 @@ CASES = {
         TWICE,
         ("previous", "current", "T_current_previous"),
     ),
+}
+CAMERA_CASES = {
     "DescriptorMatcher": Case(
         v3d.DescriptorMatcher(60, 0.9),
         partial(v3d.match_descriptors, max_hamming=60, max_ratio=0.9),
@@ -148,12 +152,14 @@ CASES = {
         partial(v3d.essential_ransac, threshold=2.0, iterations=50),
         camera_inputs.two_views,
         {"uv_a": "valid", "uv_b": "valid"},
+        sampled=True,
     ),
     "PnPRANSAC": Case(
         v3d.PnPRANSAC(3.0, 50),
         partial(v3d.pnp_ransac, threshold=3.0, iterations=50),
         camera_inputs.points_in_view,
         {"points": "valid", "uv": "valid"},
+        sampled=True,
     ),
     "PoseRefiner": Case(
         v3d.PoseRefiner(1.0, 0.02, rounds=1, iterations=30, tolerance=1e-14),
@@ -203,6 +209,7 @@ CASES = {
         dict.fromkeys(("T_gc", "T_ec", "stamps"), "valid"),
     ),
 }
+CASES |= CAMERA_CASES
 each = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 each_padded = pytest.mark.parametrize(
     "case", [i for i in CASES.values() if i.masks], ids=[n for n, i in CASES.items() if i.masks]
@@ -312,6 +319,33 @@ def test_module_can_be_copied_and_pickled(case: Case) -> None:
     twin.load_state_dict(case.module.state_dict())
     assert_same(twin(**inputs), expected)
     assert not list(case.module.parameters())  # settings are numbers unless a parameter is given
+
+
+each_of_the_camera = pytest.mark.parametrize("case", CAMERA_CASES.values(), ids=CAMERA_CASES)
+
+
+@each_of_the_camera
+def test_module_can_be_mapped_over_a_batch(case: Case) -> None:
+    """`torch.func.vmap` traces the torch functions; without it, compiled code may run."""
+    inputs = case.inputs(2, 20, torch.float64)
+
+    def apply(*row: Tensor) -> tuple[Tensor, ...]:
+        return tensors(case.module(**dict(zip(inputs, row, strict=True))))
+
+    mapped = torch.func.vmap(apply)(*inputs.values())
+    for one, other in zip(mapped, tensors(case.module(**inputs)), strict=True):
+        if case.sampled:
+            assert one.shape == other.shape and one.dtype == other.dtype
+        else:
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6, equal_nan=True)
+
+
+@each_of_the_camera
+def test_shapes_do_not_depend_on_values(case: Case) -> None:
+    inputs = case.inputs(2, 20, torch.float64)
+    expected = tensors(case.module(**inputs))
+    found = tensors(case.module(**{name: each.to("meta") for name, each in inputs.items()}))
+    assert [(each.shape, each.dtype) for each in found] == [(each.shape, each.dtype) for each in expected]
 
 
 # ---------------------------------------------------------------- gradients

@@ -193,7 +193,7 @@ def _minimise_compiled(
         chi2[order] = squared
         results.append((*moved, chi2, cost_before, cost_after, steps))
     columns = (torch.from_numpy(np.stack(column)) for column in zip(*results, strict=True))
-    return _Minimum(*(column.reshape(*batch, *column.shape[1:]) for column in columns))
+    return _Minimum(*(column.reshape((*batch, *column.shape[1:])) for column in columns))
 
 
 @torch.no_grad()

@@ -167,7 +167,7 @@ class DenseAligner(torch.nn.Module):
         failed = _failed_alignment(grey_a.device)  # also the first of all, which is dropped, so that none can be stacked
         rows = [failed, *(failed if alignment is None else alignment for alignment in alignments)]
         stacked = (torch.stack(list(column))[1:] for column in zip(*rows, strict=True))
-        return DenseAlignment(*(column.reshape(*batch, *column.shape[1:]) for column in stacked))
+        return DenseAlignment(*(column.reshape((*batch, *column.shape[1:])) for column in stacked))
 
     @torch.no_grad()
     def align_views(self, a: DenseView, b: DenseView, T_ba: Tensor) -> DenseAlignment | None:

@@ -174,9 +174,22 @@ def refine_pose(
         The refined poses and their inliers, with the dtype of ``T_cw``. Without measurements, the predictions.
 
     Example:
-        Learn the weights of features from their descriptors, through the poses of 32 frames:
+        Learn the weights of features through the poses of 32 frames:
 
-        >>> frames = torch.load("frames.pt")  # doctest: +SKIP
+        >>> import torch, v3d_torch as v3d
+        >>> T_cw, K = torch.eye(4).repeat(32, 1, 1), torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        >>> points = torch.rand(32, 50, 3) * 2 + torch.tensor([-1.0, -1.0, 2.0])
+        >>> quality = torch.rand(32, 50, 1)  # something known about each feature
+        >>> noise = 5 * (1 - quality) * torch.randn(32, 50, 2)
+        >>> uv = 500 * points[..., :2] / points[..., 2:] + K[:2, 2] + noise
+        >>> network = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.Softplus())
+        >>> optimiser = torch.optim.Adam(network.parameters(), lr=0.1)
+        >>> for _ in range(10):
+        ...     refined = v3d.refine_pose(T_cw, points, uv, K, weights=network(quality)[..., 0], rounds=1)
+        ...     loss = v3d.se3_log(refined.T_cw).square().sum()  # the true poses are the identity
+        ...     optimiser.zero_grad()
+        ...     loss.backward()
+        ...     optimiser.step()
     """
     KORNIA_CHECK_SHAPE(T_cw, ["*", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
@@ -235,7 +248,7 @@ def _minimise_compiled(
     settings = rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
     results = [kernels.refine_pose(*row, *settings) for row in zip(*rows, strict=True)]
     T, inliers, active, chi2, H = (
-        torch.from_numpy(np.stack(column)).reshape(*batch, *column[0].shape) for column in zip(*results, strict=True)
+        torch.from_numpy(np.stack(column)).reshape((*batch, *column[0].shape)) for column in zip(*results, strict=True)
     )
     return PoseRefinement(orthonormalise(T), inliers, chi2, H), active
 
