@@ -163,9 +163,7 @@ CAMERA_CASES = {
     ),
     "PoseRefiner": Case(
         v3d.PoseRefiner(1.0, 0.02, rounds=1, iterations=30, tolerance=1e-14),
-        partial(
-            v3d.refine_pose, inverse_depth_sigma=0.02, rounds=1, iterations=30, tolerance=1e-14
-        ),
+        partial(v3d.refine_pose, inverse_depth_sigma=0.02, rounds=1, iterations=30, tolerance=1e-14),
         camera_inputs.view,
         dict.fromkeys(("points", "uv", "inverse_depth", "weights"), "valid"),
         ("points", "uv", "K", "weights"),

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from v3d_torch.features.matching import hamming_distance, match_by_projection, match_descriptors
+from v3d_torch.kernels.compiler import ENABLED, TWINS
 
 
 def _descriptors(count: int, seed: int) -> torch.Tensor:
@@ -62,6 +63,29 @@ def test_too_few_descriptors_have_no_matches() -> None:
     for count in ((1, 5), (5, 1)):
         a, b = map(_descriptors, count, (0, 0))
         assert match_descriptors(a, b, max_hamming=64, max_ratio=1.0).tolist() == [-1] * count[0]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 99), st.integers(0, 30), st.integers(0, 30))
+def test_matches_with_padding_are_those_without_it(seed: int, rows: int, columns: int) -> None:
+    """Both implementations; many descriptors are equal, so that the first of several nearest ones counts."""
+    generator = torch.Generator().manual_seed(seed)
+    a, b = (
+        torch.randint(0, 4, (2, count, 32), generator=generator, dtype=torch.uint8) // 3 for count in (rows, columns)
+    )
+    a_valid, b_valid = (torch.rand(each.shape[:2], generator=generator) < 0.7 for each in (a, b))
+    limits = {"max_hamming": 40, "max_ratio": 1.0}
+    found = match_descriptors(a, b, a_valid, b_valid, **limits)
+    twin = TWINS["v3d_torch.features.matching.match_descriptors"]
+    if ENABLED:
+        assert torch.equal(
+            twin.compiled(a, b, a_valid, b_valid, **limits), twin.torch(a, b, a_valid, b_valid, **limits)
+        )
+    for k in range(2):
+        expected = torch.full((rows,), -1)
+        pairs = _pairs(match_descriptors(a[k, a_valid[k]], b[k, b_valid[k]], **limits))
+        expected[a_valid[k].nonzero()[pairs[:, 0], 0]] = b_valid[k].nonzero()[pairs[:, 1], 0]
+        assert torch.equal(found[k], expected)
 
 
 def _match(projected: torch.Tensor, uv: torch.Tensor, a: torch.Tensor, b: torch.Tensor, **kwargs) -> list[list[int]]:

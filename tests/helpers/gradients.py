@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 
-def check_gradients(function: Callable[..., Tensor], *inputs: Tensor, step: float = 1e-3, tolerance: float = 1e-4) -> bool:
+def check_gradients(
+    function: Callable[..., Tensor], *inputs: Tensor, step: float = 1e-3, tolerance: float = 1e-4
+) -> bool:
     """Compare gradients with finite differences in random directions.
 
     A minimum of a cost is known to half of the digits, so that the steps are larger than those for a formula.

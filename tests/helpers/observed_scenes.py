@@ -60,7 +60,6 @@ class Scene:
         self.start = torch.where(self.fixed[:, None, None], self.T_cw, se3_exp(error) @ self.T_cw)
         self.start_points = self.points + 0.02 * normal(points, 3)
 
-
     @property
     def observations(self) -> dict[str, Any]:
         """Arguments of `bundle_adjust` beside the initial poses and points."""

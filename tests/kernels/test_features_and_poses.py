@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+import v3d_torch.odometry.rolling_shutter  # noqa: F401 - registers the kernel
 from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.features.projection_matcher import LocalMap, ProjectionMatcher
@@ -13,7 +14,6 @@ from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 from v3d_torch.odometry.depth_delay import DepthDelayCompensation
-import v3d_torch.odometry.rolling_shutter  # noqa: F401 - registers the kernel
 from v3d_torch.optim.reprojection import Measurements
 
 pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")

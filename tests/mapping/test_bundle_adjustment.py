@@ -36,9 +36,7 @@ def test_damped_step_equals_the_dense_solution() -> None:
 
     fixed = ~torch.isin(torch.arange(4), free)
     optional = dict.fromkeys(("weights", "valid"))
-    problem, state = prepare_bundle(
-        scene.start, scene.start_points, **scene.observations | {"fixed": fixed} | optional
-    )
+    problem, state = prepare_bundle(scene.start, scene.start_points, **scene.observations | {"fixed": fixed} | optional)
     _, at_start = problem.residuals_at(state)
     xi, shift = solve_normal_equations(problem.linearise(at_start, points=12), damping)
     torch.testing.assert_close(torch.cat([xi.T.flatten(), shift.T.flatten()]), expected, rtol=1e-7, atol=1e-9)
@@ -191,8 +189,6 @@ def test_cost_without_a_fixed_pose_reaches_the_same_minimum() -> None:
 
 def test_result_is_deterministic() -> None:
     scene = Scene(poses=6, points=200, observers=4)
-    first, second = (
-        scene.adjust() for _ in range(2)
-    )
+    first, second = (scene.adjust() for _ in range(2))
     assert torch.equal(first.T_cw, second.T_cw)
     assert torch.equal(first.points, second.points)

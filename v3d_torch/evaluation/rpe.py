@@ -55,8 +55,8 @@ def rpe(
     .. math::
         E_i = \left( T_{ei}^{-1} T_{ej} \right) \left( T_{gi}^{-1} T_{gj} \right)^{-1}
 
-    for the pose j nearest to ``delta`` after pose i. Pairs that span a gap, or end in the last pose, do not count, as in
-    the benchmark's tool. Differentiable in both trajectories.
+    for the pose j nearest to ``delta`` after pose i. Pairs that span a gap, or end in the last pose, do not count, as
+    in the benchmark's tool. Differentiable in both trajectories.
 
     Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
 
@@ -199,8 +199,6 @@ class RelativePoseError(torch.nn.Module):
         super().__init__()
         self.delta = delta
 
-    def forward(
-        self, T_gc: Tensor, T_ec: Tensor, stamps: Tensor, valid: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, T_gc: Tensor, T_ec: Tensor, stamps: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the errors of trajectories :math:`(*, N, 4, 4)`, metres and degrees; see :func:`rpe`."""
         return rpe(T_gc, T_ec, stamps, valid, delta=self.delta)

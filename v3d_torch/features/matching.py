@@ -146,13 +146,9 @@ class DescriptorMatcher(torch.nn.Module):
         self.max_hamming = max_hamming
         self.max_ratio = max_ratio
 
-    def forward(
-        self, a: Tensor, b: Tensor, a_valid: Tensor | None = None, b_valid: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, a: Tensor, b: Tensor, a_valid: Tensor | None = None, b_valid: Tensor | None = None) -> Tensor:
         """Match descriptors :math:`(*, N, D)` and :math:`(*, M, D)`; see :func:`match_descriptors`."""
-        return match_descriptors(
-            a, b, a_valid, b_valid, max_hamming=self.max_hamming, max_ratio=self.max_ratio
-        )
+        return match_descriptors(a, b, a_valid, b_valid, max_hamming=self.max_hamming, max_ratio=self.max_ratio)
 
 
 def _match_by_projection_compiled(

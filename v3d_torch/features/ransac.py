@@ -122,7 +122,7 @@ def pnp_ransac(
         if initial_guess is not None:
             yield initial_guess.detach().expand(*batch, 4, 4), torch.ones_like(done)
         if not can_read(data[1]):
-            yield _sample_p3p(*(each.to(torch.float64) for each in data), mask, *settings)
+            yield _sample_p3p(*_to_float64(*data), mask, *settings)
             return
         yield _sample_epnp(*data, mask, ~done, _SUBSET_SIZE, *settings)
         yield _sample_epnp(*data, mask, ~done & (count > _SUBSET_SIZE), None, *settings)
@@ -137,6 +137,10 @@ def pnp_ransac(
         if is_all_true(done):
             break
     return PnP(T_cw, inliers, found)
+
+
+def _to_float64(points: Tensor, uv: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return points.to(torch.float64), uv.to(torch.float64), K.to(torch.float64)
 
 
 def _sample_epnp(
@@ -228,5 +232,9 @@ class PnPRANSAC(torch.nn.Module):
         valid: Tensor | None = None,
     ) -> PnP:
         """Estimate poses from points :math:`(*, N, 3)` at pixels :math:`(*, N, 2)`; see :func:`pnp_ransac`."""
-        settings = {"threshold": self.threshold, "iterations": self.iterations, "seed": self.seed}
-        return pnp_ransac(points, uv, K, initial_guess, valid, **settings)
+        return pnp_ransac(
+            *(points, uv, K, initial_guess, valid),
+            threshold=self.threshold,
+            iterations=self.iterations,
+            seed=self.seed,
+        )

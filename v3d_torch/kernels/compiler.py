@@ -140,6 +140,11 @@ def to_array(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
+def to_rows(tensor: Tensor, batch: torch.Size) -> NDArray[Any]:
+    """Return a batch of tensors as an array with one dimension for all dimensions of the batch."""
+    return to_array(tensor.reshape(batch.numel(), *tensor.shape[len(batch) :]))
+
+
 def can_read(tensor: Tensor) -> bool:
     """Check whether the values of a tensor can be read at once.
 

@@ -52,9 +52,7 @@ def _linearise(
     return cost
 
 
-@kernel(
-    "(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], b1[::1], i8, i8, f8, f8, f8, UniTuple(f8, 4))"
-)
+@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], b1[::1], i8, i8, f8, f8, f8, UniTuple(f8, 4))")
 def refine_pose(
     T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
@@ -78,7 +76,8 @@ def refine_pose(
         damping_schedule: First, smallest and largest damping, and the factor between two steps.
 
     Returns:
-        Pose (4, 4), inliers (N,), measurements of the last round (N,), squared residuals (N,), information matrix (6, 6).
+        Pose (4, 4), inliers (N,), measurements that took part in the last round (N,), squared residuals (N,),
+        information matrix (6, 6).
     """
     first_damping, min_damping, max_damping, factor = damping_schedule
     count = len(points)

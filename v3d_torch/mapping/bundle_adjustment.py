@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.kernels import bundle_adjustment as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.compiler import compiled_by, to_rows
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
 from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt
@@ -100,8 +100,8 @@ def bundle_adjust(
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured, as it is by default.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
-        fixed: Poses that stay unchanged, bool, shape :math:`(*, P)`; only the first by default. Without a fixed pose the
-            world frame can drift.
+        fixed: Poses that stay unchanged, bool, shape :math:`(*, P)`; only the first by default. Without a fixed pose
+            the world frame can drift.
         weights: Weight of each observation, not negative, shape :math:`(*, M)`; 1 by default.
         valid: Observations that are not padding, bool, shape :math:`(*, M)`; all by default.
         iterations: Maximum number of Levenberg-Marquardt steps.
@@ -118,9 +118,7 @@ def bundle_adjust(
         found = _minimise(*start, *problem.detach(), iterations, tolerance)
         state = problem.differentiate((found.T_cw, found.points), initial[0])
         cost_after, residuals = problem.residuals_at(state)
-        found = found._replace(
-            T_cw=state[0], points=state[1], chi2=problem.chi2(residuals), cost_after=cost_after
-        )
+        found = found._replace(T_cw=state[0], points=state[1], chi2=problem.chi2(residuals), cost_after=cost_after)
     else:
         found = _minimise(*start, *problem, iterations, tolerance)
     chi2 = found.chi2 if valid is None else torch.where(valid, found.chi2, torch.inf)
@@ -159,8 +157,7 @@ def sort_by_point(
     """Yield, for each problem of a batch, the order that sorts observations by point, and arguments of the kernels."""
     batch = fixed.shape[:-1]
     columns = scale, offset, thresholds, weights, pose, point, fixed
-    rows = (to_array(each.reshape(batch.numel(), *each.shape[len(batch) :])) for each in columns)
-    for row in zip(*rows, strict=True):
+    for row in zip(*(to_rows(each, batch) for each in columns), strict=True):
         order = np.argsort(row[5], kind="stable")
         of_points = np.searchsorted(row[5][order], np.arange(points + 1))
         # Observations are the last dimension.
@@ -185,10 +182,9 @@ def _minimise_compiled(
         return NotImplemented
     settings = iterations, tolerance, REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
     problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
-    poses, landmarks = (each.reshape(batch.numel(), *each.shape[len(batch) :]) for each in (T_cw, points))
     results = []
-    for state, (order, problem) in zip(zip(to_array(poses), to_array(landmarks), strict=True), problems, strict=True):
-        *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(*state, *problem, *settings)
+    for T, X, (order, problem) in zip(to_rows(T_cw, batch), to_rows(points, batch), problems, strict=True):
+        *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(*(T, X, *problem, *settings))
         chi2 = np.empty_like(squared)
         chi2[order] = squared
         results.append((*moved, chi2, cost_before, cost_after, steps))
@@ -214,9 +210,7 @@ def _minimise(
     """Minimise the robust cost, without gradients."""
     problem = BundleProblem(scale, offset, thresholds, weights, pose, point, fixed)
     found = levenberg_marquardt((T_cw, points), problem.residuals_at, problem.step, iterations, tolerance)
-    return _Minimum(
-        *found.state, problem.chi2(found.system), found.cost_before, found.cost_after, found.iterations
-    )
+    return _Minimum(*found.state, problem.chi2(found.system), found.cost_before, found.cost_after, found.iterations)
 
 
 class BundleAdjuster(torch.nn.Module):

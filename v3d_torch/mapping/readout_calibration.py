@@ -14,10 +14,10 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.kernels import bundle_adjustment as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.compiler import compiled_by, to_rows
 from v3d_torch.mapping.bundle_adjustment import sort_by_point
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
-from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
+from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH, fill_padding
 from v3d_torch.optim.schur import REGULARISATION, solve_normal_equations
 
 _PRIOR_WEIGHT = 0.8
@@ -79,26 +79,24 @@ def estimate_readout(
         valid: Observations that are not padding, bool, shape :math:`(*, M)`; all by default.
 
     Returns:
-        The new ``seconds`` and ``information``, with the dtype of ``T_cw``, shape :math:`(*)` each. They are the earlier
-        ones if these are known, or if the cost has no minimum because the camera stood still or moved uniformly.
+        The new ``seconds`` and ``information``, with the dtype of ``T_cw``, shape :math:`(*)` each. They are the
+        earlier ones if these are known, or if the cost has no minimum because the camera stood still or moved
+        uniformly.
     """
     problem, state = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
     )
-    sigma = pixel_sigma[..., None] if isinstance(pixel_sigma, Tensor) else pixel_sigma
-    derivative = -readout_jacobian.to(torch.float64) / sigma
-    if valid is not None:
-        derivative = torch.where(valid[..., None], derivative, 0.0)
+    sigma = fill_padding(pixel_sigma, valid, 1.0)[..., None] if isinstance(pixel_sigma, Tensor) else pixel_sigma
+    derivative = -fill_padding(readout_jacobian, None if valid is None else valid[..., None], 0.0) / sigma
     by_readout = torch.cat([derivative, torch.zeros_like(derivative[..., :1])], dim=-1).mT.expand_as(problem.scale)
     slope, curvature = reduced_cost_derivatives(*state, *problem, by_readout)
-    prior = (torch.as_tensor(each, dtype=torch.float64, device=uv.device) for each in (seconds, information))
-    new_seconds, new_information = combine_readouts(*prior, slope, curvature)
+    old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
+    old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
+    new_seconds, new_information = combine_readouts(old_seconds, old_information, slope, curvature)
     return new_seconds.to(T_cw.dtype), new_information.to(T_cw.dtype)
 
 
-def combine_readouts(
-    seconds: Tensor, information: Tensor, slope: Tensor, curvature: Tensor
-) -> tuple[Tensor, Tensor]:
+def combine_readouts(seconds: Tensor, information: Tensor, slope: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
     """Combine an estimate of the readout with the minimum of the cost.
 
     Args:
@@ -135,12 +133,11 @@ def _reduced_cost_derivatives_compiled(
     if 0 in batch:
         return NotImplemented
     problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
-    columns = T_cw, points, derivative.mT
-    rows = (to_array(each.reshape(batch.numel(), *each.shape[len(batch) :])) for each in columns)
+    poses, landmarks, derivatives = to_rows(T_cw, batch), to_rows(points, batch), to_rows(derivative.mT, batch)
     settings = _NEGLIGIBLE_DAMPING, REGULARISATION, MIN_DEPTH
     results = [
         kernels.reduced_cost_derivatives(T, X, *problem, j[order], *settings)
-        for T, X, j, (order, problem) in zip(*rows, problems, strict=True)
+        for T, X, j, (order, problem) in zip(poses, landmarks, derivatives, problems, strict=True)
     ]
     slope, curvature = torch.from_numpy(np.array(results)).unbind(dim=1)
     return slope.reshape(batch), curvature.reshape(batch)
@@ -187,13 +184,15 @@ def reduced_cost_derivatives(
     steps = solve_normal_equations(change, _NEGLIGIBLE_DAMPING)
     weighted = residuals.weights[..., None, :] * derivative
     slope, curvature = (
-        sum(
-            (a * b).sum(dim=(-2, -1))
-            for a, b in ((weighted, r), (steps[0], equations.pose_gradient), (steps[1], equations.point_gradient))
-        )
+        _inner(weighted, r) + _inner(steps[0], equations.pose_gradient) + _inner(steps[1], equations.point_gradient)
         for r, equations in ((residuals.whitened, own), (derivative, change))
     )
     return 2 * slope, 2 * curvature
+
+
+def _inner(a: Tensor, b: Tensor) -> Tensor:
+    """Inner products of matrices (..., n, m), (...)."""
+    return (a * b).sum(dim=(-2, -1))
 
 
 class ReadoutEstimator(torch.nn.Module):
@@ -229,6 +228,4 @@ class ReadoutEstimator(torch.nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Improve readouts, shape :math:`(*)`, by M observations; see :func:`estimate_readout`."""
         observed = uv, pose, point, K, inverse_depth, self.pixel_sigma, self.inverse_depth_sigma
-        return estimate_readout(
-            seconds, information, readout_jacobian, T_cw, points, *observed, fixed, weights, valid
-        )
+        return estimate_readout(seconds, information, readout_jacobian, T_cw, points, *observed, fixed, weights, valid)

@@ -86,8 +86,8 @@ def align_depth(
     and with gain and bias between the two images. The pairs of a batch are aligned one after the other, because the
     number of usable pixels of each differs. Without gradients.
 
-    Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Dense Visual SLAM for RGB-D Cameras,
-    IROS 2013.
+    Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Dense Visual SLAM for RGB-D
+    Cameras, IROS 2013.
 
     Args:
         grey_a: Brightness of the reference images, from 0 to 1, with lens distortion, floating point, shape
@@ -157,14 +157,18 @@ class DenseAligner(torch.nn.Module):
         columns = (
             *(image.to(torch.float32).expand(*batch, 1, *size).reshape(-1, 1, *size) for image in images),
             motion.expand(*batch, 4, 4).reshape(-1, 4, 4),
-            *((pixels if static is None else static).expand(*batch, *size).reshape(-1, *size)
-              for static in (static_a, static_b)),
+            *(
+                (pixels if static is None else static).expand(*batch, *size).reshape(-1, *size)
+                for static in (static_a, static_b)
+            ),
         )
         alignments = [
             self._align(self.view(grey_a, depth_a, static_a), self.view(grey_b, depth_b, static_b), T_ba)
             for grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b in zip(*columns, strict=True)
         ]
-        failed = _failed_alignment(grey_a.device)  # also the first of all, which is dropped, so that none can be stacked
+        failed = _failed_alignment(
+            grey_a.device
+        )  # also the first of all, which is dropped, so that none can be stacked
         rows = [failed, *(failed if alignment is None else alignment for alignment in alignments)]
         stacked = (torch.stack(list(column))[1:] for column in zip(*rows, strict=True))
         return DenseAlignment(*(column.reshape((*batch, *column.shape[1:])) for column in stacked))
@@ -214,7 +218,9 @@ class DenseAligner(torch.nn.Module):
         T_ba, (gain, _) = orthonormalise(result.state[0]), result.state[1]
         residuals, config = problem.residuals(result.state), self._config
         (brightness, inverse_depth), valid_brightness = problem.reference.values.to(torch.float64), residuals.valid[0]
-        inliers = residuals.valid[1] & (residuals.values[1].abs() <= self._MAX_DEPTH_SIGMAS * config.inverse_depth_sigma)
+        inliers = residuals.valid[1] & (
+            residuals.values[1].abs() <= self._MAX_DEPTH_SIGMAS * config.inverse_depth_sigma
+        )
         rms = [r[v].square().mean().sqrt() for r, v in zip(residuals.values, residuals.valid, strict=True)]
         information = problem.information(result.system, valid_brightness)
         scale = torch.ones_like(information[0])

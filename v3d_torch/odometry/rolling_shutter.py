@@ -85,16 +85,22 @@ def _compensate_compiled(
     readout_jacobian: Tensor | None = None,
     valid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    columns = uv, row.to(torch.float64), inverse_depth, velocity, K
     is_single = uv.ndim == 2 and velocity.ndim == 1 and K.ndim == 2 and row.shape == inverse_depth.shape == uv.shape[:1]
-    if not is_single or any(each.dtype != torch.float64 for each in columns) or isinstance(readout, Tensor):
+    if not is_single or any(each.dtype != torch.float64 for each in (uv, inverse_depth, velocity, K)):
         return NotImplemented
-    if readout_jacobian is None or valid is not None:
+    if isinstance(readout, Tensor) or readout_jacobian is None or valid is not None:
         return NotImplemented
-    compensated = kernels.compensate_rolling_shutter(
-        *(to_array(each) for each in (*columns, readout_jacobian)), readout, height
+    new_uv, new_jacobian = kernels.compensate_rolling_shutter(
+        to_array(uv),
+        to_array(row.to(torch.float64)),
+        to_array(inverse_depth),
+        to_array(velocity),
+        to_array(K),
+        to_array(readout_jacobian),
+        readout,
+        height,
     )
-    return torch.from_numpy(compensated[0]), torch.from_numpy(compensated[1])
+    return torch.from_numpy(new_uv), torch.from_numpy(new_jacobian)
 
 
 @compiled_by(_compensate_compiled)
@@ -123,8 +129,8 @@ def compensate_rolling_shutter(
         uv: Undistorted pixels, as observed or compensated with ``readout_jacobian``, floating point, shape
             :math:`(*, N, 2)`. All inputs are computed with in float64.
         row: Row of each pixel in the recorded image, shape :math:`(*, N)`.
-        inverse_depth: Inverse depth of each pixel, 1/m, shape :math:`(*, N)`; 0 = not measured, such a pixel is moved as
-            one that is infinitely far.
+        inverse_depth: Inverse depth of each pixel, 1/m, shape :math:`(*, N)`; 0 = not measured, such a pixel is moved
+            as one that is infinitely far.
         velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, shape
             :math:`(*, 6)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
         readout: Time from the first to the last row, seconds, a number or shape :math:`(*)`; negative if the rows are

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
-from v3d_torch.kernels.compiler import compiled_by, is_all_true, to_array
+from v3d_torch.kernels.compiler import compiled_by, is_all_true, to_rows
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt, select
 from v3d_torch.optim.reprojection import (
@@ -149,8 +149,8 @@ def refine_pose(
 
     The result is differentiable in all inputs except the prediction, by the implicit function theorem: memory does
     not grow with the iterations. The Hessian is that of the robust cost of the last round, with the dependence of the
-    robust weights on the residuals. The classification is constant. The derivatives are as accurate as the optimum: train with
-    a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
+    robust weights on the residuals. The classification is constant. The derivatives are as accurate as the optimum:
+    train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
 
     Mur-Artal and Tardos, ORB-SLAM2, T-RO 2017, Sec. III-C; Gould et al., On Differentiating Parameterized Argmin and
     Argmax Problems, 2016.
@@ -244,9 +244,9 @@ def _minimise_compiled(
     batch, problem = T_cw.shape[:-2], (points, scale, offset, thresholds, weights, valid)
     if 0 in batch:
         return NotImplemented
-    rows = (to_array(column.reshape(batch.numel(), *column.shape[len(batch) :])) for column in (T_cw, *problem))
     settings = rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
-    results = [kernels.refine_pose(*row, *settings) for row in zip(*rows, strict=True)]
+    rows = zip(*(to_rows(column, batch) for column in (T_cw, *problem)), strict=True)
+    results = [kernels.refine_pose(*(*row, *settings)) for row in rows]
     T, inliers, active, chi2, H = (
         torch.from_numpy(np.stack(column)).reshape((*batch, *column[0].shape)) for column in zip(*results, strict=True)
     )

@@ -126,11 +126,15 @@ def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
     if measured.uv.ndim != 2 or K.shape != (3, 3) or K.dtype != torch.float64 or isinstance(sigma, Tensor):
         return NotImplemented
     if any(
-        not isinstance(each, Tensor) or each.requires_grad or each.dtype != torch.float64 or len(each) != len(measured.uv)
+        not isinstance(each, Tensor)
+        or each.requires_grad
+        or each.dtype != torch.float64
+        or len(each) != len(measured.uv)
         for each in columns
     ):
         return NotImplemented
-    whitened = kernels.whiten(*map(to_array, columns), sigma, to_array(K))
+    uv, inverse_depth, pixel_sigma = (to_array(each) for each in columns if isinstance(each, Tensor))
+    whitened = kernels.whiten(uv, inverse_depth, pixel_sigma, sigma, to_array(K))
     return WhitenedMeasurements(*map(torch.from_numpy, whitened))
 
 
@@ -212,8 +216,8 @@ def reprojection_jacobian(points: Tensor, measured: Measurements, K: Tensor) -> 
         K: Camera matrix, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Shape :math:`(..., M, 3, 6)`; the first three columns are the Jacobian by ``points``, too. A transposed view: the
-        measurements are contiguous in memory.
+        Shape :math:`(..., M, 3, 6)`; the first three columns are the Jacobian by ``points``, too. A transposed view:
+        the measurements are contiguous in memory.
     """
     scale = whiten(measured, K).scale
     return (perspective_jacobian(perspective(points.mT)) * scale[..., None, :, :]).movedim(-1, -3).mT
