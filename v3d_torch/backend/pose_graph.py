@@ -20,7 +20,7 @@ from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_e
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
-from v3d_torch.optim.reprojection import fill_padding
+from v3d_torch.runtime.batches import common_batch, fill_padding
 
 _REGULARISATION = 1e-9
 """Added to the diagonal of the normal equations, so that they have a solution for poses without any edge; negligible
@@ -202,7 +202,7 @@ def _prepare(
     robust: float | None,
 ) -> tuple[_Graph, Tensor]:
     """Graph and initial poses in float64, with the batch dimensions of all inputs."""
-    batch = torch.broadcast_shapes(T_wc.shape[:-3], edges.shape[:-2], T_ij.shape[:-3])
+    batch = common_batch(T_wc.shape[:-3], edges.shape[:-2], T_ij.shape[:-3])
     count, device = edges.shape[-2], T_wc.device
     identity = torch.eye(6, dtype=torch.float64, device=device)
     if fixed is None:

@@ -10,7 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
-from v3d_torch.optim.reprojection import fill_padding
+from v3d_torch.runtime.batches import fill_padding
 
 _MIN_PLANE_SPREAD = 1e-3
 """Minimum standard deviation of the positions along their second principal axis, metres. Positions with less spread do

@@ -12,6 +12,7 @@ from v3d_torch.evaluation.association import Matches
 from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.runtime.batches import common_batch
 from v3d_torch.types import Trajectory
 
 
@@ -75,7 +76,7 @@ def rpe(
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
-    batch = torch.broadcast_shapes(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1])
+    batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1])
     exists = stamps.new_ones(*batch, stamps.shape[-1], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
     order = torch.argsort(~exists, dim=-1, stable=True)  # padding last
     times = torch.where(exists, stamps.to(torch.float64), torch.inf).gather(-1, order)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
-from v3d_torch.optim.reprojection import fill_padding
+from v3d_torch.runtime.batches import fill_padding
 
 
 def umeyama(

@@ -17,7 +17,7 @@ from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather
 from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
 from v3d_torch.kernels.compiler import can_read
 from v3d_torch.optim.implicit import needs_gradient
-from v3d_torch.optim.reprojection import fill_padding
+from v3d_torch.runtime.batches import common_batch, fill_padding
 
 _MIN_PAIRS = 6
 """A sample of 5 pairs, and one more pair that can confirm its matrix."""
@@ -76,14 +76,15 @@ def essential_ransac(
     KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    batch = torch.broadcast_shapes(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2])
+    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2])
     mask = uv_a.new_ones(*batch, uv_a.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
+    weights = torch.ones_like(uv_a[..., 0]) if weights is None else weights
     row = None if valid is None else valid[..., None]
     problem = EpipolarProblem(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),
         b=_homogeneous(fill_padding(uv_b, row, 0.0).expand(*batch, -1, 2)),
         K_inverse=torch.linalg.inv(K.to(torch.float64)).expand(*batch, 3, 3),
-        weights=(mask.to(torch.float64) if weights is None else fill_padding(weights, valid, 0.0)).expand(*batch, -1),
+        weights=fill_padding(weights, valid, 0.0).expand(*batch, -1),
     )
     constant = EpipolarProblem(*(each.detach() for each in problem))
     with torch.no_grad():

@@ -18,6 +18,7 @@ from v3d_torch.kernels.compiler import can_read, is_all_true
 from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
 from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
+from v3d_torch.runtime.batches import common_batch
 
 _MIN_EPIPOLAR_PAIRS = 8
 """Pairs that determine a fundamental matrix (eight-point algorithm)."""
@@ -109,7 +110,7 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    batch = torch.broadcast_shapes(points.shape[:-2], uv.shape[:-2], K.shape[:-2])
+    batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2])
     mask = uv.new_ones(*batch, uv.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
     count = mask.sum(dim=-1)
     data = points.detach().expand(*batch, -1, 3), uv.detach().expand(*batch, -1, 2), K.detach().expand(*batch, 3, 3)

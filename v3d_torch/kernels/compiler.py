@@ -122,7 +122,7 @@ def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Call
 
         @wraps(function)
         def either(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-            if ENABLED and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
+            if ENABLED and not _is_traced() and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
                 if _TO_COMPILE:
                     deque(compile_kernels(), maxlen=0)
                 result = TWINS[name].compiled(*args, **kwargs)
@@ -140,19 +140,13 @@ def to_array(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
-def to_rows(tensor: Tensor, batch: torch.Size) -> NDArray[Any]:
-    """Return a batch of tensors as an array with one dimension for all dimensions of the batch."""
-    return to_array(tensor.reshape(batch.numel(), *tensor.shape[len(batch) :]))
-
-
 def can_read(tensor: Tensor) -> bool:
     """Check whether the values of a tensor can be read at once.
 
     Those of another device would have to be waited for; those of meta tensors, and of tensors that `torch.func`
     transforms or a compiler traces, do not exist.
     """
-    is_traced = torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling()
-    return type(tensor) is Tensor and tensor.device.type == "cpu" and not is_traced
+    return type(tensor) is Tensor and tensor.device.type == "cpu" and not _is_traced()
 
 
 def is_all_true(mask: Tensor) -> bool:
@@ -160,9 +154,16 @@ def is_all_true(mask: Tensor) -> bool:
     return can_read(mask) and bool(mask.all())
 
 
+def _is_traced() -> bool:
+    """Check whether `torch.func` or a compiler traces the computation."""
+    return torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling()
+
+
 def _is_plain(argument: object) -> bool:
     """Check whether an argument is no tensor, or one on the CPU without gradients."""
-    return not isinstance(argument, Tensor) or (can_read(argument) and not argument.requires_grad)
+    if not isinstance(argument, Tensor):
+        return True
+    return type(argument) is Tensor and argument.device.type == "cpu" and not argument.requires_grad
 
 
 @cache

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.kernels import bundle_adjustment as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_rows
+from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
 from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import REGULARISATION
+from v3d_torch.runtime.batches import from_rows, to_rows
 
 _Array = NDArray[Any]
 
@@ -188,8 +189,7 @@ def _minimise_compiled(
         chi2 = np.empty_like(squared)
         chi2[order] = squared
         results.append((*moved, chi2, cost_before, cost_after, steps))
-    columns = (torch.from_numpy(np.stack(column)) for column in zip(*results, strict=True))
-    return _Minimum(*(column.reshape((*batch, *column.shape[1:])) for column in columns))
+    return _Minimum(*from_rows(results, batch))
 
 
 @torch.no_grad()

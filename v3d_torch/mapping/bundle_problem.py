@@ -18,13 +18,13 @@ from v3d_torch.optim.implicit import jacobian, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.reprojection import (
     chi_square,
-    fill_padding,
     perspective,
     perspective_jacobian,
     prepare_measurements,
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
+from v3d_torch.runtime.batches import common_batch, fill_padding
 
 State = tuple[Tensor, Tensor]
 """Poses ``T_cw``, shape :math:`(..., P, 4, 4)`, and points, shape :math:`(..., L, 3)`."""
@@ -191,7 +191,7 @@ def prepare_bundle(
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     target = whiten(measured, K.to(torch.float64))
-    batch = torch.broadcast_shapes(T_cw.shape[:-3], points.shape[:-2], target.scale.shape[:-2], pose.shape[:-1])
+    batch = common_batch(T_cw.shape[:-3], points.shape[:-2], target.scale.shape[:-2], pose.shape[:-1])
     each = (*batch, pose.shape[-1])  # observation
     if fixed is None:
         fixed = torch.arange(T_cw.shape[-3], device=T_cw.device) == 0

@@ -8,17 +8,17 @@ estimate of the readout, and its curvature is the information of that estimate.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.kernels import bundle_adjustment as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_rows
+from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_adjustment import sort_by_point
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
-from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH, fill_padding
+from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import REGULARISATION, solve_normal_equations
+from v3d_torch.runtime.batches import fill_padding, from_rows, to_rows
 
 _PRIOR_WEIGHT = 0.8
 """Weight of the earlier information. Successive local bundle adjustments share most of their observations, and the
@@ -139,8 +139,8 @@ def _reduced_cost_derivatives_compiled(
         kernels.reduced_cost_derivatives(T, X, *problem, j[order], *settings)
         for T, X, j, (order, problem) in zip(poses, landmarks, derivatives, problems, strict=True)
     ]
-    slope, curvature = torch.from_numpy(np.array(results)).unbind(dim=1)
-    return slope.reshape(batch), curvature.reshape(batch)
+    slope, curvature = from_rows(results, batch)
+    return slope, curvature
 
 
 @compiled_by(_reduced_cost_derivatives_compiled)

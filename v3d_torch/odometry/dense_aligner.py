@@ -20,6 +20,7 @@ from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
 from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_marquardt
+from v3d_torch.runtime.batches import common_batch
 
 _COARSE_INVERSE_DEPTH_SIGMA = 0.02
 """Minimum standard deviation of inverse depth above the finest level, 1/m. It gives brightness more weight there: depth
@@ -151,7 +152,7 @@ class DenseAligner(torch.nn.Module):
         images = grey_a, depth_a, grey_b, depth_b
         for image in images:
             KORNIA_CHECK_SHAPE(image, ["*", "1", str(grey_a.shape[-2]), str(grey_a.shape[-1])])
-        batch, size = torch.broadcast_shapes(*(image.shape[:-3] for image in images)), grey_a.shape[-2:]
+        batch, size = common_batch(*(image.shape[:-3] for image in images)), grey_a.shape[-2:]
         pixels = grey_a.new_ones(size, dtype=torch.bool)
         motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
         columns = (

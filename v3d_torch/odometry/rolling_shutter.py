@@ -21,7 +21,7 @@ from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.optim.reprojection import fill_padding
+from v3d_torch.runtime.batches import fill_padding
 
 
 @dataclass(frozen=True)

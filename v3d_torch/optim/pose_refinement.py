@@ -11,26 +11,25 @@ from __future__ import annotations
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
-from v3d_torch.kernels.compiler import compiled_by, is_all_true, to_rows
+from v3d_torch.kernels.compiler import compiled_by, is_all_true
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt, select
 from v3d_torch.optim.reprojection import (
     INVERSE_DEPTH_SIGMA,
     MIN_DEPTH,
     chi_square,
-    fill_padding,
     perspective,
     perspective_jacobian,
     prepare_measurements,
     whiten,
 )
+from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
 _TOLERANCE = 1e-3
 """Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
@@ -116,6 +115,11 @@ class _Problem(NamedTuple):
         step = -torch.linalg.solve(H, gradient(zero, self))
         return se3_exp(zero_with_gradient(step)) @ T_cw
 
+    def expand(self, batch: torch.Size) -> _Problem:
+        dimensions = (2, 2, 2, 1, 1, 1)  # of each column, without those of the batch
+        columns = zip(self, dimensions, strict=True)
+        return _Problem(*(column.expand(*batch, *column.shape[column.ndim - count :]) for column, count in columns))
+
     def detach(self) -> _Problem:
         return _Problem(*(column.detach() for column in self))
 
@@ -196,19 +200,20 @@ def refine_pose(
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
-    target = whiten(measured, K.to(torch.float64))
-    batch = torch.broadcast_shapes(T_cw.shape[:-2], points.shape[:-2], target.scale.shape[:-2])
-    each = (*batch, points.shape[-2])  # measurement
-    mask = torch.ones(each, dtype=torch.bool, device=uv.device) if valid is None else valid.expand(each)
+    scale, offset = whiten(measured, K.to(torch.float64))
+    thresholds = measured.chi2_threshold
     problem = _Problem(
-        points=fill_padding(points, None if valid is None else valid[..., None], 0.0).expand(*each, 3),
-        scale=target.scale.expand(*batch, 3, -1),
-        offset=target.offset.expand(*batch, 3, -1),
-        thresholds=measured.chi2_threshold.expand(each),
-        weights=mask.to(torch.float64) if weights is None else fill_padding(weights, valid, 0.0).expand(each),
-        valid=mask,
+        points=fill_padding(points, None if valid is None else valid[..., None], 0.0),
+        scale=scale,
+        offset=offset,
+        thresholds=thresholds,
+        weights=fill_padding(torch.ones_like(thresholds) if weights is None else weights, valid, 0.0),
+        valid=torch.ones_like(thresholds, dtype=torch.bool) if valid is None else valid,
     )
-    initial = T_cw.detach().to(torch.float64).expand(*batch, 4, 4)
+    initial = T_cw.detach().to(torch.float64)
+    batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2])
+    if batch:
+        initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
     if not needs_gradient(*problem):
         return _cast(_minimise(initial, *problem, rounds, iterations, tolerance)[0], T_cw.dtype)
     found, active = _minimise(initial, *problem.detach(), rounds, iterations, tolerance)
@@ -224,6 +229,8 @@ def _is_robust(index: int, rounds: int) -> bool:
 
 
 def _cast(refined: PoseRefinement, dtype: torch.dtype) -> PoseRefinement:
+    if refined.T_cw.dtype == dtype:
+        return refined
     return PoseRefinement(
         refined.T_cw.to(dtype), refined.inliers, refined.chi2.to(dtype), refined.information.to(dtype)
     )
@@ -247,9 +254,7 @@ def _minimise_compiled(
     settings = rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
     rows = zip(*(to_rows(column, batch) for column in (T_cw, *problem)), strict=True)
     results = [kernels.refine_pose(*(*row, *settings)) for row in rows]
-    T, inliers, active, chi2, H = (
-        torch.from_numpy(np.stack(column)).reshape((*batch, *column[0].shape)) for column in zip(*results, strict=True)
-    )
+    T, inliers, active, chi2, H = from_rows(results, batch)
     return PoseRefinement(orthonormalise(T), inliers, chi2, H), active
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from v3d_torch.config import TrackingConfig
 from v3d_torch.kernels import whitening as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.runtime.batches import fill_padding
 
 CHI2_THRESHOLD_2D = 5.991
 """95 % quantile of the chi-square distribution with 2 degrees of freedom: inlier threshold for (u, v)."""
@@ -91,18 +92,6 @@ def prepare_measurements(
     )
 
 
-def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
-    """Convert values to float64, and replace those that are padding.
-
-    Args:
-        values: Any shape.
-        valid: Mask of the values that are not padding, a shape that broadcasts; None = all.
-        filler: Number to replace padding.
-    """
-    values = values.to(torch.float64)
-    return values if valid is None else torch.where(valid, values, filler)
-
-
 class WhitenedMeasurements(NamedTuple):
     """Measurements in whitened form: residual = ``scale * (x/z, y/z, 1/z) + offset``.
 
@@ -122,20 +111,19 @@ class WhitenedMeasurements(NamedTuple):
 
 
 def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
-    columns, sigma = (measured.uv, measured.inverse_depth, measured.pixel_sigma), measured.inverse_depth_sigma
-    if measured.uv.ndim != 2 or K.shape != (3, 3) or K.dtype != torch.float64 or isinstance(sigma, Tensor):
+    uv, inverse_depth, sigma = measured.uv, measured.inverse_depth, measured.pixel_sigma
+    if uv.ndim != 2 or K.shape != (3, 3) or isinstance(measured.inverse_depth_sigma, Tensor):
         return NotImplemented
-    if any(
-        not isinstance(each, Tensor)
-        or each.requires_grad
-        or each.dtype != torch.float64
-        or len(each) != len(measured.uv)
-        for each in columns
-    ):
+    if not isinstance(sigma, Tensor):
+        sigma = torch.full_like(inverse_depth, sigma)
+    if any(each.requires_grad or each.dtype != torch.float64 for each in (uv, inverse_depth, sigma, K)):
         return NotImplemented
-    uv, inverse_depth, pixel_sigma = (to_array(each) for each in columns if isinstance(each, Tensor))
-    whitened = kernels.whiten(uv, inverse_depth, pixel_sigma, sigma, to_array(K))
-    return WhitenedMeasurements(*map(torch.from_numpy, whitened))
+    if not len(uv) == len(inverse_depth) == sigma.numel():
+        return NotImplemented
+    arrays = to_array(uv), to_array(inverse_depth), to_array(sigma)
+    return WhitenedMeasurements(
+        *map(torch.from_numpy, kernels.whiten(*arrays, measured.inverse_depth_sigma, to_array(K)))
+    )
 
 
 @compiled_by(_whiten_compiled)
