@@ -58,9 +58,11 @@ class Problems:
         self._generator = torch.Generator().manual_seed(batch)
 
     def normal(self, *shape: int) -> Tensor:
+        """Normal random numbers, a batch of the given shape."""
         return torch.randn(self.batch, *shape, generator=self._generator, dtype=torch.float64)
 
     def uniform(self, *shape: int) -> Tensor:
+        """Random numbers in [0, 1), a batch of the given shape."""
         return torch.rand(self.batch, *shape, generator=self._generator, dtype=torch.float64)
 
     def points(self, count: int) -> Tensor:
@@ -127,7 +129,7 @@ def essential(batch: int) -> tuple[Competitors, Error]:
     threshold = 1.5 / CAMERA.fx
 
     def error(found: Any) -> float:
-        E = torch.stack([torch.as_tensor(np.array(each), dtype=torch.float64).reshape(-1, 3, 3)[0] for each in found])
+        E = torch.stack([torch.as_tensor(each, dtype=torch.float64).reshape(-1, 3, 3)[0] for each in found])
         E = E / E.norm(dim=(1, 2), keepdim=True)
         return 1e3 * float(torch.minimum((E - true).norm(dim=(1, 2)), (E + true).norm(dim=(1, 2))).median())
 
@@ -213,19 +215,16 @@ def refinement_gradient(batch: int) -> tuple[Competitors, Error]:
 
 
 def bundle(batch: int) -> tuple[Competitors, Error]:
-    """Five poses, 60 points, 240 observations with 1 pixel of noise, Huber. Error: poses, thousandths."""
+    """Five poses, 60 points, 240 observations of pixels with 1 pixel of noise, Huber. Error: poses, thousandths."""
     problems = Problems(batch)
     T_cw, points = se3_exp(0.2 * problems.normal(5, 6)), problems.points(60)
     pose, point = torch.arange(240) % 5, torch.arange(240) // 4
     in_camera = (T_cw[:, pose, :3, :3] @ points[:, point, :, None])[..., 0] + T_cw[:, pose, :3, 3]
     uv = CAMERA.project(in_camera) + problems.normal(240, 2)
-    inverse_depth, sigma = 1 / in_camera[..., 2], 0.02
-    inverse_depth = inverse_depth + sigma * problems.normal(240)
     noise = 0.02 * problems.normal(5, 6)
     noise[:, 0] = 0
     start, first_points = se3_exp(noise) @ T_cw, points + 0.02 * problems.normal(60, 3)
     pose, point = pose.expand(batch, -1), point.expand(batch, -1)
-    with_scale = inverse_depth * 0  # GTSAM and kornia-rs get pixels only, so that all solve the same problem
     kornia = [
         (T[:, :3, :3].contiguous().numpy(), T[:, :3, 3].contiguous().numpy(), X.numpy(), np.column_stack([i, j, u]))
         for T, X, i, j, u in zip(start, first_points, pose.numpy(), point.numpy(), uv.numpy(), strict=True)
@@ -246,7 +245,7 @@ def bundle(batch: int) -> tuple[Competitors, Error]:
         return 1e3 * float((transform(T, centres) - true).norm(dim=-1).median())
 
     competitors: Competitors = {
-        OURS: lambda: v3d.bundle_adjust(start, first_points, uv, pose, point, K, with_scale, iterations=20).T_cw,
+        OURS: lambda: v3d.bundle_adjust(start, first_points, uv, pose, point, K, iterations=20).T_cw,
         "GTSAM": peers.gtsam_bundles(start, first_points, uv, pose, point, K, 5.991**0.5),
         "kornia-rs": from_kornia_rs,
     }
