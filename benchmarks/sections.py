@@ -181,11 +181,12 @@ def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the camera modules."""
     yield "## Camera modules"
     text = (
-        "Median time of a batch with one thread; the ratio is the time of the competitor over ours in the same turn: above 1"
-        " ours is faster. Competitors without batches solve the problems one after the other; factor graphs of GTSAM and"
-        " theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses, millimetres and"
-        " milliradians in one number; of essential matrices, thousandths of their norm; of matches, the percentage that is"
-        " missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo, thousandths."
+        "Median time of a batch with one thread; the ratio is the time of the competitor over ours in the same turn:"
+        " above 1 ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
+        " GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
+        " millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
+        " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo,"
+        " thousandths."
     )
     yield from part(text, flat(rows_of(measurements), columns.MODULES), measurements)
 
