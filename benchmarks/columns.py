@@ -72,4 +72,13 @@ PRIMITIVES = {
     "ratio": "ratio",
 }
 
+MODULES = {
+    "function": "function",
+    "batch": "batch",
+    "competitor": "competitor",
+    "ms": "ms",
+    "ratio": "ratio",
+    "error": "error",
+}
+
 DESIGN_CHOICES = {"choice": "choice", "sequence": "sequence", "result": "result", "commit": "commit"}

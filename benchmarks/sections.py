@@ -177,6 +177,20 @@ def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield from part(text, flat(rows_of(measurements), columns.PRIMITIVES), measurements)
 
 
+def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the camera modules."""
+    yield "## Camera modules"
+    text = (
+        "Median time of a batch with one thread; the ratio is the time of the competitor over ours in the same turn:"
+        " above 1 ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
+        " GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
+        " millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
+        " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo,"
+        " thousandths."
+    )
+    yield from part(text, flat(rows_of(measurements), columns.MODULES), measurements)
+
+
 def design_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on single measurements behind design choices."""
     yield "## Design choices"
@@ -202,6 +216,7 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("maps", "map_costs"), maps_section),
     (("ablation",), ablation_section),
     (("primitives",), primitives_section),
+    (("modules",), modules_section),
     (("design_choices",), design_section),
 )
 """Files of each section in ``benchmarks/results``, and the function that writes it."""

@@ -27,6 +27,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "lost": ("sequence", "interruption"),
     "map_costs": ("sequence",),
     "maps": ("sequence", "pixels"),
+    "modules": ("function", "batch", "competitor"),
     "primitives": ("primitive", "size", "threads", "competitor"),
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "contender"),
