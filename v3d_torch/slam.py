@@ -25,6 +25,7 @@ from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.unlabelled import unlabelled_instances
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
@@ -68,6 +69,7 @@ class V3DSLAM:
     Attributes:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
+        occupancy: Free and occupied space, in ``occupancy.map``; None if it is not configured.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -115,6 +117,8 @@ class V3DSLAM:
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
         self.loop_closer.rebuild(self.map.active_keyframes)
+        # Free and occupied space
+        self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
@@ -232,6 +236,9 @@ class V3DSLAM:
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:
                 self.back_end.submit(keyframe)
+        if self.occupancy is not None:
+            with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
+                self.occupancy(frame.index, depth, objects.static_mask, self.poses)
         T_wc = invert(self.poses.T_cw)
         return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
 
@@ -288,6 +295,7 @@ class V3DSLAM:
             "mapper": self.mapper,
             "loop_closer": self.loop_closer,
             "back_end": self.back_end,
+            **({} if self.occupancy is None else {"occupancy": self.occupancy}),
         }
         for name, component in components.items():
             if not is_stateful(component):
