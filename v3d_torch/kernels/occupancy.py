@@ -96,7 +96,7 @@ def _cast_ray(
         else:
             row = row if z >> BITS == (z + step_z) >> BITS else -1
             z, exit_z = z + step_z, exit_z + depth_z
-    if hit_depth > 0:
+    if hit_depth > 0:  # else the surface is not static or too far
         x = np.int64(math.floor(origin[0] + direction[0] * hit_depth))
         y = np.int64(math.floor(origin[1] + direction[1] * hit_depth))
         z = np.int64(math.floor(origin[2] + direction[2] * hit_depth))
@@ -114,7 +114,7 @@ def observe_voxels(
 
     Args:
         depth: Depth of the samples, metres, (h, w); 0 without depth.
-        static: Mask of the samples on static surfaces, (h, w).
+        static: Mask of the samples on static surfaces, (h, w); the others hit nothing.
         rays: Ray of each sample at unit depth, camera frame, (h, w, 3).
         T_wc: Camera-to-world pose, (4, 4).
         voxel_size: Side of a voxel, metres.
@@ -136,7 +136,7 @@ def observe_voxels(
     for row in range(height):
         for column in range(width):
             z = float(depth[row, column])
-            if not (static[row, column] and z > 0):
+            if z <= 0:
                 continue
             a, b, c = float(rays[row, column, 0]), float(rays[row, column, 1]), float(rays[row, column, 2])
             for axis in range(3):
@@ -146,7 +146,7 @@ def observe_voxels(
             if count + 3 * side > len(blocks):  # a ray passes fewer blocks
                 blocks = np.concatenate((blocks, np.empty_like(blocks)))
                 marks = np.concatenate((marks, np.zeros_like(marks)))
-            hit_depth = z if z <= max_depth else 0.0
+            hit_depth = z if static[row, column] and z <= max_depth else 0.0
             count = _cast_ray(origin, direction, free_depth, hit_depth, first, table, blocks, marks, count)
     return blocks[:count], marks[:count]
 
@@ -174,3 +174,74 @@ def add_observations(
                 before = 0 if row[voxel] == UNKNOWN else np.int64(row[voxel])
                 after = before + (hit if mark == HIT else miss)
                 row[voxel] = np.int8(min(max(after, minimum), maximum))
+
+
+@device
+def _find_block(x: int, y: int, z: int, keys: Ints, bound: int) -> int:
+    """Place of the key of a block among ascending keys; -1 if it is not there."""
+    if max(x, y, z) >= bound or min(x, y, z) < -bound:
+        return -1
+    key = ((x + bound) * 2 * bound + y + bound) * 2 * bound + z + bound
+    place = np.searchsorted(keys, key)
+    return place if place < len(keys) and keys[place] == key else -1
+
+
+@device
+def _squared_gap(point: float, voxel: int, size: float) -> float:
+    """Squared distance along one axis between a coordinate and a voxel; 0 inside."""
+    low = voxel * size
+    gap = max(low - point, point - (low + size), 0.0)
+    return gap * gap
+
+
+@device
+def _is_ball_free(
+    point: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
+) -> bool:
+    """Check whether all voxels that a ball touches are free."""
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    reach = np.int64(math.ceil(radius / size))
+    for axis in range(3):
+        first[axis] = np.int64(math.floor(point[axis] / size)) - reach
+        last[axis] = first[axis] + 2 * reach + 1
+    for x in range(first[0], last[0]):
+        gap_x = _squared_gap(point[0], x, size)
+        for y in range(first[1], last[1]):
+            gap_y = _squared_gap(point[1], y, size)
+            place, block_z = -1, np.int64(0)
+            for z in range(first[2], last[2]):
+                if math.sqrt(gap_x + gap_y + _squared_gap(point[2], z, size)) > radius:
+                    continue
+                if place < 0 or z >> BITS != block_z:
+                    block_z = z >> BITS
+                    place = _find_block(x >> BITS, y >> BITS, block_z, keys, bound)
+                if place < 0:
+                    return False
+                value = log_odds[rows[place], _local_index(x, y, z)]
+                if value >= 0 or value == UNKNOWN:
+                    return False
+    return True
+
+
+@kernel("(f8[:,::1], f8, f8, i8[::1], i8[::1], i8, i1[:,::1])")
+def are_balls_free(
+    points: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
+) -> NDArray[np.bool_]:
+    """Check whether balls lie in free space.
+
+    Args:
+        points: Centres of the balls, metres, (P, 3).
+        radius: Radius of the balls, metres.
+        size: Side of a voxel, metres.
+        keys: Keys of the blocks, ascending, (N,).
+        rows: Row of each key's block, (N,).
+        bound: Bound of the coordinates of blocks.
+        log_odds: Log-odds of the blocks, steps, (N, 4096).
+
+    Returns:
+        True if all voxels that the ball touches are free, (P,).
+    """
+    free = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        free[i] = _is_ball_free(points[i], radius, size, keys, rows, bound, log_odds)
+    return free

@@ -1,4 +1,4 @@
-"""Distances between points and voxels."""
+"""Clearance of points: the nearest occupied voxel, and balls in free space."""
 
 from __future__ import annotations
 
@@ -8,6 +8,15 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from v3d_torch.geometry.cell_keys import MAX_COORDINATE
+from v3d_torch.kernels import occupancy as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.occupancy import UNKNOWN
+from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
+
+_BATCH = 1 << 20
+"""Voxels that are looked up together, to bound the memory."""
 
 
 class NearestVoxels:
@@ -41,33 +50,51 @@ class NearestVoxels:
         return nearest, near
 
 
-def offsets_within(radius: float, size: float) -> Tensor:
-    """Offsets from the voxel of a point to all voxels that a ball around the point can touch.
+def _compiled(blocks: VoxelBlocks, points: Tensor, radius: float, size: float) -> Tensor:
+    if points.dtype != torch.float64:
+        return NotImplemented
+    index = blocks.keys.numpy(), blocks.rows.numpy(), MAX_COORDINATE, blocks.log_odds.numpy()
+    return torch.from_numpy(kernels.are_balls_free(to_array(points), radius, size, *index))
+
+
+@compiled_by(_compiled)
+def are_balls_free(blocks: VoxelBlocks, points: Tensor, radius: float, size: float) -> Tensor:
+    """Check whether every voxel that a ball touches is free.
 
     Args:
-        radius: Radius of the ball, metres.
+        blocks: Voxels.
+        points: Finite centres of the balls, metres, float64, shape :math:`(P, 3)`.
+        radius: Radius of the balls, metres.
         size: Side of a voxel, metres.
 
     Returns:
-        Offsets, voxels, int64, shape :math:`(K, 3)`.
+        Bool, shape :math:`(P,)`.
     """
     reach = math.ceil(radius / size)
     steps = torch.arange(-reach, reach + 1)
     offsets = torch.cartesian_prod(steps, steps, steps)
-    nearest = (offsets.abs() - 1).clamp(min=0).to(torch.float64).norm(dim=1) * size
-    return offsets[nearest <= radius]
+    free = torch.ones(len(points), dtype=torch.bool)
+    for part in torch.arange(len(points)).split(max(_BATCH // len(offsets), 1)):
+        voxels = (points[part] / size).floor().to(torch.int64)[:, None] + offsets
+        touched = cube_gap(points[part, None], voxels, size) <= radius
+        log_odds = blocks.log_odds_at(voxels[touched])
+        blocked = torch.zeros_like(touched)
+        blocked[touched] = (log_odds >= 0) | (log_odds == UNKNOWN)
+        free[part] = ~blocked.any(dim=1)
+    return free
 
 
-def voxel_gap(points: Tensor, voxels: Tensor, size: float) -> Tensor:
-    """Distance from points to cubes: 0 inside.
+def cube_gap(points: Tensor, cubes: Tensor, size: float) -> Tensor:
+    """Distance from points to cubes; 0 inside.
 
     Args:
         points: Points, metres, float64, shape :math:`(..., 3)`.
-        voxels: Coordinates of voxels or blocks, int64, shape :math:`(..., 3)`.
+        cubes: Coordinates of voxels or blocks, int64, shape :math:`(..., 3)`.
         size: Side of a cube, metres.
 
     Returns:
         Distances, metres, float64.
     """
-    low = voxels.to(torch.float64) * size
-    return torch.maximum(low - points, points - (low + size)).clamp(min=0).norm(dim=-1)
+    low = cubes.to(torch.float64) * size
+    x, y, z = torch.maximum(low - points, points - (low + size)).clamp(min=0).square().unbind(dim=-1)
+    return (x + y + z).sqrt()

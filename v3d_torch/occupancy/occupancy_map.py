@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
-from v3d_torch.kernels.occupancy import BITS, SIDE, UNKNOWN
-from v3d_torch.occupancy.clearance import NearestVoxels, offsets_within, voxel_gap
+from v3d_torch.kernels.occupancy import SIDE, UNKNOWN
+from v3d_torch.occupancy.clearance import NearestVoxels, are_balls_free, cube_gap
 from v3d_torch.occupancy.ray_casting import observe_voxels
 from v3d_torch.occupancy.sensor_model import SensorModel
 from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
@@ -21,9 +21,6 @@ _LOG = logging.getLogger(__name__)
 
 _KEPT_FRACTION = 0.9
 """Fraction of the maximum number of blocks that is kept when blocks are removed, so that this is rare."""
-
-_QUERY_BATCH = 1 << 20
-"""Voxels that are looked up together, to bound the memory of a query."""
 
 
 class VoxelState(IntEnum):
@@ -71,8 +68,8 @@ class OccupancyMap:
 
         Args:
             depth: Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement. Pixels can be subsampled.
-            static: Mask of static pixels, bool, shape :math:`(h, w)`. The others are neither obstacles nor do they show
-                free space.
+            static: Mask of static pixels, bool, shape :math:`(h, w)`. The others are no obstacles; they only show that
+                the space in front of them is free.
             rays: Viewing ray of each pixel at unit depth, float32, shape :math:`(h, w, 3)`; see `PinholeCamera.rays`.
             T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
         """
@@ -119,17 +116,8 @@ class OccupancyMap:
         Returns:
             True if every voxel that a ball touches is free, bool, shape :math:`(...)`.
         """
-        size, rows = self.config.voxel_size, points.reshape(-1, 3).to(torch.float64)
-        offsets = offsets_within(radius, size)
-        free = torch.ones(len(rows), dtype=torch.bool)
-        for part in torch.arange(len(rows)).split(max(_QUERY_BATCH // len(offsets), 1)):
-            voxels = self._voxels(rows[part])[:, None] + offsets
-            touched = voxel_gap(rows[part, None], voxels, size) <= radius
-            log_odds = self.blocks.log_odds_at(voxels[touched])
-            blocked = torch.zeros_like(touched)
-            blocked[touched] = (log_odds >= 0) | (log_odds == UNKNOWN)
-            free[part] = ~blocked.any(dim=1)
-        return free.reshape(points.shape[:-1])
+        rows = points.reshape(-1, 3).to(torch.float64)
+        return are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
 
     def distance(self, points: Tensor) -> Tensor:
         """Distance to the centre of the nearest occupied voxel.
@@ -190,7 +178,7 @@ class OccupancyMap:
     def _remove_farthest(self, camera: Tensor) -> None:
         """Remove the blocks farthest from the camera, but none that reaches into the window around it."""
         side = SIDE * self.config.voxel_size
-        gap = voxel_gap(camera, self.blocks.coordinates, side)
+        gap = cube_gap(camera, self.blocks.coordinates, side)
         kept = int(_KEPT_FRACTION * self.config.max_blocks)
         limit = max(float(gap.kthvalue(kept).values), self.config.window_radius)
         before = len(self.blocks)

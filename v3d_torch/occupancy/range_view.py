@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -26,7 +27,8 @@ class RangeView:
         row: First row.
         column: First column.
         depth_units: Depth in units of `UNIT`, 0 = no measurement, uint16, shape :math:`(h, w)`.
-        static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`.
+        static: Mask of samples on static surfaces whose neighbours are static too, bool, shape :math:`(h, w)`: next to
+            a moving object some samples belong to it, because masks are off by some pixels.
     """
 
     row: int
@@ -47,7 +49,9 @@ class RangeView:
         row, column = (int(stride * math.modf((number + 1) * step)[0]) for step in _STEPS)
         units = (_samples(depth, row, column, stride) / UNIT).round()
         units = torch.where(units < 2**16, units, 0).to(torch.uint16)
-        return RangeView(row, column, units, _samples(static, row, column, stride).contiguous())
+        moving = ~_samples(static, row, column, stride)
+        near_moving = max_pool2d(moving[None].to(torch.float32), 3, 1, 1)[0] > 0
+        return RangeView(row, column, units, ~near_moving)
 
     @property
     def depth(self) -> Tensor:

@@ -54,7 +54,8 @@ def observe_voxels(
 
     Args:
         depth: Depth of samples, metres, float32, shape :math:`(h, w)`; 0 = no measurement.
-        static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`; the others have no rays.
+        static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`. The others hit nothing: their rays only
+            show the space in front of them.
         rays: Viewing ray of each sample at unit depth, float32, shape :math:`(h, w, 3)`.
         T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
         voxel_size: Side of a voxel, metres.
@@ -63,14 +64,14 @@ def observe_voxels(
     """
     far = depth.new_tensor(torch.inf)
     nearest = -max_pool2d(-torch.where(depth > 0, depth, far)[None], 3, 1, 1)[0]
-    valid = static & (depth > 0)
-    nearest, z = (values[valid].to(torch.float64) for values in (nearest, depth))
+    valid = depth > 0
+    nearest, z, hits = nearest[valid].to(torch.float64), depth[valid].to(torch.float64), static[valid]
     a, b, c = rays[valid].to(torch.float64).unbind(dim=1)
     direction = torch.stack([(r[0] * a + r[1] * b + r[2] * c) / voxel_size for r in T_wc[:3, :3].tolist()], dim=1)
     origin = T_wc[:3, 3] / voxel_size
     free_depth = (nearest - (voxel_size / 2 + tolerance * (nearest * nearest))).clamp(max=max_depth)
     voxels, marks = [torch.zeros(0, 3, dtype=torch.int64)], [torch.zeros(0, dtype=torch.uint8)]
-    hits = (origin + direction * z[:, None])[z <= max_depth].floor().to(torch.int64)
+    hits = (origin + direction * z[:, None])[hits & (z <= max_depth)].floor().to(torch.int64)
     voxel = origin.floor().to(torch.int64).expand_as(direction)
     forward = direction > 0
     exits = torch.where(direction == 0, torch.inf, (voxel + forward.to(torch.float64) - origin) / direction)

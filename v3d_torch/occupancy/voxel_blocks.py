@@ -25,8 +25,8 @@ class VoxelBlocks:
 
     Attributes:
         coordinates: Coordinates of the blocks, int64, shape :math:`(N, 3)`.
-        log_odds: Log-odds of their voxels, steps of the sensor model, int8, shape :math:`(N, 4096)` in the order
-            x, y, z; `UNKNOWN` for voxels that were never observed.
+        keys: Keys of the coordinates, ascending, int64, shape :math:`(N,)`.
+        rows: Row of each key's block, int64, shape :math:`(N,)`.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,10 @@ class VoxelBlocks:
 
     @property
     def log_odds(self) -> Tensor:
-        """Log-odds of the voxels, as a view."""
+        """Log-odds of the voxels, steps of the sensor model, int8, shape :math:`(N, 4096)` in the order x, y, z; a view.
+
+        They are `UNKNOWN` for voxels that were never observed.
+        """
         return self._log_odds[: len(self)]
 
     def add(self, observations: Observations, model: SensorModel) -> None:
@@ -68,9 +71,9 @@ class VoxelBlocks:
         if len(self) == 0:
             return blocks.new_full(blocks.shape[:1], -1)
         keys = cell_keys(blocks)
-        place = torch.searchsorted(self._keys, keys).clamp(max=len(self) - 1)
+        place = torch.searchsorted(self.keys, keys).clamp(max=len(self) - 1)
         in_range = ((blocks >= -MAX_COORDINATE) & (blocks < MAX_COORDINATE)).all(dim=1)
-        return torch.where(in_range & (self._keys[place] == keys), self._rows[place], -1)
+        return torch.where(in_range & (self.keys[place] == keys), self.rows[place], -1)
 
     def log_odds_at(self, voxels: Tensor) -> Tensor:
         """Log-odds of voxels.
@@ -124,7 +127,7 @@ class VoxelBlocks:
         self._sort_keys()
 
     def _sort_keys(self) -> None:
-        self._keys, self._rows = cell_keys(self.coordinates).sort()
+        self.keys, self.rows = cell_keys(self.coordinates).sort()
 
 
 def _add_compiled(log_odds: Tensor, slots: Tensor, marks: Tensor, model: SensorModel) -> None:

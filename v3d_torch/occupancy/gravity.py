@@ -1,0 +1,50 @@
+"""Up direction of the world, from an accelerometer, from people and objects, or from the first camera."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+_ACCELEROMETER_TOLERANCE = math.radians(5)
+"""Error of an accelerometer's up direction: bias and acceleration of a camera that is moved by hand."""
+
+_VOTES_TOLERANCE = math.radians(30)
+"""Error of the votes, which are for quarter turns of images."""
+
+_CAMERA_TOLERANCE = math.radians(45)
+"""Tilt of a camera that is held upright."""
+
+_MIN_VOTES = 3.0
+"""Length of the sum of votes from which on it is more reliable than the first camera, in detections of score 1."""
+
+
+class UpDirection(NamedTuple):
+    """Approximate up direction.
+
+    Attributes:
+        direction: Unit vector, world frame, float64, shape :math:`(3,)`.
+        tolerance: Bound of its error, radians.
+    """
+
+    direction: Tensor
+    tolerance: float
+
+
+def estimate_up(accelerometer: Tensor | None = None, votes: Tensor | None = None) -> UpDirection:
+    """Choose the most accurate source of the up direction. The floor then refines it, see `find_floor`.
+
+    Args:
+        accelerometer: Unit vector against gravity in the frame of the first camera, which is the world frame, as an
+            accelerometer at rest measures it, shape :math:`(3,)`; None without accelerometer.
+        votes: Sum of the votes of the segmentation for the up direction, world frame, shape :math:`(3,)`; see
+            `UprightSegmenter`. None if there are none.
+    """
+    if accelerometer is not None:
+        return UpDirection(normalize(accelerometer.to(torch.float64), dim=0), _ACCELEROMETER_TOLERANCE)
+    if votes is not None and float(votes.norm()) >= _MIN_VOTES:
+        return UpDirection(normalize(votes.to(torch.float64), dim=0), _VOTES_TOLERANCE)
+    return UpDirection(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), _CAMERA_TOLERANCE)
