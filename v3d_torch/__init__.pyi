@@ -18,6 +18,14 @@ from .objects.instance_tracker import InstanceTracker
 from .objects.intra_object_motion import Deformation, IntraObjectMotion, intra_object_motion
 from .objects.largest_clusters import LargestClusters, largest_clusters
 from .objects.voting import HoughVoting, Votes, hough_vote
+from .occupancy.floor import Floor, find_floor
+from .occupancy.gravity import UpDirection, estimate_up
+from .occupancy.map_server import write_map_server_files
+from .occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
+from .occupancy.occupancy_io import StoredOccupancy, load_occupancy, save_occupancy
+from .occupancy.occupancy_map import OccupancyMap, VoxelState
+from .occupancy.occupancy_mapper import OccupancyMapper
+from .occupancy.octomap_file import write_octomap
 from .reconstruction.mesh import Mesh, fuse_mesh
 from .reconstruction.point_map import PointMap, fuse_points
 from .runs.state import load_state, save_state
@@ -34,6 +42,7 @@ __all__ = [
     "Deformation",
     "DepthSmoother",
     "DownloadError",
+    "Floor",
     "FrameResult",
     "GroundTruthWarning",
     "HoughVoting",
@@ -44,22 +53,30 @@ __all__ = [
     "LargestClusters",
     "Mesh",
     "MotionState",
+    "OccupancyGrid",
+    "OccupancyMap",
+    "OccupancyMapper",
     "PinholeCamera",
     "PointMap",
     "RGBDFrame",
     "SourceOptions",
     "StaticViews",
     "StoredMap",
+    "StoredOccupancy",
     "TrackedObject",
     "TrackingStatus",
     "Trajectory",
+    "UpDirection",
     "V3DError",
     "Votes",
     "VoxelPool",
+    "VoxelState",
     "Voxels",
     "back_project",
     "chamfer_distance",
     "dbscan",
+    "estimate_up",
+    "find_floor",
     "fuse_mesh",
     "fuse_points",
     "hough_vote",
@@ -67,15 +84,20 @@ __all__ = [
     "largest_clusters",
     "load_config",
     "load_map",
+    "load_occupancy",
     "load_sequence",
     "load_state",
     "match_instances",
+    "occupancy_grid",
     "open_source",
     "read_trajectory",
     "save_map",
+    "save_occupancy",
     "save_state",
     "smooth_depth",
     "surface_normals",
     "voxel_pool",
+    "write_map_server_files",
+    "write_octomap",
     "write_trajectory",
 ]

@@ -32,6 +32,7 @@ from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.motion_model import MotionModel, PosePrediction
@@ -238,7 +239,8 @@ class V3DSLAM:
                 self.back_end.submit(keyframe)
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
-                self.occupancy(frame.index, depth, objects.static_mask, self.poses)
+                votes = up_votes(self._segmenter_state)
+                self.occupancy(frame.index, depth, objects.static_mask, self.poses, votes)
         T_wc = invert(self.poses.T_cw)
         return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
 

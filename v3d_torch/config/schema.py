@@ -402,9 +402,9 @@ class OccupancyConfig(Section):
     those are removed that have a newer one near by."""
     max_distance: float = Field(1.0, gt=0)
     """Distances to obstacles are truncated to this, metres: more than robots keep from obstacles."""
-    obstacle_heights: tuple[float, float] = (0.1, 1.8)
-    """Lowest and highest obstacle in the 2D grid, metres above the floor: above the error of the floor, and the height
-    of a person."""
+    obstacle_heights: tuple[float, float] = (0.15, 1.8)
+    """Lowest and highest obstacle in the 2D grid, metres above the floor: a voxel and the error of the floor at 4 m,
+    which 1.5 degrees of tilt make, and the height of a person."""
 
 
 class CheckpointConfig(Section):

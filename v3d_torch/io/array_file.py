@@ -33,6 +33,7 @@ _DAMAGE_ERRORS = (
     TypeError,
     AttributeError,
     RuntimeError,
+    OverflowError,
     MemoryError,
 )
 """Errors of zip archives, arrays and JSON with wrong or missing bytes."""

@@ -45,7 +45,7 @@ def _nearest_depth(depth: Depth, row: int, column: int) -> float:
 @device
 def _enter(origin: float, direction: float) -> tuple[int, int, float, float]:
     """First voxel of a ray along one axis, step to the next, depth at which the ray leaves the voxel, and per step."""
-    voxel = np.int64(math.floor(origin))
+    voxel = math.floor(origin)
     if direction > 0:
         return voxel, 1, (voxel + 1 - origin) / direction, 1 / direction
     if direction < 0:
@@ -97,9 +97,9 @@ def _cast_ray(
             row = row if z >> BITS == (z + step_z) >> BITS else -1
             z, exit_z = z + step_z, exit_z + depth_z
     if hit_depth > 0:  # else the surface is not static or too far
-        x = np.int64(math.floor(origin[0] + direction[0] * hit_depth))
-        y = np.int64(math.floor(origin[1] + direction[1] * hit_depth))
-        z = np.int64(math.floor(origin[2] + direction[2] * hit_depth))
+        x = math.floor(origin[0] + direction[0] * hit_depth)
+        y = math.floor(origin[1] + direction[1] * hit_depth)
+        z = math.floor(origin[2] + direction[2] * hit_depth)
         row, count = _block_row(x, y, z, first, table, blocks, count)
         marks[row, _local_index(x, y, z)] = HIT
     return count
@@ -182,7 +182,7 @@ def _find_block(x: int, y: int, z: int, keys: Ints, bound: int) -> int:
     if max(x, y, z) >= bound or min(x, y, z) < -bound:
         return -1
     key = ((x + bound) * 2 * bound + y + bound) * 2 * bound + z + bound
-    place = np.searchsorted(keys, key)
+    place = int(np.searchsorted(keys, key))
     return place if place < len(keys) and keys[place] == key else -1
 
 
@@ -199,17 +199,14 @@ def _is_ball_free(
     point: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
 ) -> bool:
     """Check whether all voxels that a ball touches are free."""
-    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
-    reach = np.int64(math.ceil(radius / size))
-    for axis in range(3):
-        first[axis] = np.int64(math.floor(point[axis] / size)) - reach
-        last[axis] = first[axis] + 2 * reach + 1
-    for x in range(first[0], last[0]):
+    reach = math.ceil(radius / size)
+    i, j, k = math.floor(point[0] / size), math.floor(point[1] / size), math.floor(point[2] / size)
+    for x in range(i - reach, i + reach + 1):
         gap_x = _squared_gap(point[0], x, size)
-        for y in range(first[1], last[1]):
+        for y in range(j - reach, j + reach + 1):
             gap_y = _squared_gap(point[1], y, size)
-            place, block_z = -1, np.int64(0)
-            for z in range(first[2], last[2]):
+            place, block_z = -1, 0
+            for z in range(k - reach, k + reach + 1):
                 if math.sqrt(gap_x + gap_y + _squared_gap(point[2], z, size)) > radius:
                     continue
                 if place < 0 or z >> BITS != block_z:

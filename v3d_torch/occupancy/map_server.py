@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
+import torch
 import yaml
 
 from v3d_torch.io.files import atomic_write, write_text
@@ -30,12 +30,11 @@ def write_map_server_files(path: Path, grid: OccupancyGrid) -> None:
         OutputError: If a file cannot be written.
     """
     image = path.with_suffix(".pgm")
-    states = grid.states.flip(0).numpy()  # the first row of the image has the largest y
-    grey = np.zeros(states.shape, np.uint8)
-    for state, value in _GREY.items():
-        grey[states == state] = value
+    values = torch.tensor([_GREY[state] for state in VoxelState], dtype=torch.uint8)
+    grey = values[grid.states.flip(0).to(torch.int64) + 1]  # the first row of the image has the largest y
+    height, width = grey.shape
     with atomic_write(image) as temporary:
-        temporary.write_bytes(f"P5\n{grey.shape[1]} {grey.shape[0]}\n255\n".encode() + grey.tobytes())
+        temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode() + grey.numpy().tobytes())
     about = {
         "image": image.name,
         "mode": "trinary",

@@ -34,8 +34,9 @@ class VoxelState(IntEnum):
 class OccupancyMap:
     """Voxel grid with log-odds of occupancy, in the world frame.
 
-    Voxel (i, j, k) is the cube from ``(i, j, k) * voxel_size`` to ``(i + 1, j + 1, k + 1) * voxel_size``. It is occupied
-    if its probability is at least 0.5, and unknown if it was never observed. All queries take batches of points.
+    Voxel (i, j, k) is the cube between the corners (i, j, k) and (i + 1, j + 1, k + 1), times the size of a voxel. It
+    is occupied if its probability is at least 0.5, and unknown if it was never observed. All queries take batches of
+    points.
 
     Args:
         config: Sensor model, size of voxels, bounds of memory and distances.

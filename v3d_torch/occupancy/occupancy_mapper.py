@@ -6,12 +6,14 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.occupancy.floor import Floor, find_floor
+from v3d_torch.occupancy.gravity import UpDirection, estimate_up
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.view_store import ViewStore, displacement
@@ -43,14 +45,18 @@ class OccupancyMapper:
 
     Attributes:
         map: The occupancy map.
+        accelerometer: Unit vector against gravity in the frame of the first camera, float64, shape :math:`(3,)`, as an
+            accelerometer at rest measures it; None without accelerometer.
     """
 
-    def __init__(self, config: OccupancyConfig, camera: PinholeCamera) -> None:
+    def __init__(self, config: OccupancyConfig, camera: PinholeCamera, accelerometer: Tensor | None = None) -> None:
         self._config = config
         self._camera = camera
+        self.accelerometer = accelerometer
         self.map = OccupancyMap(config)
         self._store = ViewStore(config.max_views)
         self._count = 0
+        self._up_votes: Tensor | None = None
         self._rebuilt: OccupancyMap | None = None
         self._rebuilt_views = 0
 
@@ -59,7 +65,14 @@ class OccupancyMapper:
         """True while the map is rebuilt after a correction of the poses."""
         return self._rebuilt is not None
 
-    def __call__(self, frame: int, depth: Tensor, static: Tensor, poses: PoseHistory) -> None:
+    @property
+    def up(self) -> UpDirection:
+        """Approximate up direction, which `find_floor` refines."""
+        return estimate_up(self.accelerometer, self._up_votes)
+
+    def __call__(
+        self, frame: int, depth: Tensor, static: Tensor, poses: PoseHistory, up_votes: Tensor | None = None
+    ) -> None:
         """Add a frame, if it is due and its pose is known.
 
         Args:
@@ -67,7 +80,9 @@ class OccupancyMapper:
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             poses: Poses of all frames up to this one.
+            up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None without.
         """
+        self._up_votes = up_votes
         if frame % self._config.interval != 0 or not _is_reliable(poses):
             return
         view = RangeView.sample(self._count, depth[0], static, self._config.stride)
@@ -78,8 +93,20 @@ class OccupancyMapper:
             self._rebuilt_views -= 1
         if self._rebuilt is None and self._count % _CHECK_INTERVAL == 0:
             self._begin_rebuild(poses)
-        if self._rebuilt is not None:
-            self._continue_rebuild(_REBUILD_VIEWS + 1)
+        self._continue_rebuild(_REBUILD_VIEWS + 1)
+
+    def find_floor(self) -> Floor | None:
+        """Find the floor of the map; None if none is visible. It takes a tenth of a second."""
+        return find_floor(self.map, self.up)
+
+    def grid(self, heights: tuple[float, float] | None = None) -> OccupancyGrid | None:
+        """Return the 2D grid above the floor; None if no floor is visible.
+
+        Args:
+            heights: Lowest and highest obstacle, metres above the floor; None for those of the configuration.
+        """
+        floor = self.find_floor()
+        return None if floor is None else occupancy_grid(self.map, floor, heights)
 
     def correct(self, poses: PoseHistory) -> None:
         """Apply all corrections of the poses at once; call this after the last frame.
@@ -87,11 +114,9 @@ class OccupancyMapper:
         Args:
             poses: Poses of all frames.
         """
-        if self._rebuilt is not None:
-            self._continue_rebuild(len(self._store))
+        self._continue_rebuild(len(self._store))
         self._begin_rebuild(poses)
-        if self._rebuilt is not None:
-            self._continue_rebuild(len(self._store))
+        self._continue_rebuild(len(self._store))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the map, the stored views, and the state of a rebuild."""
@@ -99,6 +124,7 @@ class OccupancyMapper:
             "map": self.map.state_dict(),
             "store": self._store.state_dict(),
             "count": self._count,
+            "up_votes": self._up_votes,
             "rebuilt": None if self._rebuilt is None else self._rebuilt.state_dict(),
             "rebuilt_views": self._rebuilt_views,
         }
@@ -108,6 +134,7 @@ class OccupancyMapper:
         self.map.load_state_dict(state["map"])
         self._store.load_state_dict(state["store"])
         self._count, self._rebuilt_views = state["count"], state["rebuilt_views"]
+        self._up_votes = state["up_votes"]
         self._rebuilt = None
         if state["rebuilt"] is not None:
             self._rebuilt = OccupancyMap(self._config)
@@ -124,8 +151,9 @@ class OccupancyMapper:
         self._rebuilt, self._rebuilt_views = OccupancyMap(self._config), 0
 
     def _continue_rebuild(self, count: int) -> None:
-        """Add the next stored views to the rebuilt map; after the last one, replace the map."""
-        assert self._rebuilt is not None
+        """Continue a rebuild with the next stored views; after the last one, replace the map."""
+        if self._rebuilt is None:
+            return
         end = min(self._rebuilt_views + count, len(self._store))
         for position in range(self._rebuilt_views, end):
             self._integrate(self._rebuilt, position)

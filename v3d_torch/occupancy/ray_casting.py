@@ -33,9 +33,9 @@ def _observe_compiled(
 ) -> Observations:
     if depth.dtype != torch.float32 or rays.dtype != torch.float32 or T_wc.dtype != torch.float64:
         return NotImplemented
-    arrays = (to_array(each) for each in (depth, static, rays, T_wc))
     reach = math.ceil(max_depth * float(rays.square().sum(dim=-1).max().sqrt()) / (SIDE * voxel_size)) + 1
-    blocks, marks = kernels.observe_voxels(*arrays, voxel_size, max_depth, tolerance, reach)
+    samples = to_array(depth), to_array(static), to_array(rays)
+    blocks, marks = kernels.observe_voxels(*samples, to_array(T_wc), voxel_size, max_depth, tolerance, reach)
     coordinates = torch.from_numpy(blocks)
     order = cell_keys(coordinates).argsort()
     return Observations(coordinates[order], torch.from_numpy(marks)[order])

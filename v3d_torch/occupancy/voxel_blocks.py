@@ -40,7 +40,7 @@ class VoxelBlocks:
 
     @property
     def log_odds(self) -> Tensor:
-        """Log-odds of the voxels, steps of the sensor model, int8, shape :math:`(N, 4096)` in the order x, y, z; a view.
+        """View of the log-odds of the voxels, steps, int8, shape :math:`(N, 4096)` in the order x, y, z.
 
         They are `UNKNOWN` for voxels that were never observed.
         """
