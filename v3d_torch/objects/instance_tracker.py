@@ -9,6 +9,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
@@ -81,14 +82,13 @@ class InstanceTracker(torch.nn.Module):
         """
         step = self._stride
         detections = [self._detection(stamp, clouds, i, T_wc) for i in range(len(instances))]
-        coarse_masks = _flatten(instances.masks[:, ::step, ::step])
+        coarse_masks = pack_masks(instances.masks, step)
 
         # Predict each track, and check whether the object is visible there.
         predicted = self._predict_silhouettes(stamp, T_wc)
         coarse_depth = depth[:, ::step, ::step].contiguous()
         predicted_masks = [self._predict_mask(silhouette, coarse_depth, step) for silhouette in predicted.values()]
-        rows = _flatten(torch.stack(predicted_masks)) if predicted_masks else ()
-        predicted_coarse = dict(zip(predicted, rows, strict=True))
+        predicted_coarse = dict(zip(predicted, map(pack_masks, predicted_masks), strict=True))
         visible = torch.tensor(
             [s.visible_fraction(depth, _DEPTH_TOLERANCE) > _MIN_VISIBLE_FRACTION for s in predicted.values()]
         )
@@ -111,7 +111,7 @@ class InstanceTracker(torch.nn.Module):
             if track.id not in detected:
                 mask = self._predict_mask(predicted[track], depth)
                 track.set_masks(mask, mask & has_depth, predicted_coarse[track], missed=True)
-        self._remove_duplicates(_flatten(has_depth[::step, ::step]))
+        self._remove_duplicates(pack_masks(has_depth, step))
         return list(self.tracks)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
@@ -160,9 +160,9 @@ class InstanceTracker(torch.nn.Module):
         Args:
             stamp: Timestamp, seconds.
             instances: N instances of the frame.
-            masks: Coarse masks of the instances, float32, shape (N, P).
+            masks: Coarse masks of the instances, packed, shape (N, B).
             detections: Detections of the instances.
-            predicted_coarse: Predicted coarse mask of each of the T tracks, float32, shape (P,).
+            predicted_coarse: Predicted coarse mask of each of the T tracks, packed, shape (B,).
             visible: Tracks that are visible at their predicted position, bool, shape (T,).
 
         Returns:
@@ -175,10 +175,11 @@ class InstanceTracker(torch.nn.Module):
         # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
         last_masks = torch.stack([track.coarse_mask for track in self.tracks])
         predicted_masks = torch.stack(list(predicted_coarse.values()))
-        intersection = predicted_masks @ masks.T
-        predicted_areas, areas = predicted_masks.sum(dim=1)[:, None], masks.sum(dim=1)
+        last_intersection, intersection = (count_common_pixels(each, masks) for each in (last_masks, predicted_masks))
+        last_areas, predicted_areas = (count_pixels(each)[:, None] for each in (last_masks, predicted_masks))
+        areas = count_pixels(masks)
         overlap = torch.maximum(
-            _intersection_over_union(last_masks @ masks.T, last_masks.sum(dim=1)[:, None], areas),
+            _intersection_over_union(last_intersection, last_areas, areas),
             _intersection_over_union(intersection, predicted_areas, areas),
         )
         covered = intersection > self._config.min_overlap * predicted_areas
@@ -203,24 +204,19 @@ class InstanceTracker(torch.nn.Module):
         """Remove missed tracks whose predicted mask a detected track of the same class covers: they are one object.
 
         Args:
-            has_depth: Coarse pixels with depth, float32, shape (P,).
+            has_depth: Coarse pixels with depth, packed, shape (B,).
         """
         missed = [track for track in self.tracks if track.missed]
         located = [track for track in self.tracks if not track.missed and track.newest.is_located]
         if not missed or not located:
             return
-        masks = torch.stack([track.coarse_mask for track in missed]) * has_depth
-        intersection = masks @ torch.stack([track.coarse_mask for track in located]).T
+        masks = torch.stack([track.coarse_mask for track in missed]) & has_depth
+        intersection = count_common_pixels(masks, torch.stack([track.coarse_mask for track in located]))
         same_class = torch.tensor([[track.label == other.label for other in located] for track in missed])
-        covered = intersection > self._config.min_overlap * masks.sum(dim=1, keepdim=True)
+        covered = intersection > self._config.min_overlap * count_pixels(masks)[:, None]
         duplicate = (same_class & covered).any(dim=1)
         removed = {track for track, is_duplicate in zip(missed, duplicate.tolist(), strict=True) if is_duplicate}
         self.tracks = [track for track in self.tracks if track not in removed]
-
-
-def _flatten(masks: Tensor) -> Tensor:
-    """Return masks as rows of numbers, bool (..., h, w) to float32 (..., h w)."""
-    return masks.flatten(-2).to(torch.float32)
 
 
 def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ class Track:
         first_stamp: Timestamp of the first detection, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
-        coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, float32, shape :math:`(P,)`.
+        coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         detections: Detections of the last second, newest last, at least one.
         labels: Number of detections of each class.
@@ -174,7 +174,7 @@ class Track:
         Args:
             mask: Pixels of the object, bool, shape :math:`(H, W)`.
             cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
-            coarse_mask: Every n-th pixel of the mask, float32, shape :math:`(P,)`.
+            coarse_mask: Every n-th pixel of the mask, packed, uint8, shape :math:`(B,)`.
             missed: True if the masks are predicted, because the object was not detected.
         """
         self.mask, self.cloud_pixels, self.coarse_mask, self.missed = mask, cloud_pixels, coarse_mask, missed
