@@ -399,7 +399,7 @@ class OccupancyConfig(Section):
     farthest from the camera are removed."""
     max_views: int = Field(1000, gt=0)
     """Maximum number of stored views, 15 kB each, from which the map is rebuilt after corrections of the poses. Beyond,
-    those are removed that have a newer one near by."""
+    only the newest of similar views is kept."""
     max_distance: float = Field(1.0, gt=0)
     """Distances to obstacles are truncated to this, metres: more than robots keep from obstacles."""
     obstacle_heights: tuple[float, float] = (0.15, 1.8)

@@ -45,7 +45,7 @@ class OccupancyMap:
     def __init__(self, config: OccupancyConfig) -> None:
         self.config = config
         self.blocks = VoxelBlocks()
-        self._model = SensorModel.from_config(config)
+        self.sensor_model = SensorModel.from_config(config)
         self._nearest: NearestVoxels | None = None  # of the occupied voxels; None after they changed
 
     @property
@@ -76,7 +76,7 @@ class OccupancyMap:
         """
         config = self.config
         limits = config.voxel_size, config.max_depth, config.depth_tolerance
-        self.blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self._model)
+        self.blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self.sensor_model)
         if len(self.blocks) > config.max_blocks:
             self._remove_farthest(T_wc[:3, 3])
         self._nearest = None
@@ -104,7 +104,7 @@ class OccupancyMap:
             Probabilities, float64, shape :math:`(...)`; NaN where space is unknown.
         """
         log_odds = self.blocks.log_odds_at(self._voxels(points))
-        probability = torch.sigmoid(log_odds.to(torch.float64) * self._model.step)
+        probability = torch.sigmoid(log_odds.to(torch.float64) * self.sensor_model.step)
         return torch.where(log_odds == UNKNOWN, torch.nan, probability).reshape(points.shape[:-1])
 
     def is_free(self, points: Tensor, radius: float = 0.0) -> Tensor:
@@ -180,7 +180,7 @@ class OccupancyMap:
         """Remove the blocks farthest from the camera, but none that reaches into the window around it."""
         side = SIDE * self.config.voxel_size
         gap = cube_gap(camera, self.blocks.coordinates, side)
-        kept = int(_KEPT_FRACTION * self.config.max_blocks)
+        kept = max(int(_KEPT_FRACTION * self.config.max_blocks), 1)
         limit = max(float(gap.kthvalue(kept).values), self.config.window_radius)
         before = len(self.blocks)
         self.blocks.keep(gap <= limit)

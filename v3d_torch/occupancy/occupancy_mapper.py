@@ -89,8 +89,8 @@ class OccupancyMapper:
         self._store.append(view, len(poses) - 1, poses.T_cw)
         self._count += 1
         self._integrate(self.map, len(self._store) - 1)
-        if (removed := self._store.remove_redundant()) is not None and removed < self._rebuilt_views:
-            self._rebuilt_views -= 1
+        if (kept := self._store.reduce()) is not None:
+            self._rebuilt_views = int(kept[: self._rebuilt_views].sum())
         if self._rebuilt is None and self._count % _CHECK_INTERVAL == 0:
             self._begin_rebuild(poses)
         self._continue_rebuild(_REBUILD_VIEWS + 1)

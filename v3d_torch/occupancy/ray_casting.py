@@ -70,7 +70,7 @@ def observe_voxels(
     direction = torch.stack([(r[0] * a + r[1] * b + r[2] * c) / voxel_size for r in T_wc[:3, :3].tolist()], dim=1)
     origin = T_wc[:3, 3] / voxel_size
     free_depth = (nearest - (voxel_size / 2 + tolerance * (nearest * nearest))).clamp(max=max_depth)
-    voxels, marks = [torch.zeros(0, 3, dtype=torch.int64)], [torch.zeros(0, dtype=torch.uint8)]
+    free = [torch.zeros(0, 3, dtype=torch.int64)]
     hits = (origin + direction * z[:, None])[hits & (z <= max_depth)].floor().to(torch.int64)
     voxel = origin.floor().to(torch.int64).expand_as(direction)
     forward = direction > 0
@@ -81,21 +81,21 @@ def observe_voxels(
         inside = exit_depth[:, 0] <= free_depth
         voxel, exits, axis = voxel[inside], exits[inside], axis[inside]
         depth_step, step, free_depth = depth_step[inside], step[inside], free_depth[inside]
-        voxels.append(voxel)
-        marks.append(torch.full((len(voxel),), FREE, dtype=torch.uint8))
+        free.append(voxel)
         voxel = voxel.scatter_add(1, axis, step.gather(1, axis))
         exits = exits.scatter_add(1, axis, depth_step.gather(1, axis))
-    voxels.append(hits)
-    marks.append(torch.full((len(hits),), HIT, dtype=torch.uint8))
-    return _group_by_block(torch.cat(voxels), torch.cat(marks))
+    return _group_by_block(torch.cat(free), hits)
 
 
-def _group_by_block(voxels: Tensor, marks: Tensor) -> Observations:
-    """Largest mark of each voxel, by block."""
+def _group_by_block(free: Tensor, hits: Tensor) -> Observations:
+    """Mark voxels (N, 3) and (M, 3) as free and hit, by block; a voxel can be in both."""
+    voxels = torch.cat([free, hits])
     keys, row = cell_keys(voxels >> BITS).unique(return_inverse=True)
-    grouped = torch.zeros(len(keys) * VOLUME, dtype=torch.uint8)
-    grouped.index_reduce_(0, row * VOLUME + index_in_block(voxels), marks, "amax")
-    return Observations(cells_of_keys(keys), grouped.reshape(-1, VOLUME))
+    index = row * VOLUME + index_in_block(voxels)
+    marks = torch.zeros(len(keys) * VOLUME, dtype=torch.uint8)
+    marks[index[: len(free)]] = FREE
+    marks[index[len(free) :]] = HIT
+    return Observations(cells_of_keys(keys), marks.reshape(-1, VOLUME))
 
 
 def index_in_block(voxels: Tensor) -> Tensor:
