@@ -33,7 +33,10 @@ from v3d_torch.runs.stored_run import read_run
 
 FRAMES = 20
 CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_fraction=1")
-RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply", "mesh.ply")
+RESULTS = (
+    *("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply"),
+    *("occupancy.npz", "occupancy.bt", "mesh.ply"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +68,7 @@ def no_figures() -> Iterator[None]:
 
 
 def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:
-    return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", *more]
+    return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", "--occupancy", *more]
 
 
 def call(*arguments: str | Path) -> Result:

@@ -16,11 +16,20 @@ CONFIG = OccupancyConfig(enabled=True, interval=1)
 ALL = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
 
 
-def add_view(occupancy: OccupancyMap, number: int, T_wc: Tensor, *boxes: Tensor, static: Tensor = ALL) -> None:
-    """Add a view of the room with boxes in it."""
+def add_view(
+    occupancy: OccupancyMap,
+    number: int,
+    T_wc: Tensor,
+    *boxes: Tensor,
+    static: Tensor = ALL,
+    pose_in_map: Tensor | None = None,
+) -> None:
+    """Add a view of the room with boxes in it; the map can have another world frame than the room."""
     config = occupancy.config
     view = RangeView.sample(number, render(T_wc, *boxes)[0], static, config.stride)
-    occupancy.integrate(view.depth, view.static, view.rays(CAMERA, config.stride), T_wc)
+    occupancy.integrate(
+        view.depth, view.static, view.rays(CAMERA, config.stride), T_wc if pose_in_map is None else pose_in_map
+    )
 
 
 def map_of(occupied: Tensor, free: Tensor, config: OccupancyConfig = CONFIG) -> OccupancyMap:

@@ -44,7 +44,9 @@ def test_samples_have_the_depth_and_ray_of_their_pixels() -> None:
 
 
 def test_all_pixels_are_sampled_over_time() -> None:
-    offsets = [(view.row, view.column) for view in (RangeView.sample(i, torch.ones(240, 320), ALL, 8) for i in range(200))]
+    offsets = [
+        (view.row, view.column) for view in (RangeView.sample(i, torch.ones(240, 320), ALL, 8) for i in range(200))
+    ]
     assert set(offsets) == {(row, column) for row in range(8) for column in range(8)}
     assert len(set(offsets[:16])) == 16
 

@@ -15,6 +15,9 @@ from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 _MAX_VOXELS = 8192
 """Voxels that are used, which bounds the time; of more, every n-th is used."""
 
+_MAX_CANDIDATES = 1024
+"""Normals that are compared with all others as up direction; of more, every n-th is used."""
+
 _NORMAL_RADIUS = 2
 """Voxels around a voxel whose states give its normal."""
 
@@ -88,6 +91,8 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     points = points[normals @ direction > math.cos(_FACING_TOLERANCE)]
     for _ in range(_REFINEMENTS):
         direction = _fit_normal(points, _find_levels(points @ direction, size), size, direction)
+    if direction @ up.direction < math.cos(up.tolerance):
+        return None
     return _lowest_level(points @ direction, direction, size, step * size**2)
 
 
@@ -102,6 +107,7 @@ def _voxel_normals(occupancy: OccupancyMap, points: Tensor) -> Tensor:
 def _common_direction(normals: Tensor, up: UpDirection) -> Tensor | None:
     """The direction near up with which most normals agree, up or down, (3,); None if too few do."""
     candidates = normals[normals @ up.direction > math.cos(up.tolerance)]
+    candidates = candidates[:: max(math.ceil(len(candidates) / _MAX_CANDIDATES), 1)]
     agreeing = ((normals @ candidates.T).abs() > math.cos(_DIRECTION_TOLERANCE)).sum(dim=0)
     if len(candidates) == 0 or int(agreeing.max()) < _MIN_VOXELS:
         return None

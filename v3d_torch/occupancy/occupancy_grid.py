@@ -46,8 +46,9 @@ class OccupancyGrid:
         level = points.to(torch.float64) @ self.T_lw[:3, :3].T + self.T_lw[:3, 3]
         column, row = ((level[..., :2] - level.new_tensor(self.origin)) / self.cell_size).floor().long().unbind(dim=-1)
         inside = (row >= 0) & (row < self.states.shape[0]) & (column >= 0) & (column < self.states.shape[1])
-        found = self.states[torch.where(inside, row, 0), torch.where(inside, column, 0)]
-        return torch.where(inside, found, VoxelState.UNKNOWN).to(torch.int8)
+        states = torch.full_like(row, VoxelState.UNKNOWN, dtype=torch.int8)
+        states[inside] = self.states[row[inside], column[inside]]
+        return states
 
 
 def level_frame(up: Tensor, offset: float) -> Tensor:
