@@ -151,9 +151,10 @@ def _lowest_level(heights: Tensor, up: Tensor, size: float, area: float) -> Floo
     is_floor = (counts >= _MIN_VOXELS) & (counts * area >= _MIN_AREA) & (below <= _MAX_BELOW * counts)
     if not bool(is_floor.any()):
         return None
-    offset = heights[is_floor][0]
-    for _ in range(_REFINEMENTS):  # to the middle of the level
-        offset = heights[(heights - offset).abs() <= size].mean()
+    # The lowest voxels of a floor are noise; its height is that at which most of them lie.
+    near = heights <= heights[is_floor][0] + 2 * size
+    offset = heights[int(torch.where(near, counts, 0).argmax())]
+    offset = heights[(heights - offset).abs() <= size].mean()
     return Floor(up, float(offset), int(_count_near(heights, offset[None], size)) * area)
 
 

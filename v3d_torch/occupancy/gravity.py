@@ -12,11 +12,9 @@ from torch.nn.functional import normalize
 _ACCELEROMETER_TOLERANCE = math.radians(5)
 """Error of an accelerometer's up direction: bias and acceleration of a camera that is moved by hand."""
 
-_VOTES_TOLERANCE = math.radians(30)
-"""Error of the votes, which are for quarter turns of images."""
-
-_CAMERA_TOLERANCE = math.radians(45)
-"""Tilt of a camera that is held upright."""
+_IMAGE_TOLERANCE = math.radians(50)
+"""Error of an up direction that is known to a quarter turn of the image only, and not known across the image: a camera
+that looks up or down, or is rolled, by less. The normals of walls are then farther from it than that of the floor."""
 
 _MIN_VOTES = 3.0
 """Length of the sum of votes from which on it is more reliable than the first camera, in detections of score 1."""
@@ -46,5 +44,5 @@ def estimate_up(accelerometer: Tensor | None = None, votes: Tensor | None = None
     if accelerometer is not None:
         return UpDirection(normalize(accelerometer.to(torch.float64), dim=0), _ACCELEROMETER_TOLERANCE)
     if votes is not None and float(votes.norm()) >= _MIN_VOTES:
-        return UpDirection(normalize(votes.to(torch.float64), dim=0), _VOTES_TOLERANCE)
-    return UpDirection(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), _CAMERA_TOLERANCE)
+        return UpDirection(normalize(votes.to(torch.float64), dim=0), _IMAGE_TOLERANCE)
+    return UpDirection(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), _IMAGE_TOLERANCE)
