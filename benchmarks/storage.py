@@ -27,6 +27,8 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "lost": ("sequence", "interruption"),
     "map_costs": ("sequence",),
     "maps": ("sequence", "pixels"),
+    "occupancy": ("quantity",),
+    "occupancy_costs": ("sequence",),
     "primitives": ("primitive", "size", "threads", "competitor"),
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "contender"),

@@ -240,7 +240,7 @@ class V3DSLAM:
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
                 votes = up_votes(self._segmenter_state)
-                self.occupancy(frame.index, depth, objects.static_mask, self.poses, votes)
+                self.occupancy(depth, objects.static_mask, self.poses, votes)
         T_wc = invert(self.poses.T_cw)
         return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
 

@@ -14,7 +14,8 @@ from helpers.occupancy_scenes import CONFIG, add_view, box_of_voxels, map_of
 from helpers.rooms import ROOM
 from torch import Tensor
 
-from v3d_torch.errors import OutputError
+from v3d_torch.config.loading import load_config
+from v3d_torch.errors import ConfigError, OutputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.map_server import write_map_server_files
@@ -104,6 +105,20 @@ def test_grid_of_a_room_shows_its_walls_also_in_a_tilted_world(twist: tuple[floa
     near_walls = [{state(x + i * SIZE, z + j * SIZE) for i in (-1, 0, 1) for j in (-1, 0, 1)} for x, z in walls]
     assert all(VoxelState.OCCUPIED in states for states in near_walls)
     assert state(right + 0.3, 0.0) == VoxelState.UNKNOWN
+
+
+@pytest.mark.parametrize("heights", [(0.5, 0.5), (1.0, 0.2), (0.1, math.nan)])
+def test_heights_in_the_wrong_order_are_rejected(heights: tuple[float, float]) -> None:
+    with pytest.raises(ConfigError, match="give the lowest obstacle first"):
+        occupancy_grid(OccupancyMap(CONFIG), FLOOR, heights)
+    with pytest.raises(ConfigError, match=r"occupancy\.obstacle_heights: .*lowest height should be below"):
+        load_config(overrides=[f"occupancy.obstacle_heights={list(heights)}".replace("nan", ".nan")])
+
+
+def test_heights_closer_than_a_voxel_use_the_space_between_them() -> None:
+    occupancy = map_of(torch.tensor([[3, -5, 3]]), box_of_voxels((0, -5, 0), (3, -4, 3)))
+    grid = occupancy_grid(occupancy, FLOOR, (0.21, 0.24))
+    assert state_above(grid, 1, 1) == VoxelState.FREE and state_above(grid, 3, 3) == VoxelState.OCCUPIED
 
 
 def test_map_without_space_between_the_heights_gives_an_empty_grid(tmp_path: Path) -> None:

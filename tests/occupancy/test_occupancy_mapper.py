@@ -45,7 +45,7 @@ class Drive:
             own = self.keyframes[index // 18 % 2]
             T_ck = invert(POSES[index % 36]) @ POSES[18 * (index // 18 % 2)]
             self.entries.append(PoseEntry(index / 30, status, own, T_ck, has_motion=True))
-            self.mapper(index, render(POSES[index % 36], CRATE), ALL, self.poses)
+            self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses)
 
     def correct(self, row: int = 0, shift: Tensor = SHIFT) -> None:
         """Move a keyframe, as bundle adjustment and loop closing do."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
 class Section(BaseModel):
@@ -370,7 +370,7 @@ class OccupancyConfig(Section):
 
     enabled: bool = False
     """True to grow an occupancy map and write it."""
-    voxel_size: float = Field(0.05, gt=0)
+    voxel_size: float = Field(0.05, ge=0.01)
     """Side of a voxel, metres: OctoMap's and ROS's usual resolution in rooms, twice the depth error of a Kinect at
     4 m."""
     interval: int = Field(3, gt=0)
@@ -378,7 +378,7 @@ class OccupancyConfig(Section):
     stride: int = Field(8, gt=0, le=100)
     """Every n-th row and column is added, with another offset each time: rays are 0.06 m apart at 4 m, about a
     voxel."""
-    max_depth: float = Field(4.0, gt=0)
+    max_depth: float = Field(4.0, gt=0, le=10)
     """Maximum depth of obstacles, metres, as for the dense map; farther rays show free space up to it."""
     depth_tolerance: float = Field(0.006, ge=0)
     """Depth error divided by the squared depth, 1/m: four standard deviations of a structured-light camera (Khoshelham
@@ -405,6 +405,13 @@ class OccupancyConfig(Section):
     obstacle_heights: tuple[float, float] = (0.15, 1.8)
     """Lowest and highest obstacle in the 2D grid, metres above the floor: a voxel and the error of the floor at 4 m,
     which 1.5 degrees of tilt make, and the height of a person."""
+
+    @field_validator("obstacle_heights")
+    @classmethod
+    def _check_heights(cls, heights: tuple[float, float]) -> tuple[float, float]:
+        if not heights[0] < heights[1]:
+            raise ValueError("the lowest height should be below the highest")
+        return heights
 
 
 class CheckpointConfig(Section):

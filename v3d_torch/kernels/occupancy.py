@@ -28,6 +28,7 @@ UNKNOWN = -128
 Depth = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Marks = NDArray[np.uint8]
+Table = NDArray[np.int32]
 
 
 @device
@@ -60,7 +61,7 @@ def _local_index(x: int, y: int, z: int) -> int:
 
 
 @device
-def _block_row(x: int, y: int, z: int, first: Ints, table: Ints, blocks: Ints, count: int) -> tuple[int, int]:
+def _block_row(x: int, y: int, z: int, first: Ints, table: Table, blocks: Ints, count: int) -> tuple[int, int]:
     """Row of the block with a voxel, which becomes row ``count`` if it has none; the number of rows."""
     x, y, z = x >> BITS, y >> BITS, z >> BITS
     i, j, k = x - first[0], y - first[1], z - first[2]
@@ -74,7 +75,7 @@ def _block_row(x: int, y: int, z: int, first: Ints, table: Ints, blocks: Ints, c
 
 @device
 def _cast_ray(
-    origin: Array, direction: Array, free_depth: float, hit_depth: float, first: Ints, table: Ints, blocks: Ints,
+    origin: Array, direction: Array, free_depth: float, hit_depth: float, first: Ints, table: Table, blocks: Ints,
     marks: Marks, count: int,
 ) -> int:  # fmt: skip
     """Mark the voxels along a ray as free, and the voxel of the surface as hit; return the number of blocks."""
@@ -131,7 +132,7 @@ def observe_voxels(
     for axis in range(3):
         first[axis] = (np.int64(math.floor(origin[axis])) >> BITS) - reach
     side = 2 * reach + 1
-    table = np.full((side, side, side), -1, np.int64)
+    table = np.full((side, side, side), -1, np.int32)
     blocks, marks, count = np.empty((6 * side, 3), np.int64), np.zeros((6 * side, VOLUME), np.uint8), 0
     for row in range(height):
         for column in range(width):

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 
@@ -77,8 +78,13 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
         occupancy: Map.
         floor: Floor of the map, see `find_floor`.
         heights: Lowest and highest obstacle, metres above the floor; None for those of the configuration.
+
+    Raises:
+        ConfigError: If the lowest height is not below the highest.
     """
     size, (low, high) = occupancy.config.voxel_size, heights or occupancy.config.obstacle_heights
+    if not low < high:
+        raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest")
     T_lw = level_frame(floor.up, floor.offset)
     occupied = _between(occupancy.occupied_points, T_lw, low, high)
     known = torch.cat([occupied, _between(occupancy.free_points, T_lw, low, high)])
@@ -88,7 +94,7 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
     columns, rows = ((known.amax(dim=0) / size).floor().to(torch.int64) - first + 1).tolist()
     centres = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).to(torch.float64)
     centres = (centres + first + 0.5) * size
-    levels = torch.arange(low + size / 2, high, size, dtype=torch.float64)
+    levels = torch.arange(low + min(size, high - low) / 2, high, size, dtype=torch.float64)
     count = torch.zeros(len(centres), dtype=torch.int64)
     for z in levels.tolist():
         points = torch.cat([centres, centres.new_full((len(centres), 1), z)], dim=1)

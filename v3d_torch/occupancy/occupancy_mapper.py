@@ -70,23 +70,21 @@ class OccupancyMapper:
         """Approximate up direction, which `find_floor` refines."""
         return estimate_up(self.accelerometer, self._up_votes)
 
-    def __call__(
-        self, frame: int, depth: Tensor, static: Tensor, poses: PoseHistory, up_votes: Tensor | None = None
-    ) -> None:
+    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up_votes: Tensor | None = None) -> None:
         """Add a frame, if it is due and its pose is known.
 
         Args:
-            frame: Index of the frame in the sequence.
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             poses: Poses of all frames up to this one.
             up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None without.
         """
         self._up_votes = up_votes
+        frame = len(poses) - 1
         if frame % self._config.interval != 0 or not _is_reliable(poses):
             return
         view = RangeView.sample(self._count, depth[0], static, self._config.stride)
-        self._store.append(view, len(poses) - 1, poses.T_cw)
+        self._store.append(view, frame, poses.T_cw)
         self._count += 1
         self._integrate(self.map, len(self._store) - 1)
         if (kept := self._store.reduce()) is not None:
