@@ -35,7 +35,7 @@ from v3d_torch.evaluation.ate import align
 from v3d_torch.geometry.cell_keys import cell_keys
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.occupancy_io import save_occupancy
-from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
+from v3d_torch.occupancy.occupancy_map import VoxelState
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
@@ -81,17 +81,16 @@ def compare_with_demo(sequence: RGBDSequence, pipeline: Pipeline, mapper: Occupa
     seen = [seen_points(renderer, sequence[i], occupancy.config.max_depth) for i in range(0, len(sequence), interval)]
     seen_keys, pixels = torch.cat([keys_of(points) for points in seen]).unique(return_counts=True)
     state = _states_of(seen_keys, occupied, free)
-    known, sampled = state != VoxelState.UNKNOWN, pixels >= occupancy.config.stride**2
-    right = state == VoxelState.OCCUPIED
+    known, right = state != VoxelState.UNKNOWN, state == VoxelState.OCCUPIED
+    sampled = pixels >= occupancy.config.stride**2
+    area_right = int(pixels[known & right].sum()) / int(pixels[known].sum())
     truly_free = int(free_right.sum()) + int((~has_surface).sum())
     rows = {
         "voxels that are called free and contain no surface": _share(free_right),
         "voxels that are called occupied, with a surface in them or in a neighbour": _share(near_surface),
         "voxels that are called occupied and contain a surface": _share(has_surface),
         "known voxels without surface that are called free": f"{int(free_right.sum()) / truly_free:.2%}",
-        "surface that was seen, by area, in voxels that are called occupied": _ratio(
-            pixels[known & right], pixels[known]
-        ),
+        "surface that was seen, by area, in voxels that are called occupied": f"{area_right:.2%}",
         "voxels of which at least a sample was seen that are called occupied": _share(right[known & sampled]),
     }
     for mask_id, name in FIGURES.items():
@@ -121,10 +120,6 @@ def _states_of(keys: Tensor, occupied: Tensor, free: Tensor) -> Tensor:
 
 def _share(mask: Tensor) -> str:
     return f"{float(mask.double().mean()):.2%} of {len(mask)}"
-
-
-def _ratio(part: Tensor, whole: Tensor) -> str:
-    return f"{int(part.sum()) / int(whole.sum()):.2%}"
 
 
 def measure_costs(pipeline: Pipeline, mapper: OccupancyMapper) -> Row:

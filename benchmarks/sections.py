@@ -175,9 +175,9 @@ def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measu
     yield "## Occupancy map"
     if measurements:
         text = (
-            "The map of the demo, with estimated poses and masks, against the exact surfaces of the room. A voxel that a"
-            " surface touches with its corner contains it, however little of it is seen. A sample stands for 64 pixels."
-            " What is not known is excluded from all rows."
+            "The map of the demo, with estimated poses and masks, against the exact surfaces of the room. A voxel that"
+            " a surface touches with a corner contains it, however little of it is seen; a sample stands for 64 pixels."
+            " Unknown space is excluded from all rows."
         )
         yield from part(text, flat(rows_of(measurements), columns.OCCUPANCY), measurements)
     if costs:

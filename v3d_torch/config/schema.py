@@ -395,7 +395,7 @@ class OccupancyConfig(Section):
     """Space within this distance of the camera is never forgotten to limit the memory, metres: more than the depth
     that is added."""
     max_blocks: int = Field(8192, gt=0)
-    """Maximum number of blocks of 16 x 16 x 16 voxels, 4 kB each. They hold a hundred rooms; beyond, the blocks
+    """Maximum number of blocks of 16 x 16 x 16 voxels, 4 kB each. They hold dozens of rooms; beyond, the blocks
     farthest from the camera are removed."""
     max_views: int = Field(1000, gt=0)
     """Maximum number of stored views, 15 kB each, from which the map is rebuilt after corrections of the poses. Beyond,
