@@ -170,6 +170,24 @@ def maps_section(measurements: Sequence[Measurement], costs: Sequence[Measuremen
         yield from part(text, flat(rows_of(costs), columns.MAP_COSTS), costs, "sequence")
 
 
+def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the occupancy map."""
+    yield "## Occupancy map"
+    if measurements:
+        text = (
+            "The map of the demo, with estimated poses and masks, against the exact surfaces of the room. A voxel that"
+            " a surface touches with a corner contains it, however little of it is seen; a sample stands for 64 pixels."
+            " Unknown space is excluded from all rows."
+        )
+        yield from part(text, flat(rows_of(measurements), columns.OCCUPANCY), measurements)
+    if costs:
+        text = (
+            "Time of the stage in the system, and of OctoMap (octomap-python) for the insertion of the same views;"
+            " memory of voxels and stored views; size of the files; time of queries."
+        )
+        yield from part(text, flat(rows_of(costs), columns.OCCUPANCY_COSTS), costs, "sequence")
+
+
 def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the primitives of the object stage."""
     yield "## Primitives of the object stage"
@@ -214,6 +232,7 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("ablation",), objects_section),
     (("segmentation",), segmentation_section),
     (("maps", "map_costs"), maps_section),
+    (("occupancy", "occupancy_costs"), occupancy_section),
     (("ablation",), ablation_section),
     (("primitives",), primitives_section),
     (("modules",), modules_section),

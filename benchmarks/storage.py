@@ -28,6 +28,8 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "map_costs": ("sequence",),
     "maps": ("sequence", "pixels"),
     "modules": ("function", "batch", "competitor"),
+    "occupancy": ("quantity",),
+    "occupancy_costs": ("sequence",),
     "primitives": ("primitive", "size", "threads", "competitor"),
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "contender"),

@@ -28,6 +28,14 @@ from .objects.instance_tracker import InstanceTracker
 from .objects.intra_object_motion import Deformation, IntraObjectMotion, intra_object_motion
 from .objects.largest_clusters import LargestClusters, largest_clusters
 from .objects.voting import HoughVoting, Votes, hough_vote
+from .occupancy.floor import Floor, find_floor
+from .occupancy.gravity import UpDirection, estimate_up
+from .occupancy.map_server import write_map_server_files
+from .occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
+from .occupancy.occupancy_io import StoredOccupancy, load_occupancy, save_occupancy
+from .occupancy.occupancy_map import OccupancyMap, VoxelState
+from .occupancy.occupancy_mapper import OccupancyMapper
+from .occupancy.octomap_file import write_octomap
 from .odometry.dense_aligner import DenseAligner, DenseAlignment, align_depth
 from .odometry.rolling_shutter import RollingShutterCompensation, compensate_rolling_shutter
 from .optim.pose_refinement import PoseRefinement, PoseRefiner, refine_pose
@@ -54,6 +62,7 @@ __all__ = [
     "DownloadError",
     "EssentialMatrix",
     "EssentialRANSAC",
+    "Floor",
     "FrameResult",
     "GroundTruthWarning",
     "HoughVoting",
@@ -64,6 +73,9 @@ __all__ = [
     "LargestClusters",
     "Mesh",
     "MotionState",
+    "OccupancyGrid",
+    "OccupancyMap",
+    "OccupancyMapper",
     "PinholeCamera",
     "PnP",
     "PnPRANSAC",
@@ -79,12 +91,15 @@ __all__ = [
     "SourceOptions",
     "StaticViews",
     "StoredMap",
+    "StoredOccupancy",
     "TrackedObject",
     "TrackingStatus",
     "Trajectory",
+    "UpDirection",
     "V3DError",
     "Votes",
     "VoxelPool",
+    "VoxelState",
     "Voxels",
     "align_depth",
     "ate",
@@ -95,6 +110,8 @@ __all__ = [
     "dbscan",
     "essential_ransac",
     "estimate_readout",
+    "estimate_up",
+    "find_floor",
     "fuse_mesh",
     "fuse_points",
     "hough_vote",
@@ -102,10 +119,12 @@ __all__ = [
     "largest_clusters",
     "load_config",
     "load_map",
+    "load_occupancy",
     "load_sequence",
     "load_state",
     "match_descriptors",
     "match_instances",
+    "occupancy_grid",
     "open_source",
     "optimise_pose_graph",
     "pnp_ransac",
@@ -113,6 +132,7 @@ __all__ = [
     "refine_pose",
     "rpe",
     "save_map",
+    "save_occupancy",
     "save_state",
     "se3_exp",
     "se3_log",
@@ -120,5 +140,7 @@ __all__ = [
     "surface_normals",
     "umeyama",
     "voxel_pool",
+    "write_map_server_files",
+    "write_octomap",
     "write_trajectory",
 ]
