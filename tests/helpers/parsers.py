@@ -29,7 +29,7 @@ from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.io.extract import extract_tar
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.occupancy.occupancy_io import load_occupancy
-from v3d_torch.runs import stored_run
+from v3d_torch.runs import metrics_file, stored_run
 from v3d_torch.types import Trajectory
 
 Parser = Callable[[bytes, Path], object]
@@ -126,7 +126,7 @@ PARSERS: dict[str, Parser] = {
     "archive": from_file("archive.tgz", extract_archive),
     "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
     "occupancy": from_file("occupancy.npz", load_occupancy),
-    "metrics.json": from_file("metrics.json", stored_run.read_metrics),
+    "metrics.json": from_file("metrics.json", metrics_file.read_metrics),
     "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
 }
 

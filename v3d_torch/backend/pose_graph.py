@@ -9,9 +9,8 @@ camera frame; the error of an edge is ``log(T_ij^-1 T_wi^-1 T_wj)``, in the same
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
-import pypose as pp
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
@@ -21,6 +20,9 @@ from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
 from v3d_torch.runtime.batches import common_batch, fill_padding
+
+if TYPE_CHECKING:
+    import pypose as pp
 
 _REGULARISATION = 1e-9
 """Added to the diagonal of the normal equations, so that they have a solution for poses without any edge; negligible
@@ -93,7 +95,7 @@ def optimise_pose_graph(
         The poses of minimal cost, with the dtype of ``T_wc``. Poses that no path of edges joins to a fixed pose are
         determined only relative to each other.
     """
-    initial, measured = (T.matrix() if isinstance(T, pp.LieTensor) else T for T in (T_wc, T_ij))
+    initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
     KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
@@ -227,9 +229,16 @@ def _prepare(
     return graph, T_wc.to(torch.float64).expand(*batch, *T_wc.shape[-3:])
 
 
+def _is_lie_tensor(T: Tensor) -> TypeGuard[pp.LieTensor]:
+    """Check for a tensor of PyPose without importing PyPose."""
+    return hasattr(T, "ltype")
+
+
 def _move(initial: Tensor, optimum: Tensor, steps: Tensor | None, is_fixed: Tensor) -> Tensor:
     """Optimum with its derivatives, in the type of the initial poses, whose fixed ones are kept."""
-    if isinstance(initial, pp.LieTensor):
+    if _is_lie_tensor(initial):
+        import pypose as pp  # the package takes long to import, and few callers need it
+
         T = pp.mat2SE3(optimum, check=False)
         T = T if steps is None else T @ pp.se3(steps).Exp()
         return pp.SE3(torch.where(is_fixed[..., 0], initial.tensor(), T.tensor().to(initial.dtype)))
