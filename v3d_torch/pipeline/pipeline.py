@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -14,13 +14,14 @@ import torch
 
 from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.pipeline.run_record import RunRecord, Snapshot
+from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 from v3d_torch.runtime.process import trim_memory
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
@@ -52,11 +53,12 @@ class Viewer(Protocol):
             stage_times: Time that each stage spent on the frame.
         """
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Show the final map and trajectory, and close files and connections.
 
         Args:
             slam: SLAM system after the last frame.
+            point_map: Point map of the static scene.
 
         Raises:
             OutputError: If the recording cannot be written.
@@ -71,12 +73,45 @@ class NullViewer:
     ) -> None:
         """Do nothing."""
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Do nothing."""
 
 
 NULL_VIEWER = NullViewer()
 """Viewer of a run that is not shown."""
+
+
+class ViewerGroup:
+    """Several viewers of one run.
+
+    Args:
+        viewers: Viewers.
+    """
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
+
+    def show(
+        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
+    ) -> None:
+        """Show a tracked frame in all viewers."""
+        for viewer in self._viewers:
+            viewer.show(frame, objects, slam, stage_times)
+
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
+        """Finish all viewers, also if one of them fails.
+
+        Raises:
+            OutputError: The errors of all viewers, in one line.
+        """
+        errors = []
+        for viewer in self._viewers:
+            try:
+                viewer.finish(slam, point_map)
+            except OutputError as error:
+                errors.append(str(error))
+        if errors:
+            raise OutputError("; ".join(errors))
 
 
 class Pipeline:
@@ -164,13 +199,19 @@ class Pipeline:
         return record
 
     @torch.inference_mode()
-    def flush(self) -> None:
-        """Apply the pending result of the back end and show the final state; call this after the last frame."""
+    def flush(self) -> PointMap:
+        """Apply the pending result of the back end and show the final state; call this after the last frame.
+
+        Returns:
+            Point map of the static scene, fused from all views.
+        """
         self.slam.flush()
+        point_map = fuse_points(self.views, self.slam.config)
         try:
-            self._viewer.finish(self.slam)
+            self._viewer.finish(self.slam, point_map)
         except V3DError as error:
             self.record.failure = self.record.failure or str(error)
+        return point_map
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the run between two frames: system, records and views."""

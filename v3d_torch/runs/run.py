@@ -106,8 +106,8 @@ class Run:
 
         record = self.pipeline(log_and_save)
         self._autosave.end()
-        self.pipeline.flush()
-        evaluation = write_results(self._folder, self.pipeline)
+        point_map = self.pipeline.flush()
+        evaluation = write_results(self._folder, self.pipeline, point_map)
         self._autosave.discard()
         if record.failure:
             _LOG.error(record.failure)
