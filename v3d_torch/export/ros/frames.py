@@ -56,7 +56,8 @@ def points_in_map(points: Tensor) -> Tensor:
     Returns:
         Points, metres, shape :math:`(..., 3)`.
     """
-    return points @ T_MAP_WORLD[:3, :3].T.to(points)
+    x, y, z = points.unbind(dim=-1)
+    return torch.stack([z, -x, -y], dim=-1)  # the rotation of T_MAP_WORLD
 
 
 class OdometryFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 from torch import Tensor
 
 from v3d_torch.export.ros.frames import MAP, points_in_map
-from v3d_torch.export.ros.messages import header, point, pose, vector
+from v3d_torch.export.ros.messages import header, point, vector
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 
@@ -28,7 +28,7 @@ _ARROW = (0.03, 0.06, 0.1)
 _MIN_SIZE = 0.02
 """Smallest side of a box, metres: viewers reject boxes without volume."""
 
-_EYE = torch.eye(4, dtype=torch.float64)
+_ORIGIN, _UNIT = torch.zeros(3), torch.ones(3)
 
 
 def object_markers(
@@ -36,7 +36,7 @@ def object_markers(
 ) -> ros.visualization_msgs__msg__MarkerArray:
     """Make the markers of a frame, in ``map``. The first one removes those of the frame before.
 
-    An arrow ends where the object will be a second later. Objects without a centroid have no markers.
+    An arrow ends where the object will be a second later. Objects without a centroid or a cloud have none.
 
     Args:
         stamp: Timestamp, seconds.
@@ -46,7 +46,7 @@ def object_markers(
     """
     markers = [_marker(stamp, "", 0, Marker.CUBE, "unknown", action=Marker.DELETEALL)]
     for each in objects.objects:
-        if bool(each.centroid.isfinite().all()):
+        if len(each.cloud) and bool(each.centroid.isfinite().all()):
             markers += _box_and_name(stamp, each)
             if each.motion_state is MotionState.DYNAMIC and each.id in velocities:
                 markers.append(_arrow(stamp, each, velocities[each.id]))
@@ -56,36 +56,33 @@ def object_markers(
 def _box_and_name(stamp: float, each: TrackedObject) -> list[Marker]:
     low, high = _bounds(each)
     state = each.motion_state.value
-    T_box, T_name = _EYE.clone(), _EYE.clone()
-    T_box[:3, 3] = (low + high) / 2
-    T_name[:3, 3] = torch.cat([T_box[:2, 3], high[2:] + _NAME_HEIGHT])
-    size, letters = (high - low).clamp(min=_MIN_SIZE), torch.full((3,), _NAME_HEIGHT)
+    centre, size = (low + high) / 2, (high - low).clamp(min=_MIN_SIZE)
+    above, letters = torch.cat([centre[:2], high[2:] + _NAME_HEIGHT]), torch.full((3,), _NAME_HEIGHT)
     name = f"{each.name}, {state}"
     return [
-        _marker(stamp, "boxes", each.id, Marker.CUBE, state, T=T_box, size=size, opacity=_BOX_OPACITY),
-        _marker(stamp, "names", each.id, Marker.TEXT_VIEW_FACING, state, T=T_name, size=letters, text=name),
+        _marker(stamp, "boxes", each.id, Marker.CUBE, state, centre=centre, size=size, opacity=_BOX_OPACITY),
+        _marker(stamp, "names", each.id, Marker.TEXT_VIEW_FACING, state, centre=above, size=letters, text=name),
     ]
 
 
 def _arrow(stamp: float, each: TrackedObject, velocity: Tensor) -> Marker:
     start = points_in_map(each.centroid)
-    points = torch.stack([start, start + points_in_map(velocity)])  # map and world have the same origin
+    end = start + points_in_map(velocity)  # map and world have the same origin
     return _marker(
         *(stamp, "velocities", each.id, Marker.ARROW, each.motion_state.value),
         size=torch.tensor(_ARROW),
-        points=points,
+        points=[start, end],
     )
 
 
 def _bounds(each: TrackedObject) -> tuple[Tensor, Tensor]:
-    """Smallest and largest coordinates of an object in ``map``, float64, shape (3,) each.
+    """Smallest and largest coordinates of an object in ``map``, shape (3,) each.
 
     The cloud of a missed object is that of its last detection: it is moved to the predicted centroid.
     """
-    cloud = points_in_map(each.cloud.to(torch.float64))
-    if each.missed:
-        cloud = cloud + points_in_map(each.centroid) - cloud.mean(dim=0)
-    return cloud.amin(dim=0), cloud.amax(dim=0)
+    cloud = points_in_map(each.cloud)
+    motion = points_in_map(each.centroid) - cloud.mean(dim=0) if each.missed else 0.0
+    return cloud.amin(dim=0) + motion, cloud.amax(dim=0) + motion
 
 
 def _marker(
@@ -95,11 +92,11 @@ def _marker(
     kind: int,
     motion_state: str,
     *,
-    T: Tensor = _EYE,
-    size: Tensor = torch.ones(3),  # noqa: B008 - never changed
+    centre: Tensor = _ORIGIN,
+    size: Tensor = _UNIT,
     opacity: float = 1.0,
     text: str = "",
-    points: Tensor = torch.zeros(0, 3),  # noqa: B008
+    points: Sequence[Tensor] = (),
     action: int = Marker.ADD,
 ) -> Marker:
     red, green, blue = to_rgb(MOTION_STATE_COLOURS[motion_state])
@@ -109,7 +106,7 @@ def _marker(
         number,
         kind,
         action,
-        pose(T),
+        ros.geometry_msgs__msg__Pose(point(centre), ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0)),
         vector(size),
         ros.std_msgs__msg__ColorRGBA(red, green, blue, opacity),
         ros.builtin_interfaces__msg__Duration(0, 0),  # until the next frame removes it
