@@ -22,9 +22,8 @@ def read_with_mcap(path: Path) -> Messages:
     """Read a file; the decoder uses the definitions in the file only."""
     messages: Messages = defaultdict(list)
     with path.open("rb") as file:
-        for _, channel, message, decoded in make_reader(
-            file, decoder_factories=[DecoderFactory()]
-        ).iter_decoded_messages():
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, channel, message, decoded in reader.iter_decoded_messages():
             messages[channel.topic].append((message.log_time, decoded))
     return messages
 

@@ -96,7 +96,8 @@ def test_times_are_those_of_the_frames_and_never_decrease(messages: Messages) ->
         times = [time for time, _ in messages[topic]]
         assert times == sorted(times)
         assert [stamp_of(message.header) for _, message in messages[topic]] == pytest.approx([1e-9 * t for t in times])
-    assert {stamp_of(each.header) for _, tf in messages["/tf"][3:4] for each in tf.transforms} == {0.3}
+    stamps = [stamp_of(each.header) for _, tf in messages["/tf"] for each in tf.transforms]
+    assert stamps == pytest.approx([index / 10 for index in range(FRAMES) for _ in range(3)])
 
 
 def test_convention_tf_tree_gives_the_pose_of_each_frame(messages: Messages, recorded: Recorded) -> None:
@@ -233,7 +234,7 @@ def test_full_disk_is_a_failure_after_all_frames(tmp_path: Path, monkeypatch: py
     failure = run.pipeline.record.failure
     assert failure is not None and "run.mcap: the bag cannot be written (No space left on device)" in failure
     assert len(run.pipeline.slam.poses) == FRAMES and count == 11
-    assert len(read_with_mcap(run.path)["/tf"]) == 3  # what was written before is readable
+    assert len(read_with_mcap(run.path)["/tf"]) == 2  # what was written before is readable
 
 
 def test_frames_before_the_end_of_time_are_recorded_and_the_error_names_the_cause(tmp_path: Path) -> None:
