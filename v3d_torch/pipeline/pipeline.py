@@ -120,7 +120,9 @@ class Pipeline:
     Args:
         sequence: Frames, stored or live.
         slam: System; frames of a stored sequence that it has processed already are skipped.
-        masks: Folder for an image of the masked pixels per frame; None for no images.
+        masks: Folder for an image per frame of the pixels that tracking excludes; None for no images.
+        map_masks: Folder for an image per frame of the pixels that maps exclude, which are those of `masks` and all
+            people; None for no images.
         viewer: Viewer that is shown each frame.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
@@ -138,6 +140,7 @@ class Pipeline:
         viewer: Viewer = NULL_VIEWER,
         views: StaticViews | None = None,
         *,
+        map_masks: Path | None = None,
         evaluate_masks: bool = True,
     ) -> None:
         self.sequence = sequence
@@ -145,7 +148,7 @@ class Pipeline:
         self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.record = RunRecord()
         self.between_frames = True
-        self._masks = masks
+        self._mask_folders = masks, map_masks
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
         self._snapshot_step = 1
@@ -232,9 +235,9 @@ class Pipeline:
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.dynamics.append_objects(frame, result.objects)
         self._evaluate_masks(frame, result)
-        if self._masks is not None:
-            masked = (~result.static_mask).to(torch.uint8) * 255
-            write_png(self._masks / f"{frame.stamp:.6f}.png", masked.numpy())
+        for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
+            if folder is not None:
+                write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)
         keyframes = self.slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             self.views.add(keyframes[-1], frame.image, frame.depth, result.static_without_people)

@@ -20,7 +20,7 @@ from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runs.results import write_results
 from v3d_torch.runtime.process import set_num_threads
@@ -65,6 +65,7 @@ class Run:
     ) -> None:
         config = request.config
         write_text(folder / "config.yaml", dump_config(config))  # fails before the first frame if the disk is full
+        write_request(folder, request)
         set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         system = CheckedSLAM if config.check_numerics else V3DSLAM
@@ -76,6 +77,7 @@ class Run:
             folder / "masks" if request.save_masks else None,
             viewer,
             None if known_map is None else known_map.views,
+            map_masks=folder / "map_masks" if request.save_masks else None,
         )
         if checkpoint is not None:
             remove_unfinished(folder)

@@ -1,0 +1,144 @@
+"""Images of a finished run with their poses and masks, for exports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import torch
+from torch import Tensor
+
+from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
+from v3d_torch.datasets.open_source import is_live
+from v3d_torch.errors import InputError
+from v3d_torch.export.posed_image import PosedImage
+from v3d_torch.io.download import Progress
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.stored_run import StoredRun
+from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
+
+_MASKS = "map_masks"
+
+_LOCATED = (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
+"""Statuses of frames whose pose is known relative to the whole map."""
+
+_STAMP_TOLERANCE = 2e-6
+"""Tolerance of timestamps, seconds: files have six decimals."""
+
+
+def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) -> RGBDStream:
+    """Open the source of the images of a run again.
+
+    Args:
+        run: Results of the run.
+        request: Options of the run.
+        progress: Callback for the progress of slow sources; None for no reports.
+
+    Raises:
+        InputError: If the source is a live camera, or cannot be opened.
+        DownloadError: If the source is missing and cannot be downloaded.
+    """
+    if is_live(request.seq):
+        raise InputError(
+            f"{run.folder}: the images of a live camera are not stored; record them first with v3d-torch record, and"
+            " run the recording"
+        )
+    return open_source(
+        request.seq,
+        data_root=request.data_root,
+        camera=request.camera,
+        options=request.source_options,
+        progress=progress,
+    )
+
+
+@dataclass(frozen=True)
+class LocatedFrames:
+    """Frames of a run with a known pose.
+
+    Attributes:
+        indices: Positions in the trajectory of the run, increasing.
+        poses: Poses of the frames.
+    """
+
+    indices: list[int]
+    poses: Trajectory
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def every(self, step: int) -> LocatedFrames:
+        """Return every n-th frame."""
+        poses = Trajectory(self.poses.stamps[::step], self.poses.T_wc[::step])
+        return LocatedFrames(self.indices[::step], poses)
+
+
+def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFrames:
+    """Select the frames whose pose is known relative to the whole map.
+
+    Args:
+        run: Results of the run.
+        only_keyframes: True for the keyframes among them.
+
+    Raises:
+        InputError: If there is no such frame.
+    """
+    indices = [index for index, status in enumerate(run.metrics.status) if status in _LOCATED]
+    if only_keyframes:
+        keyframes = run.frames.column("keyframe").to_pylist() if run.frames is not None else []
+        indices = [index for index in indices if index < len(keyframes) and keyframes[index]]
+    if not indices or run.trajectory is None:
+        raise InputError(f"{run.folder}: has no frame with a known pose; run another sequence")
+    return LocatedFrames(indices, Trajectory(run.trajectory.stamps[indices], run.trajectory.T_wc[indices]))
+
+
+def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, masks: bool) -> Iterator[PosedImage]:
+    """Yield frames with their poses and masks.
+
+    Args:
+        run: Results of the run.
+        source: Images of the run.
+        frames: Frames to yield.
+        masks: True to read the masks that the run saved; False for masks that exclude nothing.
+
+    Raises:
+        InputError: If the run saved no masks, the source has other frames than the run had, or an image cannot be read.
+    """
+    folder = run.folder / _MASKS
+    if masks and not folder.is_dir():
+        raise InputError(
+            f"{run.folder}: has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"
+        )
+    images = _read_frames(source, frames.indices)
+    for frame, stamp, T_wc in zip(images, frames.poses.stamps.tolist(), frames.poses.T_wc, strict=False):
+        if abs(frame.stamp - stamp) > _STAMP_TOLERANCE:
+            raise InputError(
+                f"{source.name}: frame {frame.index} is at {frame.stamp:.6f} s, but at {stamp:.6f} s in {run.folder};"
+                " pass the sequence of this run with --seq"
+            )
+        size = frame.depth.shape[1:]
+        static = _read_mask(folder / f"{stamp:.6f}.png", size) if masks else torch.ones(size, dtype=torch.bool)
+        yield PosedImage(frame, T_wc, static)
+
+
+def _read_frames(source: RGBDStream, indices: Sequence[int]) -> Iterator[RGBDFrame]:
+    if not isinstance(source, RGBDSequence):
+        wanted = set(indices)
+        yield from (frame for frame in islice(source, indices[-1] + 1) if frame.index in wanted)
+    elif indices[-1] < len(source):
+        yield from map(source.__getitem__, indices)
+    else:
+        raise InputError(
+            f"{source.name}: has {len(source)} frames, fewer than the run; pass the sequence of this run with --seq"
+        )
+
+
+def _read_mask(path: Path, size: torch.Size) -> Tensor:
+    """Read the static pixels of a frame, bool, shape (H, W)."""
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if mask is None or mask.shape != size:
+        raise InputError(f"{path}: is missing, damaged or of another size; run the sequence again with --save-masks")
+    return torch.from_numpy(mask == 0)
