@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import kornia_rs
 import numpy as np
-import pytest
 import torch
 from helpers.photographs import photograph
 

@@ -25,8 +25,10 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.extract import extract_tar
+from v3d_torch.io.ply import read_ply_points
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.runs import stored_run
+from v3d_torch.runs.request import read_request
 from v3d_torch.types import Trajectory
 
 Parser = Callable[[bytes, Path], object]
@@ -113,6 +115,8 @@ PARSERS: dict[str, Parser] = {
     "mcap": from_file("take.mcap", read_bag),
     "archive": from_file("archive.tgz", extract_archive),
     "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
+    "point map": from_file("map.ply", read_ply_points),
+    "request.yaml": from_file("request.yaml", lambda path: read_request(path.parent)),
     "metrics.json": from_file("metrics.json", stored_run.read_metrics),
     "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
 }

@@ -115,12 +115,12 @@ def _select_frames(run: StoredRun, options: ExportOptions) -> LocatedFrames:
 
 
 def _write_nerfstudio(out: Path, export: _Export, camera: PinholeCamera, images: Iterable[PosedImage]) -> list[str]:
-    write_nerfstudio(out, camera, images, export.run.folder / "map.ply")
+    write_nerfstudio(out, camera, images, _point_map(export.run))
     return []
 
 
 def _write_colmap(out: Path, export: _Export, camera: PinholeCamera, images: Iterable[PosedImage]) -> list[str]:
-    points = read_ply_points(export.run.folder / "map.ply")
+    points = read_ply_points(_point_map(export.run))
     tracks, notes = _read_tracks(export)
     write_colmap(out, camera, images, points, tracks)
     return notes
@@ -141,14 +141,22 @@ _WRITERS = {"nerfstudio": _write_nerfstudio, "colmap": _write_colmap, "tum": _wr
 """Function that writes a format and returns notes for the user."""
 
 
+def _point_map(run: StoredRun) -> Path:
+    path = run.folder / "map.ply"
+    if not path.is_file():
+        raise InputError(f"{path}: is missing, because the run did not end; continue it with run --resume {run.folder}")
+    return path
+
+
 def _read_tracks(export: _Export) -> tuple[LandmarkTracks, list[str]]:
     """Read the landmarks of the exported images from the map that the run saved, if there is one."""
-    path, tables, notes = export.request.save_map, MapTables(), []
-    if path is None:
-        notes = ["the points have no image points; a run with --save-map has landmarks, which do"]
-    else:
+    path, tables = export.request.save_map, MapTables()
+    reason = "the run was not called with --save-map"
+    if path is not None:
+        reason = f"{path} has no landmarks that two of the images observe"
         try:
             tables = load_map(path, export.source.camera, export.run.config or Config()).map
         except InputError as error:
-            notes = [f"the points have no image points ({error})"]
-    return landmark_tracks(tables, export.frames.poses), notes
+            reason = str(error)
+    tracks = landmark_tracks(tables, export.frames.poses)
+    return tracks, [] if len(tracks.points) else [f"no image points are written: {reason}"]

@@ -48,7 +48,6 @@ def main(
     from v3d_torch.config.loading import FULL, find_config, load_config
     from v3d_torch.datasets import SourceOptions, open_source
     from v3d_torch.datasets.stored import StoredSequence
-    from v3d_torch.datasets.tum_writer import TUMWriter
     from v3d_torch.errors import ConfigError, InputError
     from v3d_torch.runs.console import interrupts_between_frames
 
@@ -59,16 +58,17 @@ def main(
         with console.status(f"opening {seq}"):
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
-        failure = None
-        with interrupts_between_frames() as interrupted, TUMWriter(out, source.camera, source.groundtruth) as writer:
+        with interrupts_between_frames() as interrupted:
             if static:
-                failure = record_static(source, writer, load_config(find_config(config or FULL)), interrupted, console)
+                frames, failure = record_static(
+                    source, out, load_config(find_config(config or FULL)), interrupted, console
+                )
             else:
-                record_all(source, writer, interrupted, console)
+                frames, failure = record_all(source, out, interrupted, console), None
         if failure is not None:
-            raise InputError(f"{failure} (the {len(writer)} frames before are saved in {out})")
-        if not len(writer):
+            raise InputError(f"{failure} (the {frames} frames before are saved in {out})")
+        if not frames:
             raise InputError(f"{seq}: the source ended before its first frame")
-        console.print(f"{len(writer)} frames: {out}", markup=False)
+        console.print(f"{frames} frames: {out}", markup=False)
         if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
             raise InputError(f"{source.groundtruth_error} (the frames are saved in {out} without ground truth)")

@@ -87,7 +87,8 @@ def _camera_line(camera: PinholeCamera) -> str:
 def _image_line(index: int, image: PosedImage) -> str:
     T_cw = invert(image.T_wc)
     quaternion = Rotation.from_matrix(T_cw[:3, :3].numpy()).as_quat(canonical=True, scalar_first=True)
-    pose = " ".join(f"{value:.12g}" for value in [*quaternion.tolist(), *T_cw[:3, 3].tolist()])
+    values = np.concatenate([quaternion, T_cw[:3, 3].numpy()]) + 0.0  # + 0.0: no "-0"
+    pose = " ".join(f"{value:.12g}" for value in values.tolist())
     return f"{index + 1} {pose} {_CAMERA_ID} {image.name}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import torch
@@ -11,10 +10,6 @@ from torch import Tensor
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.io.files import write_png
-from v3d_torch.objects.frame_objects import FrameObjects
-from v3d_torch.reconstruction.point_map import PointMap
-from v3d_torch.runtime.stage_timer import StageTime
-from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Trajectory
 
 ESTIMATE = "estimated_trajectory.txt"
@@ -57,28 +52,3 @@ class StaticRecording:
             OutputError: If the file cannot be written.
         """
         write_trajectory(self._writer.folder / ESTIMATE, trajectory)
-
-
-class StaticRecordingViewer:
-    """Viewer that writes a static recording while the frames are tracked.
-
-    Args:
-        writer: Writer of the folder.
-    """
-
-    def __init__(self, writer: TUMWriter) -> None:
-        self._recording = StaticRecording(writer)
-
-    def show(
-        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
-    ) -> None:
-        """Write a frame."""
-        self._recording.add(frame, objects.static_without_people)
-
-    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
-        """Write the final poses.
-
-        Raises:
-            OutputError: If the file cannot be written.
-        """
-        self._recording.write_poses(slam.poses.trajectory())

@@ -116,7 +116,7 @@ def write_request(folder: Path, request: RunRequest) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    write_text(folder / _FILE, yaml.safe_dump(request.absolute()._options(), sort_keys=False, allow_unicode=True))
+    write_text(folder / _FILE, yaml.safe_dump(request.absolute()._options(), sort_keys=False))
 
 
 def read_request(folder: Path) -> RunRequest:

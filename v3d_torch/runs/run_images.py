@@ -96,22 +96,33 @@ def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFr
 
 
 def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, masks: bool) -> Iterator[PosedImage]:
-    """Yield frames with their poses and masks.
+    """Read frames with their poses and masks, one after the other.
 
     Args:
         run: Results of the run.
         source: Images of the run.
-        frames: Frames to yield.
+        frames: Frames to read.
         masks: True to read the masks that the run saved; False for masks that exclude nothing.
 
+    Returns:
+        Iterator over the frames, which raises an InputError if an image cannot be read or is not of the run.
+
     Raises:
-        InputError: If the run saved no masks, the source has other frames than the run had, or an image cannot be read.
+        InputError: If the run saved no masks, or the source has fewer frames than the run had.
     """
     folder = run.folder / _MASKS
     if masks and not folder.is_dir():
         raise InputError(
             f"{run.folder}: has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"
         )
+    if isinstance(source, RGBDSequence) and frames.indices[-1] >= len(source):
+        raise InputError(
+            f"{source.name}: has {len(source)} frames, fewer than the run; pass the sequence of this run with --seq"
+        )
+    return _read_images(run, source, frames, folder if masks else None)
+
+
+def _read_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, masks: Path | None) -> Iterator[PosedImage]:
     images = _read_frames(source, frames.indices)
     for frame, stamp, T_wc in zip(images, frames.poses.stamps.tolist(), frames.poses.T_wc, strict=False):
         if abs(frame.stamp - stamp) > _STAMP_TOLERANCE:
@@ -120,20 +131,15 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, m
                 " pass the sequence of this run with --seq"
             )
         size = frame.depth.shape[1:]
-        static = _read_mask(folder / f"{stamp:.6f}.png", size) if masks else torch.ones(size, dtype=torch.bool)
+        static = torch.ones(size, dtype=torch.bool) if masks is None else _read_mask(masks / f"{stamp:.6f}.png", size)
         yield PosedImage(frame, T_wc, static)
 
 
 def _read_frames(source: RGBDStream, indices: Sequence[int]) -> Iterator[RGBDFrame]:
-    if not isinstance(source, RGBDSequence):
-        wanted = set(indices)
-        yield from (frame for frame in islice(source, indices[-1] + 1) if frame.index in wanted)
-    elif indices[-1] < len(source):
-        yield from map(source.__getitem__, indices)
-    else:
-        raise InputError(
-            f"{source.name}: has {len(source)} frames, fewer than the run; pass the sequence of this run with --seq"
-        )
+    if isinstance(source, RGBDSequence):
+        return map(source.__getitem__, indices)
+    wanted = set(indices)
+    return (frame for frame in islice(source, indices[-1] + 1) if frame.index in wanted)
 
 
 def _read_mask(path: Path, size: torch.Size) -> Tensor:
