@@ -49,7 +49,7 @@ def main(
     from v3d_torch.datasets import SourceOptions, open_source
     from v3d_torch.datasets.stored import StoredSequence
     from v3d_torch.errors import ConfigError, InputError
-    from v3d_torch.runs.console import interrupts_between_frames
+    from v3d_torch.runs.console import interrupts_between_frames, print_assumptions
 
     console = Console(soft_wrap=True)
     with exit_on_error():
@@ -58,6 +58,7 @@ def main(
         with console.status(f"opening {seq}"):
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
+        print_assumptions(source, console)
         with interrupts_between_frames() as interrupted:
             if static:
                 frames, failure = record_static(
