@@ -1,16 +1,17 @@
-"""Text models of COLMAP, read back by pycolmap and projected with its camera models."""
+"""Text models of COLMAP, read back and projected with OpenCV's camera models, and with pycolmap where it is installed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.colmap_reader import ColmapModel, read_model
-from helpers.posed_images import CAMERA, COLOURS, DISTORTED, POINTS, T_WC, posed_images
+from helpers.colmap_reader import ColmapModel, read_model, read_with_pycolmap
+from helpers.posed_images import CAMERA, COLOURS, DISTORTED, FISHEYE, POINTS, T_WC, posed_images
 
 from v3d_torch.export.colmap import write_colmap
 from v3d_torch.export.landmark_tracks import LandmarkTracks
@@ -21,6 +22,7 @@ CAMERAS = {
     "PINHOLE": CAMERA,
     "OPENCV": replace(DISTORTED, distortion=(0.26, -0.2, -0.005, 0.003, 0.0)),
     "FULL_OPENCV": DISTORTED,
+    "OPENCV_FISHEYE": FISHEYE,
 }
 SHIFT = torch.tensor([0.3, 0.4], dtype=torch.float64)
 """Error of all image points, pixels."""
@@ -73,6 +75,22 @@ def test_convention_image_points_are_near_the_projections_of_their_landmarks(
         for x, y, number in image["points"]:
             offset = np.array([x, y]) - image["projections"][number - 1]
             np.testing.assert_allclose(offset, SHIFT, atol=0.2 if "OPENCV" in name else 1e-3)
+
+
+@pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is not installed")
+@pytest.mark.parametrize("name", CAMERAS)
+def test_pycolmap_reads_the_same_model(name: str, exports: dict[str, tuple[Path, ColmapModel]]) -> None:
+    folder, model = exports[name]
+    theirs = read_with_pycolmap(folder / "sparse" / "0", POINTS.numpy())
+    assert theirs.camera == model.camera and theirs.images.keys() == model.images.keys()
+    assert theirs.points.keys() == model.points.keys()
+    for file, image in model.images.items():
+        for key in ("T_cw", "points", "projections"):
+            np.testing.assert_allclose(theirs.images[file][key], image[key], rtol=0, atol=1e-6)
+    for number, point in model.points.items():
+        assert {key: theirs.points[number][key] for key in ("xyz", "color", "track")} == {
+            key: point[key] for key in ("xyz", "color", "track")
+        }
 
 
 def test_poses_are_world_to_camera(model: ColmapModel) -> None:

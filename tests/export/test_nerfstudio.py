@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.posed_images import CAMERA, COLOURS, DISTORTED, POINTS, T_WC, posed_images
+from helpers.posed_images import CAMERA, COLOURS, DISTORTED, FISHEYE, POINTS, RATIONAL, T_WC, posed_images
 
-from v3d_torch.errors import OutputError
+from v3d_torch.errors import ConfigError, OutputError
 from v3d_torch.export.nerfstudio import opengl_pose, write_nerfstudio
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.ply import write_ply
@@ -31,9 +31,12 @@ def project(transforms: dict[str, Any], frame: dict[str, Any], points: np.ndarra
     """Project world points as nerfstudio does: OpenGL camera, origin of the pixels at the corner of the image."""
     K = np.array([[transforms["fl_x"], 0, transforms["cx"]], [0, transforms["fl_y"], transforms["cy"]], [0, 0, 1]])
     K[:2, 2] -= 0.5  # OpenCV has the centre of the first pixel at 0
-    distortion = np.array([transforms[name] for name in ("k1", "k2", "p1", "p2", "k3")])
     T_gl = np.linalg.inv(np.array(frame["transform_matrix"]))
     in_opencv = (points @ T_gl[:3, :3].T + T_gl[:3, 3]) * [1, -1, -1]
+    if transforms["camera_model"] == "OPENCV_FISHEYE":
+        distortion = np.array([transforms[name] for name in ("k1", "k2", "k3", "k4")])
+        return cv2.fisheye.projectPoints(in_opencv[:, None], np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
+    distortion = np.array([transforms[name] for name in ("k1", "k2", "p1", "p2", "k3")])
     return cv2.projectPoints(in_opencv, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
 
 
@@ -46,7 +49,7 @@ def test_convention_camera_looks_along_minus_z_with_y_up() -> None:
         assert torch.equal(opengl_pose(T_wc)[:, 3], T_wc[:, 3])
 
 
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED])
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED, FISHEYE])
 def test_convention_points_of_the_map_project_to_their_pixels(camera: PinholeCamera, tmp_path: Path) -> None:
     transforms = export(tmp_path, camera)
     for frame in transforms["frames"]:
@@ -79,6 +82,12 @@ def test_every_frame_has_a_mask_that_is_black_where_something_moves(tmp_path: Pa
 def test_names_sort_in_the_order_of_the_frames(tmp_path: Path) -> None:
     names = [frame["file_path"] for frame in export(tmp_path)["frames"]]
     assert names == ["images/frame_000000.png", "images/frame_000010.png"] == sorted(names)
+
+
+def test_distortion_model_that_nerfstudio_lacks_is_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nerfstudio has no distortion model rational_polynomial; .*--undistort"):
+        write_nerfstudio(tmp_path / "out", RATIONAL, posed_images(RATIONAL), tmp_path / "map.ply")
+    assert not (tmp_path / "out").exists()
 
 
 def test_folder_that_cannot_be_written_is_error(tmp_path: Path) -> None:

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
-from helpers.posed_images import CAMERA, COLOURS, DISTORTED, POINTS, T_WC, posed_images
+from helpers.posed_images import CAMERA, COLOURS, DISTORTED, FISHEYE, POINTS, RATIONAL, T_WC, posed_images
 
 from v3d_torch.export.posed_image import Undistorter
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 
 
@@ -33,10 +35,13 @@ def test_colour_image_is_written_without_loss(tmp_path: Path) -> None:
     np.testing.assert_array_equal(written, image.frame.image.permute(1, 2, 0))
 
 
-def test_convention_undistorted_image_shows_points_where_the_pinhole_camera_projects_them() -> None:
-    undistort = Undistorter(DISTORTED)
-    assert not undistort.camera.is_distorted and torch.equal(undistort.camera.K, DISTORTED.K)
-    for image in map(undistort, posed_images(DISTORTED)):
+@pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, RATIONAL])
+def test_convention_undistorted_image_shows_points_where_the_pinhole_camera_projects_them(
+    camera: PinholeCamera,
+) -> None:
+    undistort = Undistorter(camera)
+    assert not undistort.camera.is_distorted and torch.equal(undistort.camera.K, camera.K)
+    for image in map(undistort, posed_images(camera)):
         T_cw = invert(image.T_wc)
         points = POINTS @ T_cw[:3, :3].T + T_cw[:3, 3]
         for (u, v), z, colour in zip(

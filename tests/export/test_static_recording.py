@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,7 @@ def test_recording_is_a_sequence_without_depth_where_something_moves(tmp_path: P
             recording.add(image.frame, image.static)
         recording.write_poses(Trajectory([0.0, 0.1], T_WC))
     sequence = load_sequence(str(tmp_path / "out"))
-    assert sequence.camera == CAMERA and sequence.groundtruth is None
+    assert sequence.camera == replace(CAMERA, depth_scale=5000.0) and sequence.groundtruth is None
     for frame, image in zip(sequence, images, strict=True):
         assert torch.equal(frame.image, image.frame.image)
         torch.testing.assert_close(frame.depth, image.static_depth, rtol=0, atol=0.0001)

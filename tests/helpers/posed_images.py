@@ -19,6 +19,9 @@ CAMERA = PinholeCamera(100.0, 105.0, 79.0, 58.5, 160, 120)
 DISTORTED = replace(CAMERA, distortion=(0.26, -0.95, -0.005, 0.003, 1.16))
 """Lens distortion of TUM's freiburg1."""
 
+FISHEYE = replace(CAMERA, distortion=(0.03, -0.01, 0.004, -0.002), distortion_model="equidistant")
+RATIONAL = replace(CAMERA, distortion=(0.2, -0.1, 0.001, -0.001, 0.02, 0.5, -0.2, 0.01))
+
 T_WC = se3_exp(torch.tensor([[0.0] * 6, [0.1, -0.05, 0.05, 0.02, -0.03, 0.1]], dtype=torch.float64))
 """Poses of two cameras that see the points."""
 

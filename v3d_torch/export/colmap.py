@@ -73,14 +73,16 @@ def write_colmap(
 
 def _camera_line(camera: PinholeCamera) -> str:
     """Return the camera with the model of COLMAP that has the fewest parameters."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    pinhole = [camera.fx, camera.fy, camera.cx + CORNER_OFFSET, camera.cy + CORNER_OFFSET]
+    coefficients = camera.distortion
     if not camera.is_distorted:
-        model, parameters = "PINHOLE", pinhole
-    elif k3 == 0:
-        model, parameters = "OPENCV", [*pinhole, k1, k2, p1, p2]
+        model, coefficients = "PINHOLE", ()
+    elif camera.distortion_model == "equidistant":
+        model = "OPENCV_FISHEYE"
+    elif not any(coefficients[4:]):
+        model, coefficients = "OPENCV", coefficients[:4]
     else:
-        model, parameters = "FULL_OPENCV", [*pinhole, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
+        model, coefficients = "FULL_OPENCV", (*coefficients, 0.0, 0.0, 0.0)[:8]
+    parameters = (camera.fx, camera.fy, camera.cx + CORNER_OFFSET, camera.cy + CORNER_OFFSET, *coefficients)
     return f"{_CAMERA_ID} {model} {camera.width} {camera.height} {' '.join(map(repr, parameters))}"
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.export.posed_image import CORNER_OFFSET, PosedImage
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.files import atomic_write, write_png, write_text
@@ -36,27 +37,38 @@ def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[Posed
         Number of images.
 
     Raises:
+        ConfigError: If nerfstudio does not have the distortion model of the camera, ``rational_polynomial``.
         OutputError: If a file cannot be written.
     """
-    k1, k2, p1, p2, k3 = camera.distortion
+    lens = _lens(camera)
     frames = [_write_frame(folder, image) for image in images]
     with atomic_write(folder / "points.ply") as temporary:
         shutil.copyfile(points, temporary)
     transforms = {
-        "camera_model": "OPENCV",
+        **lens,
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
         "cx": camera.cx + CORNER_OFFSET,
         "cy": camera.cy + CORNER_OFFSET,
-        **{"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2},
         "depth_unit_scale_factor": 1 / _MILLIMETRES,
         "ply_file_path": "points.ply",
         "frames": frames,
     }
     write_text(folder / "transforms.json", json.dumps(transforms, indent=1) + "\n")
     return len(frames)
+
+
+def _lens(camera: PinholeCamera) -> dict[str, Any]:
+    """Return the camera model of nerfstudio and its distortion coefficients."""
+    if not camera.is_distorted or camera.distortion_model == "plumb_bob":
+        return {"camera_model": "OPENCV", **dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False))}
+    if camera.distortion_model == "equidistant":
+        return {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), camera.distortion, strict=True))}
+    raise ConfigError(
+        f"nerfstudio has no distortion model {camera.distortion_model}; remove the distortion: --undistort"
+    )
 
 
 def opengl_pose(T_wc: Tensor) -> Tensor:

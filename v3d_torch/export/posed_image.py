@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,9 +62,10 @@ class Undistorter:
     """
 
     def __init__(self, camera: PinholeCamera) -> None:
-        self.camera = replace(camera, distortion=(0.0,) * 5)
-        K, size = camera.K.numpy(), (camera.width, camera.height)
-        self._maps = cv2.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, size, cv2.CV_32FC1)
+        self.camera = replace(camera, distortion=(0.0,) * 5, distortion_model="plumb_bob")
+        u, v = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
+        recorded = camera.distort(torch.stack([u, v], dim=-1).flatten(0, 1)).reshape(camera.height, camera.width, 2)
+        self._map = recorded.float().numpy()
 
     def __call__(self, image: PosedImage) -> PosedImage:
         """Undistort an image. Its mask excludes pixels that the recorded image does not show.
@@ -81,4 +81,4 @@ class Undistorter:
 
     def _remap(self, image: Tensor, interpolation: int) -> Tensor:
         """Resample an image (H, W) or (H, W, C); what it does not show is 0."""
-        return torch.from_numpy(cv2.remap(image.numpy(), *self._maps, interpolation))
+        return torch.from_numpy(cv2.remap(image.numpy(), self._map, None, interpolation))

@@ -86,3 +86,9 @@ def test_convention_camera_info_has_opencv_matrix_and_distortion() -> None:
     assert message.k.tolist() == [517.3, 0, 318.6, 0, 516.5, 255.3, 0, 0, 1]
     assert message.p.tolist() == [517.3, 0, 318.6, 0, 0, 516.5, 255.3, 0, 0, 0, 1, 0]
     assert message.r.tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+
+
+def test_camera_info_names_the_distortion_model_of_the_camera() -> None:
+    camera = PinholeCamera(285.0, 286.0, 318.6, 255.3, 640, 480, (0.1, 0.2, 0.3, 0.4), distortion_model="equidistant")
+    message = round_trip(camera_info(2.5, "optical", camera))
+    assert (message.distortion_model, message.d.tolist()) == ("equidistant", [0.1, 0.2, 0.3, 0.4])

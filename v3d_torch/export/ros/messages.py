@@ -139,7 +139,7 @@ def camera_info(stamp: float, frame: str, camera: PinholeCamera) -> ros.sensor_m
     Args:
         stamp: Timestamp, seconds.
         frame: Name of the optical frame of the camera.
-        camera: Camera; its five distortion coefficients have the order of the model ``plumb_bob``.
+        camera: Camera.
     """
     K = camera.K
     P = torch.cat([K, torch.zeros(3, 1, dtype=K.dtype)], dim=1)
@@ -147,7 +147,7 @@ def camera_info(stamp: float, frame: str, camera: PinholeCamera) -> ros.sensor_m
         header(stamp, frame),
         camera.height,
         camera.width,
-        "plumb_bob",
+        camera.distortion_model,
         np.array(camera.distortion),
         _flatten(K),
         np.eye(3).reshape(-1),
