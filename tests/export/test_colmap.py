@@ -1,4 +1,4 @@
-"""Text models of COLMAP, read back and projected with OpenCV's camera models, and with pycolmap where it is installed."""
+"""Text models of COLMAP, read back and projected with OpenCV's camera models, and with pycolmap if it is installed."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def test_names_sort_in_the_order_of_the_frames(tmp_path: Path) -> None:
 
 
 def test_distortion_model_that_nerfstudio_lacks_is_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="nerfstudio has no distortion model rational_polynomial; .*--undistort"):
+    with pytest.raises(ConfigError, match=r"nerfstudio has no distortion model rational_polynomial; .*--undistort"):
         write_nerfstudio(tmp_path / "out", RATIONAL, posed_images(RATIONAL), tmp_path / "map.ply")
     assert not (tmp_path / "out").exists()
 

@@ -36,7 +36,7 @@ def main(
     no_masks: Annotated[bool, typer.Option("--no-masks", help="Keep what moves: the masks exclude nothing.")] = False,
     seq: Annotated[str | None, typer.Option(help="Sequence of the run, if it was moved.")] = None,
 ) -> None:
-    """Export the images of a run with their poses and masks of what moves.
+    """Export the images of a run with poses and masks.
 
     The network does not run again: the masks are those that the run saved.
     """

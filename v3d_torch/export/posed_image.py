@@ -65,7 +65,7 @@ class Undistorter:
         self.camera = replace(camera, distortion=(0.0,) * 5, distortion_model="plumb_bob")
         u, v = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
         recorded = camera.distort(torch.stack([u, v], dim=-1).flatten(0, 1)).reshape(camera.height, camera.width, 2)
-        self._map = recorded.float().numpy()
+        self._map_u, self._map_v = (each.numpy() for each in recorded.float().unbind(dim=2))
 
     def __call__(self, image: PosedImage) -> PosedImage:
         """Undistort an image. Its mask excludes pixels that the recorded image does not show.
@@ -81,4 +81,4 @@ class Undistorter:
 
     def _remap(self, image: Tensor, interpolation: int) -> Tensor:
         """Resample an image (H, W) or (H, W, C); what it does not show is 0."""
-        return torch.from_numpy(cv2.remap(image.numpy(), self._map, None, interpolation))
+        return torch.from_numpy(cv2.remap(image.numpy(), self._map_u, self._map_v, interpolation))
