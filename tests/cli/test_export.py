@@ -148,6 +148,18 @@ def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_pat
         assert_error_line(call(*arguments, tmp_path / f"to_{name}", "--seq", tmp_path / name), words)
 
 
+def test_broken_frames_that_the_run_passed_over_are_left_out(sequence: Path, tmp_path: Path) -> None:
+    shutil.copytree(sequence, tmp_path / "walk")
+    broken = sorted((tmp_path / "walk" / "rgb").iterdir())[2]
+    broken.write_bytes(b"")
+    arguments = f"--seq {tmp_path / 'walk'} --segmenter none --skip-broken --save-masks --out {tmp_path / 'run'}"
+    assert CliRunner().invoke(run.app, arguments.split()).exit_code == 0
+    done = call(tmp_path / "run", "--format", "tum", "--out", tmp_path / "out")
+    assert (done.exit_code, done.stderr) == (0, "")
+    original, static = load_sequence(str(sequence)), load_sequence(str(tmp_path / "out"))
+    assert static.stamps.tolist() == [stamp for index, stamp in enumerate(original.stamps.tolist()) if index != 2]
+
+
 def test_map_without_common_landmarks_gives_a_note(results: Path, tmp_path: Path) -> None:
     arguments = ("--format", "colmap", "--out", tmp_path / "out", "--every", "11")
     copy = tmp_path / "copy"

@@ -23,6 +23,9 @@ from v3d_torch.io.text import read_text
 
 _FILE = "request.yaml"
 
+CHANGEABLE = ("seq", "data_root", "skip_broken")
+"""Names of the options that can change when a run is resumed."""
+
 _PATHS = ("data_root", "masks", "weights", "load_map", "save_map")
 
 
@@ -44,6 +47,7 @@ class RunRequest:
         load_map: Map file in which the camera is localised; None to start a new map.
         save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
+        skip_broken: True to pass over broken frames, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
     """
 
     seq: str
@@ -59,6 +63,7 @@ class RunRequest:
     load_map: str | None = None
     save_map: str | None = None
     save_masks: bool = False
+    skip_broken: bool = False
 
     @property
     def source_options(self) -> SourceOptions:
@@ -79,11 +84,12 @@ class RunRequest:
     def conflicting_option(self, other: RunRequest) -> str | None:
         """Return the first option that the other request sets to another value, as it is typed; None if none does.
 
-        Options that name the location of the sequence do not conflict, because the sequence may have been moved.
+        Options that name the location of the sequence do not conflict, because the sequence may have been moved, nor
+        does ``skip_broken``, because a broken frame may have ended the run.
         """
         options = self._options()
         for name, value in other.absolute()._options().items():
-            if name not in ("seq", "data_root") and value not in (None, False) and value != options[name]:
+            if name not in CHANGEABLE and value not in (None, False) and value != options[name]:
                 return f"--{name.replace('_', '-')}"
         return None
 

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import torch
 
 from v3d_torch.config.loading import dump_config
+from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
@@ -171,8 +172,10 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
+        "difference": describe_difference(pipeline.sequence),
         "frames": pipeline.frame_count,
         "processed": frames,
+        "skipped": len(run.broken),
         **counts,
         "status": [status.value for status in statuses],
         "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
@@ -213,7 +216,9 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
     keyframes = slam.map.active_keyframes
-    frames = [keyframe.frame for keyframe in keyframes]
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
+    positions = torch.searchsorted(trajectory.stamps, stamps).masked_fill(known, -1)
     statuses = [status.value for status in slam.poses.statuses]
-    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
+    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -79,6 +79,7 @@ class Run:
             viewer,
             None if known_map is None else known_map.views,
             map_masks=folder / "map_masks" if request.save_masks else None,
+            skip_broken=request.skip_broken,
         )
         if checkpoint is not None:
             remove_unfinished(folder)

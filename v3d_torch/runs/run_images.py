@@ -52,6 +52,7 @@ def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) 
         camera=request.camera,
         options=request.source_options,
         progress=progress,
+        skip_broken=request.skip_broken,
     )
 
 
@@ -60,7 +61,7 @@ class LocatedFrames:
     """Frames of a run with a known pose.
 
     Attributes:
-        indices: Positions in the trajectory of the run, increasing.
+        indices: Positions in the source, increasing.
         poses: Poses of the frames.
     """
 
@@ -86,13 +87,16 @@ def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFr
     Raises:
         InputError: If there is no such frame.
     """
-    indices = [index for index, status in enumerate(run.metrics.status) if status in _LOCATED]
-    if only_keyframes:
-        keyframes = run.frames.column("keyframe").to_pylist() if run.frames is not None else []
-        indices = [index for index in indices if index < len(keyframes) and keyframes[index]]
-    if not indices or run.trajectory is None:
+    table = [] if run.frames is None else run.frames.select(["frame", "keyframe"]).to_pylist()
+    located = {  # broken frames have no row and no pose
+        position: row["frame"]
+        for position, (status, row) in enumerate(zip(run.metrics.status, table, strict=False))
+        if status in _LOCATED and (row["keyframe"] or not only_keyframes)
+    }
+    if not located or run.trajectory is None:
         raise InputError(f"{run.folder}: has no frame with a known pose; run another sequence")
-    return LocatedFrames(indices, Trajectory(run.trajectory.stamps[indices], run.trajectory.T_wc[indices]))
+    rows = list(located)
+    return LocatedFrames([*located.values()], Trajectory(run.trajectory.stamps[rows], run.trajectory.T_wc[rows]))
 
 
 def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, masks: bool) -> Iterator[PosedImage]:
