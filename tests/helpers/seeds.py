@@ -22,12 +22,14 @@ from v3d_torch.config import Config, OccupancyConfig
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.map_io import save_map
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_io import save_occupancy
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
+from v3d_torch.runs.request import RunRequest, write_request
 
 
 def _map() -> bytes:
@@ -58,6 +60,19 @@ def _occupancy() -> bytes:
         floor = Floor(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), -1.0, 0.5)
         save_occupancy(Path(folder) / "occupancy.npz", occupancy, floor)
         return (Path(folder) / "occupancy.npz").read_bytes()
+
+
+def _point_map() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.ply"
+        write_ply(path, torch.ones(2, 3), torch.ones(2, 3, dtype=torch.uint8), normals=torch.ones(2, 3))
+        return path.read_bytes()
+
+
+def _request() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write_request(Path(folder), RunRequest("demo", Config(), fps=30.0, save_masks=True))
+        return (Path(folder) / "request.yaml").read_bytes()
 
 
 def _table() -> bytes:
@@ -179,6 +194,8 @@ SEEDS: dict[str, list[bytes]] = {
     "mcap": [_bag("mcap")],
     "map": [_map()],
     "occupancy": [_occupancy()],
+    "point map": [_point_map()],
+    "request.yaml": [_request()],
     "metrics.json": [json.dumps(_METRICS).encode()],
     "table": [_table()],
     "archive": [_tar(mode) for mode in ("w", "w:gz", "w:bz2", "w:xz")],

@@ -32,7 +32,7 @@ def run() -> Pipeline:
 @pytest.fixture(scope="module")
 def results(run: Pipeline, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results") / "new" / "folder"
-    write_results(folder, run)
+    write_results(folder, run, run.flush())
     return folder
 
 
@@ -146,7 +146,7 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
     config, with_mesh = run.slam.config, load_config(overrides=["dense_map.mesh.enabled=true"])
     try:
         run.slam.config = with_mesh
-        write_results(tmp_path, run)
+        write_results(tmp_path, run, run.flush())
     finally:
         run.slam.config = config
     mesh = plyfile.PlyData.read(tmp_path / "mesh.ply")
@@ -178,7 +178,7 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
     without_truth = Pipeline(Wall(), run.slam)
     without_truth.sequence.groundtruth = None  # type: ignore[misc]
     without_truth.record = replace(run.record)
-    assert write_results(tmp_path, without_truth) is None
+    assert write_results(tmp_path, without_truth, without_truth.flush()) is None
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert "rmse" not in (metrics.get("ate") or {})
     assert metrics["frames"] == FRAMES
@@ -189,10 +189,11 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
 def test_results_that_cannot_be_written_raise_an_error(run: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"file/trajectory\.txt: cannot be written"):
-        write_results(tmp_path / "file", run)
+        write_results(tmp_path / "file", run, run.flush())
 
 
 def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> None:
-    write_results(tmp_path, run_along_wall())
+    again = run_along_wall()
+    write_results(tmp_path, again, again.flush())
     for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "dynamics.parquet"):
         assert (tmp_path / name).read_bytes() == (results / name).read_bytes(), name

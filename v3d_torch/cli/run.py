@@ -48,6 +48,10 @@ def main(
     skip_broken: SkipBroken = False,
     viz: Annotated[str | None, typer.Option(help="Show the run live with a viewer: rerun.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="Record the run for rerun in this .rrd file.")] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Record the run as ROS 2 messages in this .mcap file."),
+    ] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the static scene.")] = False,
     occupancy: Annotated[
@@ -90,7 +94,7 @@ def main(
     data_root_source = context.get_parameter_source("data_root")
     if resume is not None and data_root_source is not None and data_root_source.name == "ENVIRONMENT":
         data_root = None  # the run to resume has its own
-    choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, profile)
+    choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, bag, profile)
     with exit_on_error():
         request = RunRequest(
             seq=seq or "",

@@ -21,7 +21,7 @@ from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
-from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import ProgressBar, print_assumptions, progress_bars, run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
@@ -67,12 +67,29 @@ class Display:
     Attributes:
         viz: Viewer that shows the run live: ``rerun``; None for none.
         rerun_file: File in which the run is recorded for rerun; None for none.
+        bag: File in which the run is recorded as ROS 2 messages; None for none.
         profile: True to print the time of each stage.
     """
 
     viz: str | None = None
     rerun_file: Path | None = None
+    bag: Path | None = None
     profile: bool = False
+
+    def make_viewer(self, sequence: RGBDStream) -> Viewer:
+        """Create the viewer of a run.
+
+        Raises:
+            ConfigError: If the viewer is unknown.
+            ViewerError: If the viewer cannot be started.
+            OutputError: If a recording cannot be written.
+        """
+        viewers = [make_viewer(self.viz, self.rerun_file, sequence)]
+        if self.bag is not None:
+            from v3d_torch.export.ros.bag_viewer import BagViewer  # loads the definitions of all messages
+
+            viewers.append(BagViewer(self.bag, sequence.camera))
+        return ViewerGroup(viewers)
 
 
 def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
@@ -136,7 +153,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if request.load_map is not None and checkpoint is None:  # a checkpoint contains the map
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
     segment = make_segmenter(request.config.segmentation, weights=_path(request.weights), masks_dir=masks)
-    viewer = make_viewer(display.viz, display.rerun_file, sequence)
+    viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
     if masks is not None and masks.resolve() == (folder / "masks").resolve():
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from v3d_torch.pipeline.pipeline import NULL_VIEWER, FrameCallback, NullViewer, Pipeline, Viewer
+from v3d_torch.pipeline.pipeline import NULL_VIEWER, FrameCallback, NullViewer, Pipeline, Viewer, ViewerGroup
 from v3d_torch.pipeline.run_record import FrameTimes, ObjectTable, RunRecord, Snapshot
 
 __all__ = [
@@ -15,4 +15,5 @@ __all__ = [
     "RunRecord",
     "Snapshot",
     "Viewer",
+    "ViewerGroup",
 ]

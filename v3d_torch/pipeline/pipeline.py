@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,13 +15,14 @@ import torch
 from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
 from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.pipeline.run_record import RunRecord, Snapshot
+from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 from v3d_torch.runtime.process import trim_memory
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
@@ -53,11 +54,12 @@ class Viewer(Protocol):
             stage_times: Time that each stage spent on the frame.
         """
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Show the final map and trajectory, and close files and connections.
 
         Args:
             slam: SLAM system after the last frame.
+            point_map: Point map of the static scene.
 
         Raises:
             OutputError: If the recording cannot be written.
@@ -72,12 +74,45 @@ class NullViewer:
     ) -> None:
         """Do nothing."""
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Do nothing."""
 
 
 NULL_VIEWER = NullViewer()
 """Viewer of a run that is not shown."""
+
+
+class ViewerGroup:
+    """Several viewers of one run.
+
+    Args:
+        viewers: Viewers.
+    """
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
+
+    def show(
+        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
+    ) -> None:
+        """Show a tracked frame in all viewers."""
+        for viewer in self._viewers:
+            viewer.show(frame, objects, slam, stage_times)
+
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
+        """Finish all viewers, also if one of them fails.
+
+        Raises:
+            OutputError: The errors of all viewers, in one line.
+        """
+        errors = []
+        for viewer in self._viewers:
+            try:
+                viewer.finish(slam, point_map)
+            except OutputError as error:
+                errors.append(str(error))
+        if errors:
+            raise OutputError("; ".join(errors))
 
 
 class Pipeline:
@@ -86,7 +121,9 @@ class Pipeline:
     Args:
         sequence: Frames, stored or live.
         slam: System; frames of a stored sequence that it has processed already are skipped.
-        masks: Folder for an image of the masked pixels per frame; None for no images.
+        masks: Folder for an image per frame of the pixels that tracking excludes; None for no images.
+        map_masks: Folder for an image per frame of the pixels that maps exclude, which are those of `masks` and all
+            people; None for no images.
         viewer: Viewer that is shown each frame.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
@@ -105,6 +142,7 @@ class Pipeline:
         viewer: Viewer = NULL_VIEWER,
         views: StaticViews | None = None,
         *,
+        map_masks: Path | None = None,
         evaluate_masks: bool = True,
         skip_broken: bool = False,
     ) -> None:
@@ -113,7 +151,7 @@ class Pipeline:
         self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.record = RunRecord()
         self.between_frames = True
-        self._masks = masks
+        self._mask_folders = masks, map_masks
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
         self._skip_broken = skip_broken
@@ -171,15 +209,21 @@ class Pipeline:
         return record
 
     @torch.inference_mode()
-    def flush(self) -> None:
-        """Apply the pending results of the back end and show the final state; call this after the last frame."""
+    def flush(self) -> PointMap:
+        """Apply the pending results of the back end and show the final state; call this after the last frame.
+
+        Returns:
+            Point map of the static scene, fused from all views.
+        """
         self.slam.flush()
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
+        point_map = fuse_points(self.views, self.slam.config)
         try:
-            self._viewer.finish(self.slam)
+            self._viewer.finish(self.slam, point_map)
         except V3DError as error:
             self.record.failure = self.record.failure or str(error)
+        return point_map
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the run between two frames: system, records and views."""
@@ -212,9 +256,9 @@ class Pipeline:
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.dynamics.append_objects(frame, result.objects)
         self._evaluate_masks(frame, result)
-        if self._masks is not None:
-            masked = (~result.static_mask).to(torch.uint8) * 255
-            write_png(self._masks / f"{frame.stamp:.6f}.png", masked.numpy())
+        for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
+            if folder is not None:
+                write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)
         keyframes = self.slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             self.views.add(keyframes[-1], frame.image, frame.depth, result.static_without_people)

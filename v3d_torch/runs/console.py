@@ -102,7 +102,7 @@ def run_with_progress(
         sequence = run.pipeline.sequence
         total = len(sequence) if isinstance(sequence, Sized) else None
         done = 0 if checkpoint is None else checkpoint.frames
-        evaluation = run(_TrackingBar(progress, total, interrupted, done))
+        evaluation = run(TrackingBar(progress, total, interrupted, done))
     run.pipeline.record.interrupted |= interrupted.is_set()  # also after the last frame, while results were written
     return run.pipeline, evaluation
 
@@ -165,8 +165,15 @@ class ProgressBar:
         self._progress.update(self._task, completed=done, total=total)
 
 
-class _TrackingBar:
-    """Progress bar of a run: frame rate, tracking status and moving objects."""
+class TrackingBar:
+    """Progress bar of a run: frame rate, tracking status and moving objects.
+
+    Args:
+        progress: Progress bars of the console.
+        frames: Number of frames; None if it is not known.
+        interrupted: Event that ends the run after the current frame.
+        done: Number of frames that are tracked already.
+    """
 
     def __init__(self, progress: Progress, frames: int | None, interrupted: Event, done: int) -> None:
         self._progress = progress
@@ -176,6 +183,11 @@ class _TrackingBar:
         self._frames = 0
 
     def __call__(self, frame: RGBDFrame, result: FrameResult) -> None:
+        """Update the bar after a frame.
+
+        Raises:
+            KeyboardInterrupt: If the run is interrupted.
+        """
         now, note = time.perf_counter(), f"{result.status.value}  {describe_motion(result)}"
         if self._start is None:
             self._start = now  # the first frame is not counted, because it waits for the network

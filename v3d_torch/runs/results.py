@@ -35,7 +35,7 @@ from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
-from v3d_torch.reconstruction.point_map import fuse_points
+from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -65,12 +65,13 @@ _DYNAMICS = pa.schema(
 )
 
 
-def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
+def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Evaluation | None:
     """Write all results of a run, ``metrics.json`` last, so that its presence shows that they are complete.
 
     Args:
         folder: Folder of the results; made if it is missing.
         pipeline: Pipeline that has run, to the end or not.
+        point_map: Point map of the static scene, from `Pipeline.flush`.
 
     Returns:
         The scores, if there is ground truth.
@@ -79,7 +80,7 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
         OutputError: If the folder cannot be written or the disk is full.
     """
     trajectory, evaluation = _write_tables(folder, pipeline)
-    _write_maps(folder, pipeline, trajectory)
+    _write_maps(folder, pipeline, trajectory, point_map)
     draw_run(folder / "figures", pipeline, trajectory)
     _write_metrics(folder, pipeline, evaluation, pipeline.record.failure)
     return evaluation
@@ -216,10 +217,9 @@ def _peak_memory_mb() -> float | None:
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
+def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:
     slam, views = pipeline.slam, pipeline.views
-    cloud = fuse_points(views, slam.config)
-    write_ply(folder / "map.ply", cloud.points, cloud.colours, normals=cloud.normals)
+    write_ply(folder / "map.ply", point_map.points, point_map.colours, normals=point_map.normals)
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
