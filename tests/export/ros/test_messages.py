@@ -11,14 +11,15 @@ from helpers.bag_messages import matrix_of
 from rosbags.typesys import Stores, get_typestore
 
 from v3d_torch.errors import OutputError
-from v3d_torch.export.ros.messages import camera_info, header, odometry, path, transforms
+from v3d_torch.export.ros.messages import camera_info, header, occupancy_grid, odometry, path, transforms
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 
 T = se3_exp(torch.tensor([[0.5, -0.3, 1.0, 0.4, -1.2, 2.0], [0.1, 0, 0, 0, 0, 3.1]], dtype=torch.float64))
 TYPES = (
     *("tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry", "nav_msgs/msg/Path", "sensor_msgs/msg/CameraInfo"),
-    *("sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"),
+    *("nav_msgs/msg/OccupancyGrid", "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"),
 )
 NEWER = [store for store in Stores if store.name.startswith("ROS2_") and store.name > "ROS2_HUMBLE"]
 
@@ -64,6 +65,18 @@ def test_transforms_and_path_have_the_given_poses() -> None:
     assert [each.header.stamp.sec for each in line.poses] == [1, 2]
     assert {line.header.frame_id, *(each.header.frame_id for each in line.poses)} == {"map"}
     np.testing.assert_allclose([matrix_of(each.pose) for each in line.poses], T, atol=1e-12)
+
+
+def test_occupancy_grid_has_its_cells_row_by_row_and_the_pose_of_the_corner_of_the_first_one() -> None:
+    states = torch.tensor([[-1, 0, 1], [0, 0, 1]], dtype=torch.int8)
+    grid = OccupancyGrid(states, cell_size=0.05, origin=(-1.0, 2.0), T_lw=T[0])
+    message = round_trip(occupancy_grid(2.5, "map", grid, T[1]))
+    assert (message.header.frame_id, message.info.width, message.info.height) == ("map", 3, 2)
+    assert message.data.tolist() == [-1, 0, 100, 0, 0, 100] and message.info.resolution == np.float32(0.05)
+    corner = T[1] @ torch.linalg.inv(T[0]) @ torch.tensor([-1.0, 2.0, 0.0, 1.0], dtype=torch.float64)
+    pose = matrix_of(message.info.origin)
+    np.testing.assert_allclose(pose[:3, 3], corner[:3], atol=1e-12)
+    np.testing.assert_allclose(pose[:3, :3], (T[1] @ torch.linalg.inv(T[0]))[:3, :3], atol=1e-12)
 
 
 def test_odometry_has_pose_twist_and_covariance_row_by_row() -> None:

@@ -1,4 +1,4 @@
-"""ROS 2 messages of poses and cameras, made from tensors.
+"""ROS 2 messages of poses, cameras and occupancy grids, made from tensors.
 
 The definitions are those of ROS 2 Humble. Later distributions differ from them in additional constants only.
 """
@@ -16,11 +16,17 @@ from torch import Tensor
 
 from v3d_torch.errors import OutputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
+from v3d_torch.occupancy.occupancy_map import VoxelState
 
 _NANOSECONDS = 10**9
 
 _MAX_SECONDS = 2**31
 """Times of ROS count seconds in 32 bits, with sign."""
+
+_OCCUPANCY = {VoxelState.UNKNOWN: -1, VoxelState.FREE: 0, VoxelState.OCCUPIED: 100}
+"""Values of cells, as `nav_msgs/OccupancyGrid` defines them: the probability in per cent, or unknown."""
 
 _UNKNOWN = torch.zeros(6, 6)
 """Covariance that is not known, as the definitions of ROS mark it."""
@@ -155,6 +161,28 @@ def camera_info(stamp: float, frame: str, camera: PinholeCamera) -> ros.sensor_m
         0,
         0,
         ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, do_rectify=False),
+    )
+
+
+def occupancy_grid(stamp: float, frame: str, grid: OccupancyGrid, T_fw: Tensor) -> ros.nav_msgs__msg__OccupancyGrid:
+    """Make an occupancy grid. It is level, also if the frame is not: its origin is turned in the frame.
+
+    Args:
+        stamp: Timestamp, seconds.
+        frame: Name of the coordinate frame in which the pose of the grid is given.
+        grid: Grid.
+        T_fw: Transform from the world frame to that frame, float64, shape :math:`(4, 4)`.
+    """
+    T_lg = torch.eye(4, dtype=torch.float64)
+    T_lg[:2, 3] = torch.tensor(grid.origin, dtype=torch.float64)
+    height, width = grid.states.shape
+    values = torch.tensor([_OCCUPANCY[state] for state in VoxelState], dtype=torch.int8)
+    return ros.nav_msgs__msg__OccupancyGrid(
+        header(stamp, frame),
+        ros.nav_msgs__msg__MapMetaData(
+            header(stamp, frame).stamp, grid.cell_size, width, height, pose(T_fw @ invert(grid.T_lw) @ T_lg)
+        ),
+        values[grid.states.to(torch.int64).flatten() + 1].numpy(),
     )
 
 

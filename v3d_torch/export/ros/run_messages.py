@@ -10,6 +10,7 @@
 ``/cloud``                        ``sensor_msgs/PointCloud2``, keyframes      static pixels, in the camera's frame
 ``/path``                         ``nav_msgs/Path``, keyframes                keyframes; at the end all frames
 ``/cloud_map``                    ``sensor_msgs/PointCloud2``, at the end     the static map
+``/map``                          ``nav_msgs/OccupancyGrid``, at the end      the floor, if an occupancy map is grown
 ================================  ==========================================  =====================================
 
 While the camera is lost, only ``/camera/color/camera_info`` has messages.
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from v3d_torch.export.ros import frames
 from v3d_torch.export.ros.markers import object_markers
-from v3d_torch.export.ros.messages import camera_info, odometry, path, transforms
+from v3d_torch.export.ros.messages import camera_info, occupancy_grid, odometry, path, transforms
 from v3d_torch.export.ros.point_cloud import point_cloud
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_log
@@ -97,6 +98,8 @@ class RunMessages:
         yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc))
         points = frames.points_in_map(point_map.points)
         yield "/cloud_map", point_cloud(stamp, frames.MAP, points, point_map.colours)
+        if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
+            yield "/map", occupancy_grid(stamp, frames.MAP, grid, frames.T_MAP_WORLD)
 
     def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
         odometry_frame, twist = self._odometry_frame, torch.zeros(6, dtype=torch.float64)
