@@ -59,9 +59,10 @@ def run(sequence: RGBDSequence, config: Config, frames: int | None) -> Iterator[
         for index in range(len(sequence) if frames is None else frames):
             preprocessed = slam.preprocess(sequence[index], slam.predictions[0])
             slam.advance_predictions()
-            instances = preprocessed.segmentation.instances
-            assert instances is not None, "the network sees every frame"
-            yield TrackedFrame(preprocessed.frame, instances[instances.labels == PERSON], slam.track(preprocessed))
+            frame, instances = preprocessed.frame, preprocessed.segmentation.instances
+            if instances is None:  # the network does not see every frame
+                instances = Instances.empty(*frame.image.shape[1:])
+            yield TrackedFrame(frame, instances[instances.labels == PERSON], slam.track(preprocessed))
 
 
 def compare(sequence: RGBDSequence, truth: Sequence[TruePeople], config: Config) -> dict[str, TrackScores]:
