@@ -10,16 +10,29 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
-from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter, StateEstimate
+from v3d_torch.objects.partial_view import PositionMeasurement
 from v3d_torch.segmentation.coco import UNLABELLED
 
-_CENTROID_SIGMA = 0.05
-"""Standard deviation of the centroid of a fully visible object, metres: arms and legs swing by more, the error of the
-mask contour is smaller."""
+_BIAS_SIGMA = 0.03
+"""Standard deviation of the bias of the centroid of a fully visible object, metres: arms and legs swing, and a mask cuts
+off feet."""
 
-_PARTIAL_SIGMA = 0.45
-"""Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
-the hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
+_PARTIAL_BIAS_SIGMA = 0.1
+"""Additional standard deviation of the bias if nearly nothing of the object is visible, metres, in proportion to the
+hidden part."""
+
+_MIN_CONFIRMED_SCORE = 0.75
+"""Sum of the scores of the detections from which an object is confirmed: one strong detection or some weak ones."""
+
+_MIN_MEAN_SCORE = 0.4
+"""Minimum mean score of a confirmed object that was never dynamic: furniture that resembles a person has lower ones."""
+
+_CONFIRMING_DYNAMIC_FRAMES = 2
+"""Number of frames in which the vote classified an object as dynamic that confirm it, whatever its scores."""
+
+_APPEARANCE_RATE = 0.1
+"""Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
 
 _HISTORY = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""
@@ -50,26 +63,33 @@ class Detection3D:
 
 @dataclass(eq=False)  # compared by identity, so that a track can be a dictionary key
 class Track:
-    """One object with an id.
+    """One object.
 
-    The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
-    masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` and
-    ``last_deforming`` record the results of votes and Chamfer distances.
+    The detections and the class are measured. A Kalman filter estimates the position of the whole object, which is the
+    centroid of its visible surface when nothing hides a part of it. The masks belong to the newest frame and are either
+    measured or predicted, see ``missed``. ``last_dynamic`` and ``last_deforming`` record the results of votes and
+    Chamfer distances.
 
     Args:
         config: Noise and maximum speed of the Kalman filter.
 
     Attributes:
-        id: Number of the object, from 1, never reused.
-        first_stamp: Timestamp of the first detection, seconds.
+        id: Number of the object, from 1, never reused; negative while the object is not confirmed.
+        first_stamp: Timestamp of the first detection since the object was last lost, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, float32, shape :math:`(P,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
+        visible: True if the object was detected in the newest frame, or if the depth shows it at its predicted position.
         detections: Detections of the last second, newest last, at least one.
         labels: Number of detections of each class.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
+        scored_detections: Number of detections with a score.
         total_score: Sum of the scores of all detections.
+        appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
+        reference: Cloud of the object relative to its position, from a view in which most of it was visible, world
+            axes, metres, float64, shape :math:`(P, 3)`; None before the first centroid.
+        vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
@@ -82,22 +102,42 @@ class Track:
     cloud_pixels: Tensor
     coarse_mask: Tensor
     missed: bool = False
+    visible: bool = True
     detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
     label: int = UNLABELLED
+    scored_detections: int = 0
     total_score: float = 0.0
+    appearance: Tensor | None = None
+    reference: Tensor | None = None
+    vacant_time: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
 
     def __post_init__(self, config: TrackerConfig) -> None:
         self._filter = ConstantVelocityKalmanFilter(config)
-        self._max_points = 1
 
     @property
     def newest(self) -> Detection3D:
         """Newest detection."""
         return self.detections[-1]
+
+    @property
+    def is_confirmed(self) -> bool:
+        """True if the object has got its final id."""
+        return self.id > 0
+
+    @property
+    def is_convincing(self) -> bool:
+        """True if scores or motion show that the object exists."""
+        scored = self.total_score >= max(_MIN_CONFIRMED_SCORE, _MIN_MEAN_SCORE * self.scored_detections)
+        return scored or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
+
+    @property
+    def velocity(self) -> Tensor:
+        """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
+        return self._filter.velocity
 
     def detection_pair(self, baseline: float) -> tuple[Detection3D, Detection3D] | None:
         """Return the newest detection and an earlier one to compare it with.
@@ -114,21 +154,24 @@ class Track:
                 return (previous, current) if previous.is_located and current.is_located else None
         return None
 
-    @property
-    def velocity(self) -> Tensor:
-        """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
-        return self._filter.velocity
-
     def predict_centroid(self, stamp: float) -> Tensor:
-        """Predict the centroid with constant velocity (paper, Sec. II).
+        """Predict the position with constant velocity (paper, Sec. II).
 
         Args:
             stamp: Timestamp, seconds.
 
         Returns:
-            Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
+            Position, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
         """
         return self._filter.predict(stamp)
+
+    def predict_state(self, stamp: float) -> StateEstimate:
+        """Predict position and velocity with their covariance.
+
+        Args:
+            stamp: Timestamp, seconds.
+        """
+        return self._filter.predict_state(stamp)
 
     def predict_cloud(self, stamp: float) -> Tensor:
         """Predict the cloud: the newest cloud, moved with constant velocity.
@@ -141,32 +184,75 @@ class Track:
         """
         return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
 
-    def add_detection(self, detection: Detection3D) -> None:
+    def innovation(self, stamp: float, measured: PositionMeasurement) -> tuple[Tensor, float]:
+        """Compare a measured position with its prediction.
+
+        Args:
+            stamp: Timestamp, seconds.
+            measured: Measured position.
+
+        Returns:
+            Measured minus predicted position, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
+            square metres.
+        """
+        return self._filter.innovation(stamp, measured.position, _bias_sigma(measured))
+
+    def add_detection(self, detection: Detection3D, measured: PositionMeasurement) -> None:
         """Add a detection, update the Kalman filter, and drop detections older than the history.
 
         Args:
             detection: Detection, not older than the newest one.
+            measured: Position of the whole object, measured by the detection.
         """
-        self._max_points = max(self._max_points, len(detection.cloud))
-        hidden_fraction = 1 - len(detection.cloud) / self._max_points
-        sigma = _CENTROID_SIGMA + _PARTIAL_SIGMA * hidden_fraction
-        self._filter.update(detection.stamp, detection.centroid, sigma)
+        self._filter.update(detection.stamp, measured.position, _bias_sigma(measured))
+        if detection.is_located and (self.reference is None or measured.is_complete or measured.shows_more):
+            self.reference = detection.cloud.to(torch.float64) - detection.centroid
+            if measured.shows_more:  # the position is now that of more of the object
+                self._filter.shift(detection.centroid - measured.position)
+        self.vacant_time = 0.0
         self.detections.append(detection)
         oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
+
+    def lose(self) -> None:
+        """Drop the masks and all but the newest detection, which only an object in view needs."""
+        nothing = torch.zeros(0, 0, dtype=torch.bool)
+        self.set_masks(nothing, nothing, torch.zeros(0), missed=True)
+        self.visible = False
+        self.detections = self.detections[-1:]
+
+    def restart(self, stamp: float) -> None:
+        """Forget the detections before an object was lost: motion is measured anew.
+
+        Args:
+            stamp: Timestamp of the first detection afterwards, seconds.
+        """
+        self.first_stamp = stamp
+        self.detections = []
 
     def update_label(self, label: int, score: float) -> None:
         """Update the class with the class of a detection.
 
         Args:
             label: Class index.
-            score: Score of the detection.
+            score: Score of the detection; 0 if it has none.
         """
         self.labels[label] += 1
         self.total_score += score
+        self.scored_detections += score > 0
         named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
         self.label = (named or self.labels).most_common(1)[0][0]
+
+    def update_appearance(self, histogram: Tensor) -> None:
+        """Update the mean colour histogram.
+
+        Args:
+            histogram: Colour histogram of a detection, float32, shape :math:`(D,)`. NaN is ignored.
+        """
+        if bool(histogram[0].isnan()):
+            return
+        self.appearance = histogram if self.appearance is None else self.appearance.lerp(histogram, _APPEARANCE_RATE)
 
     def set_masks(self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool) -> None:
         """Set the masks of the newest frame.
@@ -196,6 +282,14 @@ class Track:
         """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
         self._filter.apply_world_correction(T_new_old)
+        if self.reference is not None:
+            self.reference = self.reference @ R.T
         self.detections = [
             Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
         ]
+
+
+def _bias_sigma(measured: PositionMeasurement) -> float:
+    """Return the standard deviation of the bias of a measured position, metres."""
+    unknown = measured.hidden_fraction if measured.is_complete else max(measured.hidden_fraction, measured.new_fraction)
+    return _BIAS_SIGMA + _PARTIAL_BIAS_SIGMA * unknown

@@ -1,0 +1,285 @@
+"""Evidence for all pairs of tracks and instances of a frame, from positions, masks, appearance and class."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from v3d_torch.config import TrackerConfig
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.appearance import HISTOGRAM_SIZE, histogram_similarity
+from v3d_torch.objects.association import (
+    appearance_log_ratio,
+    class_log_ratio,
+    overlap_log_ratio,
+    position_log_ratio,
+    vacancy_log_ratio,
+)
+from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.partial_view import (
+    PositionMeasurement,
+    ReferenceView,
+    coarse_cells,
+    measure_position,
+    view_references,
+)
+from v3d_torch.objects.silhouette import Silhouette, silhouettes
+from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.types import Instances
+
+_MIN_VISIBLE_FRACTION = 0.5
+"""An object is visible at its predicted position if the depth agrees with more than this fraction of its points."""
+
+_MAX_BESIDE_COVERAGE = 0.1
+"""An instance lies beside a predicted mask if their intersection is less than this fraction of the smaller area."""
+
+_MIN_COVERAGE = 0.5
+"""An instance covers a predicted mask if their intersection is at least this fraction of the smaller area."""
+
+DEPTH_TOLERANCE = 0.2
+"""Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
+
+Measurements = dict[tuple[int, int], PositionMeasurement]
+"""Measured positions by the indices of track and instance."""
+
+
+@dataclass(frozen=True)
+class DetectedInstances:
+    """Instances of a frame, as the tracker compares them.
+
+    Attributes:
+        stamp: Timestamp, seconds.
+        labels: Class of each of N instances, int64, shape :math:`(N,)`.
+        detections: Detections of the instances.
+        masks: Coarse masks, float32, shape :math:`(N, P)`.
+        cells: Coarse pixel (row, column) of each point of each cloud.
+        appearance: Colour histograms, float32, shape :math:`(N, D)`; NaN if unknown.
+    """
+
+    stamp: float
+    labels: Tensor
+    detections: Sequence[Detection3D]
+    masks: Tensor
+    cells: Sequence[NDArray[np.int64]]
+    appearance: Tensor
+
+    def __len__(self) -> int:
+        return len(self.detections)
+
+
+@dataclass(frozen=True)
+class PredictedTracks:
+    """Tracks at their predicted positions in a frame.
+
+    Attributes:
+        tracks: T tracks.
+        silhouettes: Projection of the newest cloud of each track at its predicted position.
+        masks: Coarse predicted masks, float32, shape :math:`(T, P)`.
+        visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
+            :math:`(T,)`.
+        free_fractions: Fraction of the predicted points behind which the depth image shows a surface, by track.
+        views: Reference cloud of each track, compared with the depth image; None for a track without one.
+    """
+
+    tracks: Sequence[Track]
+    silhouettes: Sequence[Silhouette]
+    masks: Tensor
+    visible_fractions: Tensor
+    free_fractions: Sequence[float]
+    views: Sequence[ReferenceView | None]
+
+    @property
+    def visible(self) -> Tensor:
+        """Tracks that are visible at their predicted position, bool, shape (T,)."""
+        return self.visible_fractions > _MIN_VISIBLE_FRACTION
+
+
+def detect_instances(
+    stamp: float,
+    instances: Instances,
+    clouds: InstanceClouds,
+    appearance: Tensor | None,
+    T_wc: Tensor,
+    camera: PinholeCamera,
+    stride: int,
+) -> DetectedInstances:
+    """Transform the instances of a frame into the world frame and to coarse masks.
+
+    Args:
+        stamp: Timestamp, seconds.
+        instances: Instances of the frame.
+        clouds: Clouds of the instances, camera frame.
+        appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
+        T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+        camera: Camera of the frame.
+        stride: Step between the coarse pixels, pixels.
+    """
+    R, t = T_wc[:3, :3], T_wc[:3, 3]
+    detections = []
+    for points, valid, centroid in zip(clouds.points, clouds.valid, clouds.centroid, strict=True):
+        cloud = points[valid]
+        detections.append(Detection3D(stamp, R @ centroid.to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud)))
+    T_cw = invert(T_wc)
+    return DetectedInstances(
+        stamp,
+        instances.labels,
+        detections,
+        flatten_masks(instances.masks[:, ::stride, ::stride]),
+        [coarse_cells(detection.cloud, T_cw, camera, stride) for detection in detections],
+        torch.full((len(detections), HISTOGRAM_SIZE), torch.nan) if appearance is None else appearance,
+    )
+
+
+def predict_tracks(
+    tracks: Sequence[Track],
+    stamp: float,
+    depth: Tensor,
+    T_cw: Tensor,
+    camera: PinholeCamera,
+    spacing: float,
+    stride: int,
+) -> PredictedTracks:
+    """Predict tracks, and check whether they are visible there.
+
+    Args:
+        tracks: Tracks.
+        stamp: Timestamp, seconds.
+        depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+        camera: Camera of the frame.
+        spacing: Spacing of the points of the clouds, metres.
+        stride: Step between the coarse pixels, pixels.
+    """
+    clouds = [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in tracks]
+    projected = silhouettes(clouds, camera, spacing)
+    coarse_depth = depth[:, ::stride, ::stride].contiguous()
+    masks = [each.mask(coarse_depth, 0, DEPTH_TOLERANCE, step=stride, include_missing=True) for each in projected]
+    referenced = [(i, track, track.reference) for i, track in enumerate(tracks) if track.reference is not None]
+    positions = [track.predict_centroid(stamp) for _, track, _ in referenced]
+    references = [reference for _, _, reference in referenced]
+    views: list[ReferenceView | None] = [None] * len(tracks)
+    compared = view_references(positions, references, depth, T_cw, camera, stride)
+    for (i, _, _), view in zip(referenced, compared, strict=True):
+        views[i] = view
+    free_fractions = [
+        each.count_seen_through(depth, DEPTH_TOLERANCE) / max(len(cloud), 1)
+        for each, cloud in zip(projected, clouds, strict=True)
+    ]
+    return PredictedTracks(
+        tracks,
+        projected,
+        flatten_masks(torch.stack(masks)) if masks else torch.zeros(0, coarse_depth.numel()),
+        torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
+        free_fractions,
+        views,
+    )
+
+
+def compare_tracks(
+    predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig
+) -> tuple[Tensor, Measurements]:
+    """Add up the evidence for each pair of a track and an instance.
+
+    An instance can continue a track of its class within the gate, and any track whose predicted mask it covers, or whose
+    last or predicted mask it overlaps: the position jumps when an object is hidden. An instance beside an object that is
+    visible at its predicted position is another object.
+
+    Args:
+        predicted: T tracks.
+        detected: N instances.
+        config: Gates.
+
+    Returns:
+        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`, and the measured
+        positions of the possible pairs.
+    """
+    # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
+    last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
+    intersection, areas = predicted.masks @ detected.masks.T, detected.masks.sum(dim=1)
+    predicted_areas = predicted.masks.sum(dim=1, keepdim=True)
+    coverage = (intersection / torch.minimum(predicted_areas, areas).clamp(min=1)).to(torch.float64)
+    overlap = torch.maximum(
+        _intersection_over_union(last_masks @ detected.masks.T, last_masks.sum(dim=1, keepdim=True), areas),
+        _intersection_over_union(intersection, predicted_areas, areas),
+    )
+    same_class = _same_class(predicted.tracks, detected)
+    beside = predicted.visible[:, None] & (coverage < _MAX_BESIDE_COVERAGE)
+    near = _within_gate(predicted.tracks, detected, config) & ~beside
+    possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
+    squared_distance, variance = torch.full_like(coverage, torch.nan), torch.ones_like(coverage)
+    measurements: Measurements = {}
+    for i, j in possible.nonzero().tolist():
+        detection, view = detected.detections[j], predicted.views[i]
+        measured = PositionMeasurement(detection.centroid, 0.0, 0.0)
+        if view is not None:
+            measured = measure_position(view, detection.centroid, detection.cloud, detected.cells[j])
+        measurements[i, j] = measured
+        difference, variance[i, j] = predicted.tracks[i].innovation(detected.stamp, measured)
+        squared_distance[i, j] = difference.square().sum()
+    visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
+    evidence = (
+        position_log_ratio(squared_distance, variance)
+        + overlap_log_ratio(coverage, overlap, visible)
+        + _other_evidence(predicted.tracks, detected, same_class)
+    )
+    return evidence.masked_fill(~possible, -torch.inf), measurements
+
+
+def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Add up the evidence for each pair of a lost track and an instance; a lost track has no predicted mask.
+
+    Args:
+        tracks: T lost tracks.
+        detected: N instances.
+        config: Gates.
+
+    Returns:
+        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
+    """
+    same_class = _same_class(tracks, detected)
+    possible = same_class & _within_gate(tracks, detected, config)
+    squared_distance = torch.full(possible.shape, torch.nan, dtype=torch.float64)
+    variance = torch.ones_like(squared_distance)
+    for i, j in possible.nonzero().tolist():
+        measured = PositionMeasurement(detected.detections[j].centroid, 0.0, 0.0)
+        difference, variance[i, j] = tracks[i].innovation(detected.stamp, measured)
+        squared_distance[i, j] = difference.square().sum()
+    evidence = position_log_ratio(squared_distance, variance) + _other_evidence(tracks, detected, same_class)
+    return evidence.masked_fill(~possible, -torch.inf)
+
+
+def flatten_masks(masks: Tensor) -> Tensor:
+    """Return masks as rows of numbers, bool (..., h, w) to float32 (..., h w)."""
+    return masks.flatten(-2).to(torch.float32)
+
+
+def _other_evidence(tracks: Sequence[Track], detected: DetectedInstances, same_class: Tensor) -> Tensor:
+    """Evidence of appearance, class and vacancy, shape (T, N)."""
+    unknown = torch.full((HISTOGRAM_SIZE,), torch.nan)
+    appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
+    similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
+    vacant_time = torch.tensor([[track.vacant_time] for track in tracks], dtype=torch.float64)
+    return appearance_log_ratio(similarity) + class_log_ratio(same_class) + vacancy_log_ratio(vacant_time)
+
+
+def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
+    return torch.tensor([track.label for track in tracks])[:, None] == detected.labels
+
+
+def _within_gate(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Check which instances are within the distance that each track can have moved, bool, shape (T, N)."""
+    predicted = torch.stack([track.predict_centroid(detected.stamp) for track in tracks])
+    observed = torch.stack([detection.centroid for detection in detected.detections])
+    elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
+    return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * elapsed
+
+
+def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Return the intersection over union from areas of intersections (A, B) and masks (A, 1) and (B,), float64."""
+    return (intersection / (a + b - intersection).clamp(min=1)).to(torch.float64)
