@@ -230,7 +230,7 @@ class V3DSLAM:
             T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
             self._apply_world_correction(T_new_old)
             if pose.status is not TrackingStatus.LOST:
-                self.free_space_check.add_view(view.with_pose(self.poses.T_cw))
+                self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:

@@ -22,12 +22,12 @@ from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from typer.testing import CliRunner, Result
 
-from v3d_torch.io.state_file import VERSION
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import run
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.io.state_file import VERSION
 from v3d_torch.runs.checkpoint import CHECKPOINT
 from v3d_torch.runs.stored_run import read_run
 

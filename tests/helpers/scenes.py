@@ -395,7 +395,7 @@ class ObjectStage:
         self.instances = instances.concatenate(unlabelled)
         clouds = self._back_project(depth if cloud_depth is None else cloud_depth, self.instances)
         result = self._classify(self.instances, clouds, view, newly_occupied, self.feature_support)
-        self._free_space_check.add_view(view)
+        self._free_space_check.add_view(view, view.T_cw)
         return result
 
     def move_world(self, T_new_old: Tensor) -> None:

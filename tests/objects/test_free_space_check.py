@@ -80,7 +80,7 @@ def test_misalignment_grows_with_the_rotation_rate() -> None:
     depth = torch.full((1, CAMERA.height, CAMERA.width), WALL)
     check = FreeSpaceCheck(FreeSpaceConfig(depth_sync_error=0.02), CAMERA)
     assert check.make_view(0.0, depth, HERE).misalignment == 0  # no earlier view
-    check.add_view(view())
+    check.add_view(view(), invert(HERE))
     assert check.make_view(0.1, depth, HERE).misalignment == 0
     assert check.make_view(0.1, depth, turned(3.0)).misalignment == round(math.radians(0.6) * CAMERA.fx)
     assert check.make_view(0.1, depth, turned(60.0)).misalignment == round(math.radians(12.0) * CAMERA.fx)
@@ -279,7 +279,7 @@ def check_with(*views: DepthView, **config: object) -> FreeSpaceCheck:
     """Return a free-space check with stored views."""
     check = FreeSpaceCheck(FreeSpaceConfig(**config), CAMERA)
     for observed in views:
-        check.add_view(observed)
+        check.add_view(observed, observed.T_cw)
     return check
 
 
@@ -383,18 +383,20 @@ def test_box_appears_for_the_time_of_each_baseline(rate: int) -> None:
                 assert row.isnan().all()
             else:
                 assert (box(row) == expected).all() and (around(row) == 0).all()
-        check.add_view(current)
+        check.add_view(current, current.T_cw)
 
 
 def test_views_older_than_the_longest_baseline_are_dropped() -> None:
-    check, references = check_with(), []
+    check, stored, images = check_with(), [], []
     for frame in range(100):
         observed = view(at=frame / 10)
-        references.append(weakref.ref(observed))
-        check.add_view(observed)
+        check.add_view(observed, observed.T_cw)
+        stored.append(weakref.ref(observed.nearest_depth))
+        images.append(weakref.ref(observed.depth))
     del observed
     gc.collect()
-    assert 10 <= sum(ref() is not None for ref in references) <= 13
+    assert 10 <= sum(ref() is not None for ref in stored) <= 13
+    assert all(ref() is None for ref in images)
 
 
 MOVES = [(0.3, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.5, 0.0, 0.0, 0.0), (0.1, -0.1, 0.2, 0.05, -0.1, 0.1)]
@@ -479,6 +481,6 @@ def test_state_dict_continues_with_identical_results() -> None:
         torch.testing.assert_close(
             original(current).appeared, continued(other).appeared, rtol=0, atol=0, equal_nan=True
         )
-        original.add_view(current)
-        continued.add_view(other)
+        original.add_view(current, current.T_cw)
+        continued.add_view(other, other.T_cw)
     assert not original(view(WITH_BOX, at=1.8)).appeared.isnan().all()

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import pack_masks
 from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.newly_occupied import NewlyOccupied
@@ -34,9 +35,7 @@ def refine(depth: Tensor, appeared: Tensor | None = None, *, missed: bool = Fals
     segmented = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     segmented[ROWS.start : CUT, COLUMNS] = True
     cloud = (CAMERA.rays * depth[0][..., None])[segmented & (depth[0] > 0)][::5]
-    track = Track(
-        1, 0.0, TrackerConfig(), segmented, segmented & (depth[0] > 0), segmented.flatten().float(), missed=missed
-    )
+    track = Track(1, 0.0, TrackerConfig(), segmented, segmented & (depth[0] > 0), pack_masks(segmented), missed=missed)
     track.add_detection(Detection3D(0.0, cloud.mean(dim=0).to(torch.float64), cloud))
     if appeared is None:
         appeared = torch.full((1, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)

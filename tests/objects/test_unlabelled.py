@@ -138,7 +138,7 @@ def test_box_carried_into_the_room_is_proposed() -> None:
     check = FreeSpaceCheck(FreeSpaceConfig(), CAMERA)
     here = torch.eye(4, dtype=torch.float64)
     wall = torch.full((1, 120, 160), 4.0)
-    check.add_view(DepthView(0.0, wall, here))
+    check.add_view(DepthView(0.0, wall, here), here)
     depth = torch.where(MASK, 2.0, wall)
     appeared = check(DepthView(0.3, depth, here))
     proposed = unlabelled_instances(appeared, NO_INSTANCES, depth, CAMERA, FreeSpaceConfig().min_unlabelled_area)

@@ -10,9 +10,9 @@ position, the point has appeared.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -43,9 +43,37 @@ _MIN_INTERVAL = 1e-3
 """Shortest time between two views, seconds: lower bound of a divisor."""
 
 
+class SpaceView(Protocol):
+    """What the check needs of a view: `DepthView` or `StoredView`."""
+
+    @property
+    def T_cw(self) -> Tensor:
+        """World-to-camera pose, float64, shape :math:`(4, 4)`."""
+
+    @property
+    def nearest_depth(self) -> Tensor:
+        """Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without depth."""
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """View that later frames are compared with.
+
+    Attributes:
+        stamp: Timestamp, seconds.
+        nearest_depth: Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without
+            depth.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+    """
+
+    stamp: float
+    nearest_depth: Tensor
+    T_cw: Tensor
+
+
 @dataclass(frozen=True)
 class DepthView:
-    """Depth image with its pose.
+    """Depth image of the current frame with its pose.
 
     Attributes:
         stamp: Timestamp, seconds.
@@ -59,20 +87,6 @@ class DepthView:
     depth: Tensor
     T_cw: Tensor
     misalignment: int = 0
-
-    def __getstate__(self) -> dict[str, object]:
-        """Return the fields without the cached images."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def with_pose(self, T_cw: Tensor) -> DepthView:
-        """Return the same depth image with another pose. The cached images do not depend on the pose and are kept.
-
-        Args:
-            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-        """
-        view = replace(self, T_cw=T_cw)
-        vars(view).update(vars(self) | {"T_cw": T_cw})
-        return view
 
     @cached_property
     def missing(self) -> Tensor:
@@ -120,7 +134,7 @@ def _limits(config: FreeSpaceConfig) -> kernels.Limits:
     return config.min_depth, config.max_depth, config.tolerance, config.min_tolerance
 
 
-def _is_free_space_compiled(points: Tensor, view: DepthView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
+def _is_free_space_compiled(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
     if points.dtype != torch.float64:
         return NotImplemented
     pose, nearest_depth = to_array(view.T_cw), to_array(view.nearest_depth)
@@ -130,7 +144,7 @@ def _is_free_space_compiled(points: Tensor, view: DepthView, camera: PinholeCame
 
 
 @compiled_by(_is_free_space_compiled)
-def is_free_space(points: Tensor, view: DepthView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
+def is_free_space(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
     """Check whether points lie in space that a view of another time observes as free.
 
     Args:
@@ -157,7 +171,7 @@ def is_free_space(points: Tensor, view: DepthView, camera: PinholeCamera, config
 
 def _newly_occupied_compiled(
     view: DepthView,
-    earlier: Sequence[DepthView | None],
+    earlier: Sequence[SpaceView | None],
     rays: Tensor,
     stride: int,
     camera: PinholeCamera,
@@ -176,7 +190,7 @@ def _newly_occupied_compiled(
 @compiled_by(_newly_occupied_compiled)
 def _newly_occupied(
     view: DepthView,
-    earlier: Sequence[DepthView | None],
+    earlier: Sequence[SpaceView | None],
     rays: Tensor,
     stride: int,
     camera: PinholeCamera,
@@ -208,7 +222,7 @@ def _newly_occupied(
 
 
 def vacated_fractions(
-    clouds: Sequence[Tensor], view: DepthView, camera: PinholeCamera, config: FreeSpaceConfig
+    clouds: Sequence[Tensor], view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig
 ) -> Tensor:
     """Fraction of each cloud's visible points whose position is free space in a view of another time.
 
@@ -244,7 +258,7 @@ class FreeSpaceCheck:
     def __init__(self, config: FreeSpaceConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._camera = camera
-        self._views: list[DepthView] = []
+        self._views: list[StoredView] = []
         self._stride = max(1, round(camera.width / _COLUMNS))
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
@@ -281,14 +295,16 @@ class FreeSpaceCheck:
         appeared = _newly_occupied(view, earlier, self._rays, self._stride, self._camera, config)
         return NewlyOccupied(appeared, self._stride)
 
-    def add_view(self, view: DepthView) -> None:
+    def add_view(self, view: DepthView, T_cw: Tensor) -> None:
         """Store a view with its final pose, and drop the views that are too old for all baselines.
 
         Args:
             view: View, newer than all stored ones.
+            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         """
         oldest = view.stamp - max(self._config.baselines, default=0.0) - _VIEW_MARGIN
-        self._views = [stored for stored in self._views if stored.stamp >= oldest] + [view]
+        new = StoredView(view.stamp, view.nearest_depth, T_cw)
+        self._views = [stored for stored in self._views if stored.stamp >= oldest] + [new]
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the stored views into the corrected world.
@@ -296,7 +312,7 @@ class FreeSpaceCheck:
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
-        self._views = [view.with_pose(view.T_cw @ invert(T_new_old)) for view in self._views]
+        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored views."""
@@ -310,5 +326,5 @@ class FreeSpaceCheck:
         """
         self._views = list(state["views"])
 
-    def _newest_view_before(self, stamp: float) -> DepthView | None:
+    def _newest_view_before(self, stamp: float) -> StoredView | None:
         return next((view for view in reversed(self._views) if view.stamp <= stamp + STAMP_TOLERANCE), None)

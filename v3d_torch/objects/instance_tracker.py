@@ -10,6 +10,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
@@ -23,7 +24,6 @@ from v3d_torch.objects.track_matching import (
     compare_lost_tracks,
     compare_tracks,
     detect_instances,
-    flatten_masks,
     predict_tracks,
 )
 from v3d_torch.segmentation.coco import UNLABELLED
@@ -197,15 +197,15 @@ class InstanceTracker(torch.nn.Module):
 
     def _is_part(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
         """Check whether most of an instance lies within a matched instance of the same class and place."""
-        mask, centroid = detected.masks[i], detected.detections[i].centroid
-        for j in matches:
-            if detected.labels[j] != detected.labels[i] or float(mask @ detected.masks[j]) <= (
-                _DUPLICATE_COVERAGE * float(mask.sum())
-            ):
-                continue
-            if not float((centroid - detected.detections[j].centroid).norm()) > _DUPLICATE_DISTANCE:
-                return True
-        return False
+        centroid = detected.detections[i].centroid
+        mask = detected.masks[i : i + 1]
+        minimum = _DUPLICATE_COVERAGE * int(count_pixels(mask))
+        return any(
+            detected.labels[j] == detected.labels[i]
+            and int(count_common_pixels(mask, detected.masks[j : j + 1])) > minimum
+            and not float((centroid - detected.detections[j].centroid).norm()) > _DUPLICATE_DISTANCE
+            for j in matches
+        )
 
     def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor]) -> Track:
         """Add a track that is not confirmed yet, and return it."""
@@ -228,7 +228,7 @@ class InstanceTracker(torch.nn.Module):
         """Predict the masks of missed tracks, except those that have gone or are lost, and return them."""
         missed, lost = [], []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
-        coarse_depth = flatten_masks(has_depth[:: self._stride, :: self._stride])
+        coarse_depth = pack_masks(has_depth, self._stride)
         for i, track in enumerate(predicted.tracks):
             if track in updated:
                 continue
@@ -238,7 +238,7 @@ class InstanceTracker(torch.nn.Module):
             if track.vacant_time > _MAX_VACANT_TIME:
                 continue
             is_late = stamp - track.newest.stamp > self._config.max_missed_time
-            if is_late or self._is_covered(track, coarse_mask * coarse_depth, updated):
+            if is_late or self._is_covered(track, coarse_mask & coarse_depth, updated):
                 lost.append(track)
                 continue
             mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
@@ -254,9 +254,9 @@ class InstanceTracker(torch.nn.Module):
 
     def _is_covered(self, track: Track, coarse_mask: Tensor, updated: Sequence[Track]) -> bool:
         """Check whether the predicted mask of a missed track belongs to a detected track of the same class."""
-        minimum = self._config.min_overlap * float(coarse_mask.sum())
+        minimum = self._config.min_overlap * int(count_pixels(coarse_mask))
         return any(
-            float(coarse_mask @ other.coarse_mask) > minimum
+            int(count_pixels(coarse_mask & other.coarse_mask)) > minimum
             for other in updated
             if other.label == track.label and other.newest.is_located
         )

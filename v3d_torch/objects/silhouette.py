@@ -165,6 +165,7 @@ class Silhouette:
         self._gap = spacing * camera.fx / median_depth
         # Minimum of z and of -z in each cell: one erosion then finds the nearest and the farthest depth around a cell.
         self._first_cell, self._minima = _bin_depths(cells, z)
+        self._eroded: dict[int, Minima] = {}  # by radius
 
     def mask(
         self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, include_missing: bool = False
@@ -184,11 +185,16 @@ class Silhouette:
         if len(self._z) == 0:
             return torch.zeros(depth.shape[1:], dtype=torch.bool)
         radius = max(round((margin + self._gap) / _CELL), 1)
-        # Only the part of the image within the radius of the points can be in the mask.
+        if radius not in self._eroded:
+            self._eroded[radius] = self._erode(radius)
+        minima = self._eroded[radius]
+        return _select_pixels(minima, self._first_cell - radius, depth, tolerance, step, include_missing)
+
+    def _erode(self, radius: int) -> Minima:
+        """Return the minima around each cell, also around the empty cells within the radius of the others."""
         border = (radius, radius, radius, radius)
         padded = cv2.copyMakeBorder(self._minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
-        minima = np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
-        return _select_pixels(minima, self._first_cell - radius, depth, tolerance, step, include_missing)
+        return np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
 
     def visible_fraction(self, depth: Tensor, tolerance: float) -> float:
         """Return the fraction of projected points whose depth is the measured depth.

@@ -78,7 +78,7 @@ class Track:
         first_stamp: Timestamp of the first detection since the object was last lost, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
-        coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, float32, shape :math:`(P,)`.
+        coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         visible: True if the object was detected in the newest frame, or if the depth shows it at its predicted position.
         detections: Detections of the last second, newest last, at least one.
@@ -218,7 +218,7 @@ class Track:
     def lose(self) -> None:
         """Drop the masks and all but the newest detection, which only an object in view needs."""
         nothing = torch.zeros(0, 0, dtype=torch.bool)
-        self.set_masks(nothing, nothing, torch.zeros(0), missed=True)
+        self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True)
         self.visible = False
         self.detections = self.detections[-1:]
 
@@ -260,7 +260,7 @@ class Track:
         Args:
             mask: Pixels of the object, bool, shape :math:`(H, W)`.
             cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
-            coarse_mask: Every n-th pixel of the mask, float32, shape :math:`(P,)`.
+            coarse_mask: Every n-th pixel of the mask, packed, uint8, shape :math:`(B,)`.
             missed: True if the masks are predicted, because the object was not detected.
         """
         self.mask, self.cloud_pixels, self.coarse_mask, self.missed = mask, cloud_pixels, coarse_mask, missed

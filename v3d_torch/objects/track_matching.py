@@ -12,6 +12,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE, histogram_similarity
 from v3d_torch.objects.association import (
@@ -57,7 +58,7 @@ class DetectedInstances:
         stamp: Timestamp, seconds.
         labels: Class of each of N instances, int64, shape :math:`(N,)`.
         detections: Detections of the instances.
-        masks: Coarse masks, float32, shape :math:`(N, P)`.
+        masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
         cells: Coarse pixel (row, column) of each point of each cloud.
         appearance: Colour histograms, float32, shape :math:`(N, D)`; NaN if unknown.
     """
@@ -80,7 +81,7 @@ class PredictedTracks:
     Attributes:
         tracks: T tracks.
         silhouettes: Projection of the newest cloud of each track at its predicted position.
-        masks: Coarse predicted masks, float32, shape :math:`(T, P)`.
+        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`.
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
             :math:`(T,)`.
         free_fractions: Fraction of the predicted points behind which the depth image shows a surface, by track.
@@ -130,7 +131,7 @@ def detect_instances(
         stamp,
         instances.labels,
         detections,
-        flatten_masks(instances.masks[:, ::stride, ::stride]),
+        pack_masks(instances.masks, stride),
         [coarse_cells(detection.cloud, T_cw, camera, stride) for detection in detections],
         torch.full((len(detections), HISTOGRAM_SIZE), torch.nan) if appearance is None else appearance,
     )
@@ -174,7 +175,7 @@ def predict_tracks(
     return PredictedTracks(
         tracks,
         projected,
-        flatten_masks(torch.stack(masks)) if masks else torch.zeros(0, coarse_depth.numel()),
+        pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
         torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
         free_fractions,
         views,
@@ -201,11 +202,13 @@ def compare_tracks(
     """
     # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
     last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
-    intersection, areas = predicted.masks @ detected.masks.T, detected.masks.sum(dim=1)
-    predicted_areas = predicted.masks.sum(dim=1, keepdim=True)
+    intersection = count_common_pixels(predicted.masks, detected.masks)
+    areas, predicted_areas = count_pixels(detected.masks), count_pixels(predicted.masks)[:, None]
     coverage = (intersection / torch.minimum(predicted_areas, areas).clamp(min=1)).to(torch.float64)
     overlap = torch.maximum(
-        _intersection_over_union(last_masks @ detected.masks.T, last_masks.sum(dim=1, keepdim=True), areas),
+        _intersection_over_union(
+            count_common_pixels(last_masks, detected.masks), count_pixels(last_masks)[:, None], areas
+        ),
         _intersection_over_union(intersection, predicted_areas, areas),
     )
     same_class = _same_class(predicted.tracks, detected)
@@ -252,11 +255,6 @@ def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, co
         squared_distance[i, j] = difference.square().sum()
     evidence = position_log_ratio(squared_distance, variance) + _other_evidence(tracks, detected, same_class)
     return evidence.masked_fill(~possible, -torch.inf)
-
-
-def flatten_masks(masks: Tensor) -> Tensor:
-    """Return masks as rows of numbers, bool (..., h, w) to float32 (..., h w)."""
-    return masks.flatten(-2).to(torch.float32)
 
 
 def _other_evidence(tracks: Sequence[Track], detected: DetectedInstances, same_class: Tensor) -> Tensor:

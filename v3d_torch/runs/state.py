@@ -15,7 +15,7 @@ from v3d_torch.io.paths import StrPath
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.tensor_table import TensorTable
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.odometry.odometry import TrackedFrame
@@ -29,7 +29,7 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 STATE_CLASSES: tuple[type, ...] = (
     *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
-    *(DepthView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig),
+    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig),
 )
 """Classes of the package that a saved state can contain; others are not read."""
 
