@@ -51,7 +51,7 @@ class InstanceTracker(torch.nn.Module):
     The instances of a frame continue tracks in four stages, each an optimal assignment: first confirmed tracks, then
     lost ones, then new ones that are not confirmed yet; instances without a class continue what is left. A track that
     is not detected is predicted with its mask for a short time. Then it is lost: it has no mask any more, but keeps its
-    id for some seconds, in case it was hidden or out of view. The state (tracks and next ids) is part of
+    id for some seconds, in case it was hidden or out of view. The state (tracks and next id) is part of
     ``state_dict()``.
 
     Args:
@@ -71,29 +71,27 @@ class InstanceTracker(torch.nn.Module):
         self._voxel_size = voxel_size
         self._stride = max(1, camera.width // _COARSE_COLUMNS)
         self._next_id = 1
-        self._next_unconfirmed_id = -1
         self._last_stamp = -torch.inf
         self.tracks: list[Track] = []
         self.lost: list[Track] = []
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the tracks and the next ids, for ``state_dict()``."""
+        """Return the tracks and the next id, for ``state_dict()``."""
         return {
             "tracks": list(self.tracks),
             "lost": list(self.lost),
-            "next_ids": (self._next_id, self._next_unconfirmed_id),
+            "next_id": self._next_id,
             "last_stamp": self._last_stamp,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Replace the tracks and the next ids, for ``load_state_dict()``.
+        """Replace the tracks and the next id, for ``load_state_dict()``.
 
         Args:
             state: Result of `get_extra_state`.
         """
         self.tracks, self.lost = list(state["tracks"]), list(state["lost"])
-        self._next_id, self._next_unconfirmed_id = state["next_ids"]
-        self._last_stamp = state["last_stamp"]
+        self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
 
     def forward(
         self,
@@ -115,7 +113,7 @@ class InstanceTracker(torch.nn.Module):
             appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
         Returns:
-            Tracks that were detected, or missed for at most the maximum time: confirmed ones sorted by id, then others.
+            Tracks that were detected, or missed for at most the maximum time, sorted by id.
         """
         camera, stride = self._camera, self._stride
         detected = detect_instances(stamp, instances, clouds, appearance, T_wc, camera, stride)
@@ -137,8 +135,7 @@ class InstanceTracker(torch.nn.Module):
             updated.append(track)
 
         missed = self._predict_missed_tracks(stamp, depth, predicted, updated)
-        self.tracks = [*updated, *missed]
-        self._confirm_tracks()
+        self.tracks = sorted([*updated, *missed], key=lambda track: track.id)
         self._last_stamp = stamp
         return list(self.tracks)
 
@@ -208,19 +205,11 @@ class InstanceTracker(torch.nn.Module):
         )
 
     def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor]) -> Track:
-        """Add a track that is not confirmed yet, and return it."""
-        track = Track(self._next_unconfirmed_id, stamp, self._config, *masks)
-        self._next_unconfirmed_id -= 1
+        """Add a track with the next id and return it."""
+        track = Track(self._next_id, stamp, self._config, *masks)
+        self._next_id += 1
         self.tracks.append(track)
         return track
-
-    def _confirm_tracks(self) -> None:
-        """Give ids to the tracks that are convincing, in their order, and sort all tracks."""
-        for track in self.tracks:
-            if not track.is_confirmed and track.is_convincing:
-                track.id = self._next_id
-                self._next_id += 1
-        self.tracks.sort(key=lambda track: (not track.is_confirmed, abs(track.id)))
 
     def _predict_missed_tracks(
         self, stamp: float, depth: Tensor, predicted: PredictedTracks, updated: Sequence[Track]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from math import isnan
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,11 +104,12 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
+        uncovered = ~_union([track.mask for track in detected], view.depth)
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=_visible_mask(track, detected),
+                mask=_visible_mask(track, uncovered),
                 centroid=track.predict_centroid(stamp),
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
@@ -200,13 +202,16 @@ class MotionClassifier:
         return deforming or motion_state is MotionState.STATIC
 
 
-def _visible_mask(track: Track, detected: Sequence[Track]) -> Tensor:
+def _union(masks: Sequence[Tensor], depth: Tensor) -> Tensor:
+    """Return the union of masks (H, W), of the size of the depth (1, H, W) if there are none."""
+    union = np.zeros(depth.shape[1:], np.bool_)
+    for mask in masks:
+        union |= mask.numpy()
+    return torch.from_numpy(union)
+
+
+def _visible_mask(track: Track, uncovered: Tensor) -> Tensor:
     """Return the visible pixels of an object: without those of detected objects if its mask is predicted."""
     if not track.missed:
         return track.mask
-    if not track.visible:
-        return torch.zeros_like(track.mask)
-    mask = track.mask.numpy().copy()
-    for other in detected:
-        mask &= ~other.mask.numpy()
-    return torch.from_numpy(mask)
+    return track.mask & uncovered if track.visible else torch.zeros_like(track.mask)

@@ -74,13 +74,14 @@ class Track:
         config: Noise and maximum speed of the Kalman filter.
 
     Attributes:
-        id: Number of the object, from 1, never reused; negative while the object is not confirmed.
+        id: Number of the object, from 1, never reused.
         first_stamp: Timestamp of the first detection since the object was last lost, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         visible: True if the object was detected in the newest frame, or if the depth shows it at its predicted position.
+        is_confirmed: True if scores or motion have shown that the object exists.
         detections: Detections of the last second, newest last, at least one.
         labels: Number of detections of each class.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
@@ -103,6 +104,7 @@ class Track:
     coarse_mask: Tensor
     missed: bool = False
     visible: bool = True
+    is_confirmed: bool = False
     detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
     label: int = UNLABELLED
@@ -122,17 +124,6 @@ class Track:
     def newest(self) -> Detection3D:
         """Newest detection."""
         return self.detections[-1]
-
-    @property
-    def is_confirmed(self) -> bool:
-        """True if the object has got its final id."""
-        return self.id > 0
-
-    @property
-    def is_convincing(self) -> bool:
-        """True if scores or motion show that the object exists."""
-        scored = self.total_score >= max(_MIN_CONFIRMED_SCORE, _MIN_MEAN_SCORE * self.scored_detections)
-        return scored or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
 
     @property
     def velocity(self) -> Tensor:
@@ -241,6 +232,8 @@ class Track:
         self.labels[label] += 1
         self.total_score += score
         self.scored_detections += score > 0
+        if self.total_score >= max(_MIN_CONFIRMED_SCORE, _MIN_MEAN_SCORE * self.scored_detections):
+            self.is_confirmed = True
         named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
         self.label = (named or self.labels).most_common(1)[0][0]
 
@@ -269,6 +262,7 @@ class Track:
         """Record that the vote classified the object as dynamic in the frame at ``stamp``, seconds."""
         self.last_dynamic = stamp
         self.dynamic_frames += 1
+        self.is_confirmed = self.is_confirmed or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
 
     def mark_deforming(self, stamp: float) -> None:
         """Record that the object deforms in the frame at ``stamp``, seconds."""
