@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-_NEW_OBJECT_VOLUME = 10.0
+_NEW_OBJECT_VOLUME = 100.0
 """Inverse density of new objects, cubic metres: somewhere in the view of the camera, one appears."""
 
 _TAIL = 4.0

@@ -14,12 +14,10 @@ from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, p
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.partial_view import PositionMeasurement, first_measurement
 from v3d_torch.objects.track import Track
 from v3d_torch.objects.track_matching import (
     DEPTH_TOLERANCE,
     DetectedInstances,
-    Measurements,
     PredictedTracks,
     compare_lost_tracks,
     compare_tracks,
@@ -116,19 +114,19 @@ class InstanceTracker(torch.nn.Module):
             Tracks that were detected, or missed for at most the maximum time, sorted by id.
         """
         camera, stride = self._camera, self._stride
-        detected = detect_instances(stamp, instances, clouds, appearance, T_wc, camera, stride)
+        detected = detect_instances(stamp, instances, clouds, appearance, T_wc, stride)
         predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._voxel_size, stride)
-        matches, measurements = self._match(predicted, detected)
+        matches = self._match(predicted, detected)
 
         # Update matched tracks, and start a track for each instance without a match that is not a part of another one.
         updated: list[Track] = []
         for i, detection in enumerate(detected.detections):
-            track, measured = matches.get(i), measurements.get(i)
+            track = matches.get(i)
             if track is None and self._is_part(i, matches, detected):
                 continue
             masks = instances.masks[i], clouds.cloud_pixels[i], detected.masks[i]
             track = track or self._start_track(stamp, masks)
-            track.add_detection(detection, measured or first_measurement(detection.centroid, instances.masks[i]))
+            track.add_detection(detection)
             track.set_masks(*masks, missed=False)
             track.update_label(int(instances.labels[i]), float(instances.scores[i]))
             track.update_appearance(detected.appearance[i])
@@ -148,28 +146,20 @@ class InstanceTracker(torch.nn.Module):
         for track in (*self.tracks, *self.lost):
             track.apply_world_correction(T_new_old)
 
-    def _match(
-        self, predicted: PredictedTracks, detected: DetectedInstances
-    ) -> tuple[dict[int, Track], dict[int, PositionMeasurement]]:
-        """Match instances to tracks in stages.
-
-        Returns:
-            Track of each instance that continues one, and the measured position if it is not lost, by the index of the
-            instance.
-        """
+    def _match(self, predicted: PredictedTracks, detected: DetectedInstances) -> dict[int, Track]:
+        """Match instances to tracks in stages; return the track of each instance that continues one, by its index."""
         matches: dict[int, Track] = {}
-        measurements: dict[int, PositionMeasurement] = {}
         if len(detected) == 0:
-            return matches, measurements
+            return matches
         labelled = detected.labels != UNLABELLED
-        evidence, measured = _compare(predicted, detected, self._config)
+        evidence = _compare(predicted, detected, self._config)
         confirmed = torch.tensor([track.is_confirmed for track in self.tracks], dtype=torch.bool)
         free_instances = torch.ones(len(detected), dtype=torch.bool)
         free_tracks = torch.ones(len(self.tracks), dtype=torch.bool)
 
         def assign(rows: Tensor, columns: Tensor) -> None:
             for i, j in _assign(evidence, rows & free_tracks, columns & free_instances):
-                matches[j], measurements[j] = self.tracks[i], measured[i, j]
+                matches[j] = self.tracks[i]
                 free_tracks[i], free_instances[j] = False, False
 
         assign(confirmed, labelled)
@@ -178,7 +168,7 @@ class InstanceTracker(torch.nn.Module):
             free_instances[j] = False
         assign(~confirmed, labelled)
         assign(torch.ones_like(confirmed), ~labelled)
-        return matches, measurements
+        return matches
 
     def _match_lost(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:
         """Match instances to lost tracks, which become tracks again; return the pairs."""
@@ -253,9 +243,9 @@ class InstanceTracker(torch.nn.Module):
 
 def _compare(
     predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig
-) -> tuple[Tensor, Measurements]:
+) -> Tensor:
     if not predicted.tracks:
-        return torch.zeros(0, len(detected), dtype=torch.float64), {}
+        return torch.zeros(0, len(detected), dtype=torch.float64)
     return compare_tracks(predicted, detected, config)
 
 

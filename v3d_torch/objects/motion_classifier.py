@@ -29,7 +29,7 @@ from v3d_torch.objects.motion_evidence import (
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.track import Track
-from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
+from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID, UNLABELLED
 from v3d_torch.types import Instances
 
 _STATIC_FRACTION = 0.1
@@ -104,7 +104,8 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
-        uncovered = ~_union([track.mask for track in detected], view.depth)
+        named = [track.mask for track in detected if track.label != UNLABELLED]
+        uncovered = ~_union(named, view.depth)
         objects = [
             TrackedObject(
                 id=track.id,
@@ -211,7 +212,12 @@ def _union(masks: Sequence[Tensor], depth: Tensor) -> Tensor:
 
 
 def _visible_mask(track: Track, uncovered: Tensor) -> Tensor:
-    """Return the visible pixels of an object: without those of detected objects if its mask is predicted."""
+    """Return the visible pixels of an object: none of another object if its mask is predicted.
+
+    Args:
+        track: Track of the object.
+        uncovered: Pixels in no detected object with a class, bool, shape :math:`(H, W)`.
+    """
     if not track.missed:
         return track.mask
     return track.mask & uncovered if track.visible else torch.zeros_like(track.mask)

@@ -10,23 +10,19 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
-from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter, StateEstimate
-from v3d_torch.objects.partial_view import PositionMeasurement
+from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.segmentation.coco import UNLABELLED
 
-_BIAS_SIGMA = 0.03
-"""Standard deviation of the bias of the centroid of a fully visible object, metres: arms and legs swing, and a mask cuts
-off feet."""
+_CENTROID_SIGMA = 0.05
+"""Standard deviation of the centroid of a fully visible object, metres: arms and legs swing by more, the error of the
+mask contour is smaller."""
 
-_PARTIAL_BIAS_SIGMA = 0.1
-"""Additional standard deviation of the bias if nearly nothing of the object is visible, metres, in proportion to the
-hidden part."""
+_PARTIAL_SIGMA = 0.45
+"""Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
+the hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
 
 _MIN_CONFIRMED_SCORE = 0.75
 """Sum of the scores of the detections from which an object is confirmed: one strong detection or some weak ones."""
-
-_MIN_MEAN_SCORE = 0.4
-"""Minimum mean score of a confirmed object that was never dynamic: furniture that resembles a person has lower ones."""
 
 _CONFIRMING_DYNAMIC_FRAMES = 2
 """Number of frames in which the vote classified an object as dynamic that confirm it, whatever its scores."""
@@ -65,10 +61,9 @@ class Detection3D:
 class Track:
     """One object.
 
-    The detections and the class are measured. A Kalman filter estimates the position of the whole object, which is the
-    centroid of its visible surface when nothing hides a part of it. The masks belong to the newest frame and are either
-    measured or predicted, see ``missed``. ``last_dynamic`` and ``last_deforming`` record the results of votes and
-    Chamfer distances.
+    The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
+    masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` and
+    ``last_deforming`` record the results of votes and Chamfer distances.
 
     Args:
         config: Noise and maximum speed of the Kalman filter.
@@ -85,11 +80,8 @@ class Track:
         detections: Detections of the last second, newest last, at least one.
         labels: Number of detections of each class.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
-        scored_detections: Number of detections with a score.
         total_score: Sum of the scores of all detections.
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
-        reference: Cloud of the object relative to its position, from a view in which most of it was visible, world
-            axes, metres, float64, shape :math:`(P, 3)`; None before the first centroid.
         vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
@@ -108,10 +100,8 @@ class Track:
     detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
     label: int = UNLABELLED
-    scored_detections: int = 0
     total_score: float = 0.0
     appearance: Tensor | None = None
-    reference: Tensor | None = None
     vacant_time: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
@@ -119,6 +109,7 @@ class Track:
 
     def __post_init__(self, config: TrackerConfig) -> None:
         self._filter = ConstantVelocityKalmanFilter(config)
+        self._max_points = 1
 
     @property
     def newest(self) -> Detection3D:
@@ -156,14 +147,6 @@ class Track:
         """
         return self._filter.predict(stamp)
 
-    def predict_state(self, stamp: float) -> StateEstimate:
-        """Predict position and velocity with their covariance.
-
-        Args:
-            stamp: Timestamp, seconds.
-        """
-        return self._filter.predict_state(stamp)
-
     def predict_cloud(self, stamp: float) -> Tensor:
         """Predict the cloud: the newest cloud, moved with constant velocity.
 
@@ -175,31 +158,26 @@ class Track:
         """
         return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
 
-    def innovation(self, stamp: float, measured: PositionMeasurement) -> tuple[Tensor, float]:
-        """Compare a measured position with its prediction.
+    def innovation(self, detection: Detection3D) -> tuple[Tensor, float]:
+        """Compare the centroid of a detection with its prediction.
 
         Args:
-            stamp: Timestamp, seconds.
-            measured: Measured position.
+            detection: Detection, not older than the newest one.
 
         Returns:
-            Measured minus predicted position, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
+            Measured minus predicted centroid, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
             square metres.
         """
-        return self._filter.innovation(stamp, measured.position, _bias_sigma(measured))
+        return self._filter.innovation(detection.stamp, detection.centroid, self._centroid_sigma(detection))
 
-    def add_detection(self, detection: Detection3D, measured: PositionMeasurement) -> None:
+    def add_detection(self, detection: Detection3D) -> None:
         """Add a detection, update the Kalman filter, and drop detections older than the history.
 
         Args:
             detection: Detection, not older than the newest one.
-            measured: Position of the whole object, measured by the detection.
         """
-        self._filter.update(detection.stamp, measured.position, _bias_sigma(measured))
-        if detection.is_located and (self.reference is None or measured.is_complete or measured.shows_more):
-            self.reference = detection.cloud.to(torch.float64) - detection.centroid
-            if measured.shows_more:  # the position is now that of more of the object
-                self._filter.shift(detection.centroid - measured.position)
+        self._max_points = max(self._max_points, len(detection.cloud))
+        self._filter.update(detection.stamp, detection.centroid, self._centroid_sigma(detection))
         self.vacant_time = 0.0
         self.detections.append(detection)
         oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
@@ -231,8 +209,7 @@ class Track:
         """
         self.labels[label] += 1
         self.total_score += score
-        self.scored_detections += score > 0
-        if self.total_score >= max(_MIN_CONFIRMED_SCORE, _MIN_MEAN_SCORE * self.scored_detections):
+        if self.total_score >= _MIN_CONFIRMED_SCORE:
             self.is_confirmed = True
         named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
         self.label = (named or self.labels).most_common(1)[0][0]
@@ -276,14 +253,11 @@ class Track:
         """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
         self._filter.apply_world_correction(T_new_old)
-        if self.reference is not None:
-            self.reference = self.reference @ R.T
         self.detections = [
             Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
         ]
 
-
-def _bias_sigma(measured: PositionMeasurement) -> float:
-    """Return the standard deviation of the bias of a measured position, metres."""
-    unknown = measured.hidden_fraction if measured.is_complete else max(measured.hidden_fraction, measured.new_fraction)
-    return _BIAS_SIGMA + _PARTIAL_BIAS_SIGMA * unknown
+    def _centroid_sigma(self, detection: Detection3D) -> float:
+        """Return the standard deviation of each coordinate of the centroid of a detection, metres."""
+        fewer, more = sorted((len(detection.cloud), self._max_points))
+        return _CENTROID_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
-from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE, histogram_similarity
 from v3d_torch.objects.association import (
     appearance_log_ratio,
@@ -23,13 +20,6 @@ from v3d_torch.objects.association import (
     vacancy_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.partial_view import (
-    PositionMeasurement,
-    ReferenceView,
-    coarse_cells,
-    measure_position,
-    view_references,
-)
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.types import Instances
@@ -46,10 +36,6 @@ _MIN_COVERAGE = 0.5
 DEPTH_TOLERANCE = 0.2
 """Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
 
-Measurements = dict[tuple[int, int], PositionMeasurement]
-"""Measured positions by the indices of track and instance."""
-
-
 @dataclass(frozen=True)
 class DetectedInstances:
     """Instances of a frame, as the tracker compares them.
@@ -59,7 +45,6 @@ class DetectedInstances:
         labels: Class of each of N instances, int64, shape :math:`(N,)`.
         detections: Detections of the instances.
         masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
-        cells: Coarse pixel (row, column) of each point of each cloud.
         appearance: Colour histograms, float32, shape :math:`(N, D)`; NaN if unknown.
     """
 
@@ -67,7 +52,6 @@ class DetectedInstances:
     labels: Tensor
     detections: Sequence[Detection3D]
     masks: Tensor
-    cells: Sequence[NDArray[np.int64]]
     appearance: Tensor
 
     def __len__(self) -> int:
@@ -85,7 +69,6 @@ class PredictedTracks:
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
             :math:`(T,)`.
         free_fractions: Fraction of the predicted points behind which the depth image shows a surface, by track.
-        views: Reference cloud of each track, compared with the depth image; None for a track without one.
     """
 
     tracks: Sequence[Track]
@@ -93,7 +76,6 @@ class PredictedTracks:
     masks: Tensor
     visible_fractions: Tensor
     free_fractions: Sequence[float]
-    views: Sequence[ReferenceView | None]
 
     @property
     def visible(self) -> Tensor:
@@ -107,7 +89,6 @@ def detect_instances(
     clouds: InstanceClouds,
     appearance: Tensor | None,
     T_wc: Tensor,
-    camera: PinholeCamera,
     stride: int,
 ) -> DetectedInstances:
     """Transform the instances of a frame into the world frame and to coarse masks.
@@ -118,7 +99,6 @@ def detect_instances(
         clouds: Clouds of the instances, camera frame.
         appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
         T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
-        camera: Camera of the frame.
         stride: Step between the coarse pixels, pixels.
     """
     R, t = T_wc[:3, :3], T_wc[:3, 3]
@@ -126,13 +106,11 @@ def detect_instances(
     for points, valid, centroid in zip(clouds.points, clouds.valid, clouds.centroid, strict=True):
         cloud = points[valid]
         detections.append(Detection3D(stamp, R @ centroid.to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud)))
-    T_cw = invert(T_wc)
     return DetectedInstances(
         stamp,
         instances.labels,
         detections,
         pack_masks(instances.masks, stride),
-        [coarse_cells(detection.cloud, T_cw, camera, stride) for detection in detections],
         torch.full((len(detections), HISTOGRAM_SIZE), torch.nan) if appearance is None else appearance,
     )
 
@@ -161,13 +139,6 @@ def predict_tracks(
     projected = silhouettes(clouds, camera, spacing)
     coarse_depth = depth[:, ::stride, ::stride].contiguous()
     masks = [each.mask(coarse_depth, 0, DEPTH_TOLERANCE, step=stride, include_missing=True) for each in projected]
-    referenced = [(i, track, track.reference) for i, track in enumerate(tracks) if track.reference is not None]
-    positions = [track.predict_centroid(stamp) for _, track, _ in referenced]
-    references = [reference for _, _, reference in referenced]
-    views: list[ReferenceView | None] = [None] * len(tracks)
-    compared = view_references(positions, references, depth, T_cw, camera, stride)
-    for (i, _, _), view in zip(referenced, compared, strict=True):
-        views[i] = view
     free_fractions = [
         each.count_seen_through(depth, DEPTH_TOLERANCE) / max(len(cloud), 1)
         for each, cloud in zip(projected, clouds, strict=True)
@@ -178,13 +149,10 @@ def predict_tracks(
         pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
         torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
         free_fractions,
-        views,
     )
 
 
-def compare_tracks(
-    predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig
-) -> tuple[Tensor, Measurements]:
+def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Add up the evidence for each pair of a track and an instance.
 
     An instance can continue a track of its class within the gate, and any track whose predicted mask it covers, or whose
@@ -197,8 +165,7 @@ def compare_tracks(
         config: Gates.
 
     Returns:
-        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`, and the measured
-        positions of the possible pairs.
+        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
     """
     # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
     last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
@@ -215,23 +182,13 @@ def compare_tracks(
     beside = predicted.visible[:, None] & (coverage < _MAX_BESIDE_COVERAGE)
     near = _within_gate(predicted.tracks, detected, config) & ~beside
     possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
-    squared_distance, variance = torch.full_like(coverage, torch.nan), torch.ones_like(coverage)
-    measurements: Measurements = {}
-    for i, j in possible.nonzero().tolist():
-        detection, view = detected.detections[j], predicted.views[i]
-        measured = PositionMeasurement(detection.centroid, 0.0, 0.0)
-        if view is not None:
-            measured = measure_position(view, detection.centroid, detection.cloud, detected.cells[j])
-        measurements[i, j] = measured
-        difference, variance[i, j] = predicted.tracks[i].innovation(detected.stamp, measured)
-        squared_distance[i, j] = difference.square().sum()
     visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
     evidence = (
-        position_log_ratio(squared_distance, variance)
+        _position_evidence(predicted.tracks, detected, possible)
         + overlap_log_ratio(coverage, overlap, visible)
         + _other_evidence(predicted.tracks, detected, same_class)
     )
-    return evidence.masked_fill(~possible, -torch.inf), measurements
+    return evidence.masked_fill(~possible, -torch.inf)
 
 
 def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
@@ -247,14 +204,18 @@ def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, co
     """
     same_class = _same_class(tracks, detected)
     possible = same_class & _within_gate(tracks, detected, config)
+    evidence = _position_evidence(tracks, detected, possible) + _other_evidence(tracks, detected, same_class)
+    return evidence.masked_fill(~possible, -torch.inf)
+
+
+def _position_evidence(tracks: Sequence[Track], detected: DetectedInstances, possible: Tensor) -> Tensor:
+    """Evidence of the positions of the possible pairs, 0 for the others, shape (T, N)."""
     squared_distance = torch.full(possible.shape, torch.nan, dtype=torch.float64)
     variance = torch.ones_like(squared_distance)
     for i, j in possible.nonzero().tolist():
-        measured = PositionMeasurement(detected.detections[j].centroid, 0.0, 0.0)
-        difference, variance[i, j] = tracks[i].innovation(detected.stamp, measured)
+        difference, variance[i, j] = tracks[i].innovation(detected.detections[j])
         squared_distance[i, j] = difference.square().sum()
-    evidence = position_log_ratio(squared_distance, variance) + _other_evidence(tracks, detected, same_class)
-    return evidence.masked_fill(~possible, -torch.inf)
+    return position_log_ratio(squared_distance, variance)
 
 
 def _other_evidence(tracks: Sequence[Track], detected: DetectedInstances, same_class: Tensor) -> Tensor:
