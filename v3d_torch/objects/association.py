@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-_NEW_OBJECT_VOLUME = 100.0
+_NEW_OBJECT_VOLUME = 10.0
 """Inverse density of new objects, cubic metres: somewhere in the view of the camera, one appears."""
 
 _TAIL = 4.0
@@ -68,7 +68,9 @@ def overlap_log_ratio(coverage: Tensor, overlap: Tensor, visible: Tensor) -> Ten
     Returns:
         Log-likelihood ratio, shape :math:`(T, N)`.
     """
-    weight = (2 * visible).clamp(max=1)[:, None]
+    # An object is elsewhere only if it is not seen where it was predicted, so its mask speaks against no instance there.
+    against = (2 * visible - 1).clamp(min=0)[:, None]
+    weight = torch.where(coverage < 0.5, against, (2 * visible).clamp(max=1)[:, None])
     return _COVERAGE_WEIGHT * weight * (2 * coverage - 1) + _OVERLAP_WEIGHT * overlap
 
 

@@ -153,7 +153,8 @@ class InstanceTracker(torch.nn.Module):
             return matches
         labelled = detected.labels != UNLABELLED
         evidence = _compare(predicted, detected, self._config)
-        confirmed = torch.tensor([track.is_confirmed for track in self.tracks], dtype=torch.bool)
+        named = torch.tensor([track.label != UNLABELLED for track in self.tracks], dtype=torch.bool)
+        confirmed = named & torch.tensor([track.is_confirmed for track in self.tracks], dtype=torch.bool)
         free_instances = torch.ones(len(detected), dtype=torch.bool)
         free_tracks = torch.ones(len(self.tracks), dtype=torch.bool)
 
@@ -167,7 +168,8 @@ class InstanceTracker(torch.nn.Module):
             matches[j] = track
             free_instances[j] = False
         assign(~confirmed, labelled)
-        assign(torch.ones_like(confirmed), ~labelled)
+        assign(~named, ~labelled)
+        assign(named, ~labelled)
         return matches
 
     def _match_lost(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:

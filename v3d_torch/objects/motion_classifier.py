@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from math import isnan
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,7 +28,7 @@ from v3d_torch.objects.motion_evidence import (
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.track import Track
-from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID, UNLABELLED
+from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import Instances
 
 _STATIC_FRACTION = 0.1
@@ -104,13 +103,11 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
-        named = [track.mask for track in detected if track.label != UNLABELLED]
-        uncovered = ~_union(named, view.depth)
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=_visible_mask(track, uncovered),
+                mask=_visible_mask(track, detected),
                 centroid=track.predict_centroid(stamp),
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
@@ -203,21 +200,14 @@ class MotionClassifier:
         return deforming or motion_state is MotionState.STATIC
 
 
-def _union(masks: Sequence[Tensor], depth: Tensor) -> Tensor:
-    """Return the union of masks (H, W), of the size of the depth (1, H, W) if there are none."""
-    union = np.zeros(depth.shape[1:], np.bool_)
-    for mask in masks:
-        union |= mask.numpy()
-    return torch.from_numpy(union)
-
-
-def _visible_mask(track: Track, uncovered: Tensor) -> Tensor:
-    """Return the visible pixels of an object: none of another object if its mask is predicted.
-
-    Args:
-        track: Track of the object.
-        uncovered: Pixels in no detected object with a class, bool, shape :math:`(H, W)`.
-    """
+def _visible_mask(track: Track, detected: Sequence[Track]) -> Tensor:
+    """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
     if not track.missed:
         return track.mask
-    return track.mask & uncovered if track.visible else torch.zeros_like(track.mask)
+    if not track.visible:
+        return torch.zeros_like(track.mask)
+    mask = track.mask.numpy().copy()
+    for other in detected:
+        if other.label == track.label:
+            mask &= ~other.mask.numpy()
+    return torch.from_numpy(mask)
