@@ -243,9 +243,7 @@ class InstanceTracker(torch.nn.Module):
         )
 
 
-def _compare(
-    predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig
-) -> Tensor:
+def _compare(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     if not predicted.tracks:
         return torch.zeros(0, len(detected), dtype=torch.float64)
     return compare_tracks(predicted, detected, config)

@@ -36,6 +36,7 @@ _MIN_COVERAGE = 0.5
 DEPTH_TOLERANCE = 0.2
 """Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
 
+
 @dataclass(frozen=True)
 class DetectedInstances:
     """Instances of a frame, as the tracker compares them.
