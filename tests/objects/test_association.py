@@ -18,7 +18,9 @@ from v3d_torch.objects.association import (
 
 def test_position_ratio_is_a_t_density_against_new_objects_in_ten_cubic_metres() -> None:
     offset, variance = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64), 0.04
-    expected = multivariate_t.logpdf(offset.numpy(), shape=[variance] * 3, df=4) + math.log(10)
+    expected = multivariate_t.logpdf(
+        offset.numpy(), shape=[[variance, 0, 0], [0, variance, 0], [0, 0, variance]], df=4
+    ) + math.log(10)
     ratio = position_log_ratio(offset.square().sum(), torch.tensor(variance, dtype=torch.float64))
     torch.testing.assert_close(float(ratio), float(expected))
 

@@ -48,3 +48,13 @@ def test_lost_track_beyond_the_gate_is_impossible() -> None:
     near, far = compare_lost_tracks([track], detected, TrackerConfig())[0].tolist()
     assert near > 0
     assert far == -torch.inf
+
+
+@pytest.mark.parametrize(("colour", "likely"), [(0, True), (1, False)])
+def test_track_lost_for_seconds_is_found_again_by_its_colours(colour: int, likely: bool) -> None:
+    (track,) = BoardTracker()(Board(0.0))
+    track.appearance = torch.eye(HISTOGRAM_SIZE)[0]
+    depth, instances = render([Board(0.1)])
+    clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+    detected = detect_instances(4.0, instances, clouds, torch.eye(HISTOGRAM_SIZE)[colour][None], HERE, 1)
+    assert bool(compare_lost_tracks([track], detected, TrackerConfig()) > 0) is likely

@@ -1,8 +1,8 @@
 """Appearance of instances: histograms of their colours.
 
-Clothes tell people apart when one hides another. A histogram survives turns of the body and of the camera, and needs no
-network. Brightness and both colour axes are binned coarsely, and each pixel also counts in the neighbouring bins, so that
-a change of light shifts little.
+Clothes tell people apart when one hides another. A histogram hardly changes when the body or the camera turns, and
+needs no network. Brightness and both colour axes are binned coarsely, and each pixel also counts in the neighbouring bins, so
+that a change of light shifts little.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ HISTOGRAM_SIZE = _BINS**3
 """Number D of bins of a histogram."""
 
 _COLOUR_STEP = 10
-"""Width of a bin of the colour axes a and b, in units of OpenCV's 8-bit CIELAB: clothes differ from grey by up to 40."""
+"""Width of a bin of the colour axes a and b, in units of OpenCV's 8-bit CIELAB: clothes differ from grey by up to
+40."""
 
 _STRIDE = 4
 """Every n-th pixel is counted: a person at 5 m still has some hundred of them."""

@@ -156,9 +156,9 @@ def predict_tracks(
 def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Add up the evidence for each pair of a track and an instance.
 
-    An instance can continue a track of its class within the gate, and any track whose predicted mask it covers, or whose
-    last or predicted mask it overlaps: the position jumps when an object is hidden. An instance beside an object that is
-    visible at its predicted position is another object.
+    An instance can continue a track of its class within the gate or whose predicted mask it covers, and any track whose
+    last or predicted mask it overlaps: the position jumps when an object is hidden. An instance beside an object that
+    is visible at its predicted position is another object.
 
     Args:
         predicted: T tracks.
