@@ -1,8 +1,8 @@
 """Appearance of instances: histograms of their colours.
 
 Clothes tell people apart when one hides another. A histogram hardly changes when the body or the camera turns, and
-needs no network. Brightness and both colour axes are binned coarsely, and each pixel also counts in the neighbouring bins, so
-that a change of light shifts little.
+needs no network. Brightness and both colour axes are binned coarsely, and each pixel also counts in the neighbouring
+bins, so that a change of light shifts little.
 """
 
 from __future__ import annotations
