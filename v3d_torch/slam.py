@@ -26,12 +26,15 @@ from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.unlabelled import unlabelled_instances
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.upright import up_votes
+from v3d_torch.stage_checks import ReplaceableStages
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.motion_model import MotionModel, PosePrediction
@@ -53,12 +56,13 @@ PREFETCHED_FRAMES = 4
 and preprocessing continues meanwhile."""
 
 
-class V3DSLAM:
+class V3DSLAM(ReplaceableStages):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature. `compensate`, `register`, `track_map` and `loop_closer` are also used inside other stages, which keep
-    their own references. `preprocess` uses the stages that need the frame alone, and can run ahead of `track`.
+    signature, whose results are then checked. `compensate`, `register`, `track_map` and `loop_closer` are also used
+    inside other stages, which keep their own references. `preprocess` uses the stages that need the frame alone, and
+    can run ahead of `track`.
 
     Args:
         camera: Camera of all frames.
@@ -69,6 +73,7 @@ class V3DSLAM:
     Attributes:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
+        occupancy: Free and occupied space, in ``occupancy.map``; None if it is not configured.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -84,7 +89,7 @@ class V3DSLAM:
         config: Config | None = None,
         known_map: SparseMap | None = None,
     ) -> None:
-        check_parameters(camera, config)
+        check_parameters(camera, segment, config)
         self.camera = camera
         self.config = config = config or Config()
         self.timer = StageTimer()
@@ -117,6 +122,8 @@ class V3DSLAM:
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
         self.loop_closer.rebuild(self.map.active_keyframes)
+        # Free and occupied space
+        self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
@@ -235,6 +242,10 @@ class V3DSLAM:
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:
                 self.back_end.submit(keyframe)
+        if self.occupancy is not None:
+            with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
+                votes = up_votes(self._segmenter_state)
+                self.occupancy(depth, objects.static_mask, self.poses, votes)
         T_wc = invert(self.poses.T_cw)
         return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
 
@@ -291,6 +302,7 @@ class V3DSLAM:
             "mapper": self.mapper,
             "loop_closer": self.loop_closer,
             "back_end": self.back_end,
+            **({} if self.occupancy is None else {"occupancy": self.occupancy}),
         }
         for name, component in components.items():
             if not is_stateful(component):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
+from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, SkipBroken, Version, make_app
 from v3d_torch.io.paths import expand_user_paths
 
 app = make_app()
@@ -45,10 +45,14 @@ def main(
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the masked pixels of each frame.")] = False,
+    skip_broken: SkipBroken = False,
     viz: Annotated[str | None, typer.Option(help="Show the run live with a viewer: rerun.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="Record the run for rerun in this .rrd file.")] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the static scene.")] = False,
+    occupancy: Annotated[
+        bool, typer.Option("--occupancy", help="Grow and write an occupancy map, for planning.")
+    ] = False,
     save_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Save the map at the end, for later runs.")
     ] = None,
@@ -60,6 +64,7 @@ def main(
     resume: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run that wrote its results there.")
     ] = None,
+    version: Version = False,
 ) -> None:
     """Track an RGB-D camera, and map the static part of the scene."""
     from v3d_torch.datasets.locate import check_name
@@ -79,6 +84,7 @@ def main(
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
+    overrides += ["occupancy.enabled=true"] if occupancy else []
     overrides += ["mapping.enabled=false"] if localise else []
     overrides += ["prefetch=false"] if serial else []
     data_root_source = context.get_parameter_source("data_root")
@@ -100,6 +106,7 @@ def main(
             load_map=_text(load_map),
             save_map=_text(save_map),
             save_masks=save_masks,
+            skip_broken=skip_broken,
         )
         if resume is None:
             start_run(request, out, display)

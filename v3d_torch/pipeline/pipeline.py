@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
 from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
+from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.frame_result import FrameResult
@@ -89,6 +90,7 @@ class Pipeline:
         viewer: Viewer that is shown each frame.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
+        skip_broken: True to pass over broken frames of a stored sequence, see `ReadableFrames`.
 
     Attributes:
         record: Records of the run.
@@ -104,6 +106,7 @@ class Pipeline:
         views: StaticViews | None = None,
         *,
         evaluate_masks: bool = True,
+        skip_broken: bool = False,
     ) -> None:
         self.sequence = sequence
         self.slam = slam
@@ -113,6 +116,7 @@ class Pipeline:
         self._masks = masks
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
+        self._skip_broken = skip_broken
         self._snapshot_step = 1
 
     @property
@@ -134,10 +138,12 @@ class Pipeline:
         record = self.record
         record.failure, record.interrupted = None, False
         previous_seconds, start = record.seconds, time.perf_counter()
+        frames = self._remaining_frames()
         try:
-            prefetcher = FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
+            prefetcher = FramePrefetcher(frames, self.slam, ahead=self.slam.config.prefetch)
             with torch.inference_mode(), closing(prefetcher):
                 for preprocessed in prefetcher:
+                    self._record_broken(frames, before=preprocessed.frame.index)
                     self.between_frames = False
                     frame, result = preprocessed.frame, self.slam.track(preprocessed)
                     times = self.slam.timer.lap()
@@ -149,6 +155,7 @@ class Pipeline:
                         on_frame(frame, result)
                     if len(record.times) % _TRIM_INTERVAL == 0:
                         trim_memory()
+            self._record_broken(frames, before=math.inf)
         except V3DError as error:
             record.failure = str(error)
         except Exception as error:  # an error of the program must not cost the results so far
@@ -165,8 +172,10 @@ class Pipeline:
 
     @torch.inference_mode()
     def flush(self) -> None:
-        """Apply the pending result of the back end and show the final state; call this after the last frame."""
+        """Apply the pending results of the back end and show the final state; call this after the last frame."""
         self.slam.flush()
+        if self.slam.occupancy is not None:
+            self.slam.occupancy.correct(self.slam.poses)
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:
@@ -183,10 +192,22 @@ class Pipeline:
         self.views.load_state_dict(state["views"])
 
     def _remaining_frames(self) -> Iterator[RGBDFrame]:
-        done = len(self.slam.poses) if isinstance(self.sequence, RGBDSequence) else 0
+        """Iterate over the frames that are later than the last tracked one."""
+        if not isinstance(self.sequence, RGBDSequence):
+            return iter(self.sequence)
+        start, total = int((self.sequence.stamps <= self.slam.poses.stamp).sum()), len(self.sequence)
         if isinstance(self.sequence, StoredSequence):
-            return self.sequence.frames_from(done)
-        return islice(iter(self.sequence), done, None)
+            frames = self.sequence.frames_from(start)
+        else:
+            frames = map(self.sequence.__getitem__, range(start, total))
+        if not self._skip_broken:
+            return frames
+        return ReadableFrames(frames, start, total, len(self.record.broken))
+
+    def _record_broken(self, frames: Iterator[RGBDFrame], before: float) -> None:
+        """Record the broken frames before a frame, given by its index; the reader can be some frames ahead."""
+        while isinstance(frames, ReadableFrames) and frames.broken and frames.broken[0].index < before:
+            self.record.broken.append(frames.broken.popleft())
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.dynamics.append_objects(frame, result.objects)

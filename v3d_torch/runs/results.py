@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import platform
 import re
 import sys
@@ -17,6 +18,7 @@ import pyarrow.parquet as pq
 import torch
 
 from v3d_torch.config.loading import dump_config
+from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
@@ -25,6 +27,11 @@ from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import MotionState
+from v3d_torch.occupancy.map_server import write_map_server_files
+from v3d_torch.occupancy.occupancy_grid import occupancy_grid
+from v3d_torch.occupancy.occupancy_io import save_occupancy
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
@@ -36,6 +43,8 @@ from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
     import resource
+
+_LOG = logging.getLogger(__name__)
 
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
@@ -170,8 +179,10 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
+        "difference": describe_difference(pipeline.sequence),
         "frames": pipeline.frame_count,
         "processed": frames,
+        "skipped": len(run.broken),
         **counts,
         "status": [status.value for status in statuses],
         "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
@@ -212,8 +223,23 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    if slam.occupancy is not None:
+        _write_occupancy(folder, slam.occupancy)
     keyframes = slam.map.active_keyframes
-    frames = [keyframe.frame for keyframe in keyframes]
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
+    positions = torch.searchsorted(trajectory.stamps, stamps).masked_fill(known, -1)
     statuses = [status.value for status in slam.poses.statuses]
-    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
+    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)
+
+
+def _write_occupancy(folder: Path, mapper: OccupancyMapper) -> None:
+    """Write the occupancy map, and its 2D grid if a floor is visible."""
+    floor = mapper.find_floor()
+    save_occupancy(folder / "occupancy.npz", mapper.map, floor)
+    write_octomap(folder / "occupancy.bt", mapper.map)
+    if floor is None:
+        _LOG.warning("occupancy map: no floor is visible; no 2D grid was written")
+    else:
+        write_map_server_files(folder / "map.yaml", occupancy_grid(mapper.map, floor))
