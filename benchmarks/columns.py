@@ -95,3 +95,16 @@ MODULES = {
 }
 
 DESIGN_CHOICES = {"choice": "choice", "sequence": "sequence", "result": "result", "commit": "commit"}
+
+TRACKS = {
+    "sequence": "sequence",
+    "tracker": "tracker",
+    "hota": "HOTA",
+    "deta": "DetA",
+    "assa": "AssA",
+    "idf1": "IDF1",
+    "mota": "MOTA",
+    "id_switches": "ID switches in 60 frames (all)",
+    "pixels_right": "people's pixels in the right track",
+    "tracks": "tracks (people)",
+}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import columns
 from descriptions import PEERS, kind, sequence_notes
 from storage import Measurement, Row
-from tables import accuracy_table, bullets, flat, notes, pivot, provenance, rows_of, speed_table, unique
+from tables import accuracy_table, bullets, flat, mark_highest, notes, pivot, provenance, rows_of, speed_table, unique
 
 VARIANTS = {
     "baseline": "no masks",
@@ -125,6 +125,32 @@ def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield from part(text, pivot(rows, "variant", "sequence", "objects", VARIANTS), measurements, remarks=())
 
 
+def tracks_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on people's tracks beside other trackers."""
+    yield "## Tracks of people"
+    text = (
+        "HOTA with its detection and association accuracy, IDF1 and MOTA by TrackEval, on masks: higher is better. ID"
+        " switches in 60 frames in which a person is in view, lower is better. People's pixels in the right track:"
+        " fraction of the true pixels of people that lie in the one track of this person. ByteTrack, OC-SORT and"
+        " BoT-SORT are those of the package `trackers`, fed with the same detections; of two settings the better one is"
+        " shown. The best HOTA and IDF1 of a sequence are bold."
+    )
+    yield from part(text, tracks_table(rows_of(measurements)), measurements, "sequence")
+
+
+def tracks_table(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield the table of tracks, a line per sequence and tracker, with the highest values of a sequence in bold."""
+    marked = []
+    for sequence in unique(cells["sequence"] for cells in rows):
+        of_sequence = [cells for cells in rows if cells["sequence"] == sequence]
+        bold = {name: mark_highest([cells[name] for cells in of_sequence]) for name in ("hota", "idf1")}
+        marked += [
+            cells | {"hota": hota, "idf1": idf1}
+            for cells, hota, idf1 in zip(of_sequence, bold["hota"], bold["idf1"], strict=True)
+        ]
+    yield from flat(marked, columns.TRACKS)
+
+
 def ablation_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the effect of each part of the system."""
     yield "## Ablation"
@@ -230,6 +256,7 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("growth", "keyframes"), growth_section),
     (("lost",), lost_section),
     (("ablation",), objects_section),
+    (("tracks",), tracks_section),
     (("segmentation",), segmentation_section),
     (("maps", "map_costs"), maps_section),
     (("occupancy", "occupancy_costs"), occupancy_section),

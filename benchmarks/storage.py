@@ -34,6 +34,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "contender"),
     "stages": ("sequence", "stage"),
+    "tracks": ("sequence", "tracker"),
 }
 """Cells that identify a row, by the name of the file."""
 

@@ -451,16 +451,12 @@ TRACKED = v3d.PinholeCamera(fx=100.0, fy=100.0, cx=79.5, cy=79.5, width=160, hei
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize(("batch", "count"), list(product((0, 1, 3), (0, 1, 100))))
 def test_match_instances_in_batches(batch: int, count: int, dtype: torch.dtype) -> None:
-    """Objects that moved slightly and were shuffled; some tracks and some instances are missing."""
-    observed = 10 * random(batch, count, 3, dtype=dtype)
+    """Objects that were shuffled; some tracks and some instances are missing."""
     order = random(batch, count, dtype=torch.float64, seed=6).argsort(dim=1)
-    predicted = observed.gather(1, order[..., None].expand_as(observed)) + 0.001
     tracked, present = random_mask(batch, count), random_mask(batch, count, 7)
-    predicted[~tracked], observed[~present] = torch.inf, 5.0
-    overlap = torch.zeros(batch, count, count, dtype=dtype)
-    alike = torch.ones(batch, count, count, dtype=torch.bool)
-    gate = torch.full((batch, count), 0.1, dtype=dtype)
-    matched = v3d.match_instances(predicted, observed, overlap, alike, gate, 0.5, tracked, present)
+    ratio = random(batch, count, count, dtype=dtype) - 1
+    ratio.scatter_(2, order[..., None], 1.0)  # instance of each track
+    matched = v3d.match_instances(ratio, tracked, present)
     expected = order.argsort(dim=1)  # track of each instance
     known = present & tracked.gather(1, expected)
     assert matched.dtype == torch.int64 and torch.equal(matched, torch.where(known, expected, -1))

@@ -20,6 +20,7 @@ from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
@@ -108,6 +109,7 @@ class V3DSLAM(ReplaceableStages):
         self.free_space_check = FreeSpaceCheck(free_space, camera)
         self.propose_unlabelled = partial(unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area)
         self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
+        self.describe_appearance = colour_histograms
         self.classify_motion = MotionClassifier(config.objects, camera)
         # Camera pose and map
         local_keyframes = config.tracking.local_keyframes
@@ -215,9 +217,10 @@ class V3DSLAM(ReplaceableStages):
                 instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
+            appearance = self.describe_appearance(frame.image, clouds.cloud_pixels)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))
-            objects = self.classify_motion(instances, clouds, view, occupied, support)
+            objects = self.classify_motion(instances, clouds, view, occupied, support, appearance)
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)

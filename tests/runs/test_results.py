@@ -157,7 +157,7 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
 def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:
     assert not {"occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml"} & {path.name for path in results.iterdir()}
     run = run_along_wall("occupancy.enabled=true")
-    write_results(tmp_path, run)
+    write_results(tmp_path, run, run.flush())
     assert (tmp_path / "trajectory.txt").read_bytes() == (results / "trajectory.txt").read_bytes()
     stored, wall = load_occupancy(tmp_path / "occupancy.npz"), torch.tensor([[0.0, 0.0, WALL]])
     assert stored.map.distance(wall - torch.tensor([0.0, 0.0, 0.5])).item() == pytest.approx(0.5, abs=0.05)

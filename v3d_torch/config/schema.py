@@ -96,6 +96,9 @@ class TrackerConfig(Section):
     between frames, but a cup does not turn into the table below it."""
     max_missed_time: float = Field(0.5, ge=0)
     """Time for which a missed object is predicted, seconds: about one step of a person. 0 in the ablation."""
+    max_lost_time: float = Field(5.0, ge=0)
+    """Time after that for which an object that comes back keeps its id, seconds: people walk behind others, or leave
+    the view of a camera that turns. Appearance and position have to fit. 0 in the ablation."""
 
 
 class VotingConfig(Section):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isnan
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
@@ -60,6 +61,7 @@ class MotionClassifier:
         view: DepthView,
         newly_occupied: NewlyOccupied,
         feature_support: FeatureSupport,
+        appearance: Tensor | None = None,
     ) -> FrameObjects:
         """Track and classify the objects of a frame, and update the tracks with the result.
 
@@ -69,13 +71,14 @@ class MotionClassifier:
             view: Depth of the frame, with the pose from frame-to-frame motion.
             newly_occupied: Newly occupied pixels of the frame, see `FreeSpaceCheck`.
             feature_support: Features of the frame and their agreement with the camera motion.
+            appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
         Returns:
             Objects with their motion states, and the static mask.
         """
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
-        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
+        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]
         pairs = detection_pairs(detected, (*config.voting.baselines, config.chamfer.baseline))
 
@@ -104,7 +107,7 @@ class MotionClassifier:
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=track.mask,
+                mask=_visible_mask(track, detected),
                 centroid=track.predict_centroid(stamp),
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
@@ -195,3 +198,16 @@ class MotionClassifier:
         """Check whether tracking can use the pixels of an object with this motion state."""
         deforming = motion_state is MotionState.DEFORMING and self._config.chamfer.keep_deforming_features
         return deforming or motion_state is MotionState.STATIC
+
+
+def _visible_mask(track: Track, detected: Sequence[Track]) -> Tensor:
+    """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
+    if not track.missed:
+        return track.mask
+    if not track.visible:
+        return torch.zeros_like(track.mask)
+    mask = track.mask.numpy().copy()
+    for other in detected:
+        if other.label == track.label:
+            mask &= ~other.mask.numpy()
+    return torch.from_numpy(mask)
