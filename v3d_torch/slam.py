@@ -17,7 +17,7 @@ from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
-from v3d_torch.geometry.se3 import invert, orthonormalise
+from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.feature_support import FeatureSupport
@@ -31,11 +31,14 @@ from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.motion_model import MotionModel, PosePrediction
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
+from v3d_torch.tracking.state_estimator import StateEstimator
+from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import (
     RGBDFrame,
     Segmenter,
@@ -68,6 +71,7 @@ class V3DSLAM:
     Attributes:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
+        states: States of the camera in the last seconds.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -112,6 +116,8 @@ class V3DSLAM:
         self.refine_previous = PreviousFrameRefinement(
             self.compensate, self.track_map, self.map, refine_pose=config.rolling_shutter.enabled
         )
+        self.estimate_state = StateEstimator()
+        self.states = StateHistory()
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
         self.loop_closer.rebuild(self.map.active_keyframes)
@@ -144,7 +150,8 @@ class V3DSLAM:
             ConfigError: If the segmenter returned something else than instances.
         """
         self.check(frame)
-        return PreprocessedFrame(frame, self.segment_instances(frame, prediction), self.extract_features(frame))
+        segmentation = self.segment_instances(frame, prediction)
+        return PreprocessedFrame(frame, self.extract_features(frame), lambda: segmentation)
 
     def check(self, frame: RGBDFrame) -> None:
         """Check a frame before it is preprocessed.
@@ -189,11 +196,9 @@ class V3DSLAM:
         Raises:
             InputError: If the frame is not later than the previous one.
         """
-        frame, instances = preprocessed.frame, preprocessed.segmentation.instances
-        depth, all_features = preprocessed.extraction.depth, preprocessed.extraction.features
+        frame, depth, all_features = preprocessed.frame, preprocessed.extraction.depth, preprocessed.extraction.features
         check_order(frame, self.poses.stamp)
-        self._segmenter_state = preprocessed.segmentation.segmenter_state
-        self.timer.add(preprocessed.times)
+        self.timer.add({**preprocessed.read_times, **preprocessed.extraction.times})
         with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
             velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
@@ -202,6 +207,11 @@ class V3DSLAM:
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
             view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)
+        segmentation = preprocessed.segmentation  # III-A: waits for the network if it runs beside the stages before
+        self._segmenter_state = segmentation.segmenter_state
+        self.timer.add(segmentation.times)
+        with self.timer("free_space"):
+            instances = segmentation.instances
             if instances is None:
                 instances = self.classify_motion.propagate_instances(view)
             if self.config.segmentation.source != "none":
@@ -219,6 +229,7 @@ class V3DSLAM:
             static = self.compensate(static, depth, frame.depth_delay, motion.velocity, self.map.readout)
             T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
             pose = self.track_camera(static, depth, T_cw, landmarks, motion, self.poses)
+            owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
             self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
@@ -232,8 +243,11 @@ class V3DSLAM:
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:
                 self.back_end.submit(keyframe)
-        T_wc = invert(self.poses.T_cw)
-        return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
+        with self.timer("tracking"):  # covariance of the pose, velocity of the camera
+            references = None if keyframe is None else self.map.references
+            state = self.estimate_state(pose, motion, self.poses, owners, references)
+            self.states.append(state)
+        return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
         """Apply the pending result of the back end. `track` does this; call it once after the last frame."""
@@ -256,6 +270,19 @@ class V3DSLAM:
         self.predictions.popleft()
         self.predictions.append(self._predict())
         return self.predictions[-1]
+
+    def pose_at(self, stamp: float) -> CameraState:
+        """Return the camera at a time: interpolated between frames, predicted after the last one, with covariance.
+
+        It can be called from another thread while frames are tracked.
+
+        Args:
+            stamp: Time in the clock of the frames, seconds; in the last 10 s, or later than the last frame.
+
+        Raises:
+            InputError: If the time is earlier, or before the first frame.
+        """
+        return self.states.at(stamp)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that changes from frame to frame, between two frames.
@@ -282,6 +309,8 @@ class V3DSLAM:
             "timer": self.timer,
             "map": self.map,
             "poses": self.poses,
+            "estimate_state": self.estimate_state,
+            "states": self.states,
             "motion_model": self.motion_model,
             "free_space_check": self.free_space_check,
             "classify_motion": self.classify_motion,
@@ -304,3 +333,5 @@ class V3DSLAM:
         if T_new_old is not None:
             self.classify_motion.tracker.apply_world_correction(T_new_old)
             self.free_space_check.apply_world_correction(T_new_old)
+            self.estimate_state.apply_world_correction(T_new_old)
+            self.states.apply_world_correction(T_new_old)

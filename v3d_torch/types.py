@@ -245,11 +245,14 @@ class FramePose:
         status: Source of the pose.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
+        information: Information matrix of the left perturbation of ``T_cw`` if the errors of all features were
+            independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
     """
 
     status: TrackingStatus
     T_cw: Tensor
     landmarks: Tensor
+    information: Tensor | None = None
 
     @property
     def observed_landmarks(self) -> Tensor:

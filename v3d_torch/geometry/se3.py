@@ -1,4 +1,4 @@
-"""SE(3) as 4x4 matrices: exponential, logarithm, inverse.
+"""SE(3) as 4x4 matrices: exponential, logarithm, inverse, adjoint.
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
 All functions are batched over leading dimensions, differentiable, and meant for float64. They compute the same as
@@ -149,6 +149,24 @@ def se3_log(T: Tensor) -> Tensor:
     t = T[..., :3, 3:]
     rho = t - 0.5 * (K @ t) + c * (K @ (K @ t))
     return torch.cat([rho[..., 0], phi], dim=-1)
+
+
+def adjoint(T: Tensor) -> Tensor:
+    r"""Adjoint matrices of rigid motions: they map tangent vectors of one frame to another.
+
+    .. math::
+        T \exp(\hat\xi) \, T^{-1} = \exp(\widehat{\mathrm{Ad}_T \xi}), \qquad
+        \mathrm{Ad}_T = \begin{pmatrix} R & {[t]}_\times R \\ 0 & R \end{pmatrix}
+
+    Args:
+        T: Rigid motions, shape :math:`(..., 4, 4)`.
+
+    Returns:
+        Shape :math:`(..., 6, 6)`.
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    cross = hat(torch.cat([t, t], dim=-1))[..., :3, :3]
+    return torch.cat([torch.cat([R, cross @ R], dim=-1), torch.cat([torch.zeros_like(R), R], dim=-1)], dim=-2)
 
 
 def hat(xi: Tensor) -> Tensor:
