@@ -161,21 +161,26 @@ class V3DSLAM:
         """
         check_frame(frame, self.camera)
 
-    def segment_instances(self, frame: RGBDFrame, prediction: PosePrediction | None) -> Segmentation:
+    def segment_instances(
+        self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
+    ) -> Segmentation:
         """Find the instances of a frame (III-A); people are masked until they are classified.
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
             prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
                 the camera; None if the pose is not known.
+            is_due: False to leave the frame out; None to leave out all but every ``segmentation.interval``-th frame.
 
         Raises:
             ConfigError: If the segmenter returned something else than instances.
         """
+        if is_due is None:
+            is_due = frame.index % self.config.segmentation.interval == 0
         timer = StageTimer()
         with timer("segmentation"):
             instances = None
-            if frame.index % self.config.segmentation.interval == 0:
+            if is_due:
                 T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
                 instances = segment_frame(self.segment, frame, T_cw)
                 check_instances(instances, frame)

@@ -18,7 +18,9 @@ CAMERA = PinholeCamera(fx=500.0, fy=510.0, cx=300.0, cy=250.0)
 def draw_path(frames: int = 10, keyframes: tuple[int, ...] = (0, 6), statuses: list[str] | None = None) -> CameraPath:
     trajectory = trajectory_of(frames)
     T_wk = trajectory.T_wc[list(keyframes)]
-    return make_camera_path(trajectory, statuses or frames * ["tracked"], T_wk, list(keyframes), CAMERA)
+    return make_camera_path(
+        trajectory, statuses or frames * ["tracked"], T_wk, torch.tensor(keyframes, dtype=torch.int64), CAMERA
+    )
 
 
 def trajectory_of(frames: int) -> Trajectory:
@@ -76,7 +78,7 @@ def test_colours_show_time_or_tracking_failures() -> None:
 def test_keyframes_of_an_earlier_run_have_their_own_colour() -> None:
     trajectory = trajectory_of(3)
     T_wk: Tensor = trajectory.T_wc
-    path = make_camera_path(trajectory, 3 * ["tracked"], T_wk, [-1, -1, 2], CAMERA)
+    path = make_camera_path(trajectory, 3 * ["tracked"], T_wk, torch.tensor([-1, -1, 2]), CAMERA)
     assert path.colours[3:15].unique(dim=0).tolist() == [rgb(PATH_COLOURS["earlier"])]
     assert torch.equal(path.colours[15], path.colours[2])
 

@@ -55,6 +55,10 @@ def main(
     load_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Localise the camera in this map and extend it.")
     ] = None,
+    realtime: Annotated[
+        bool,
+        typer.Option("--realtime", help="Play the sequence at its own rate, and leave out frames as on a live camera."),
+    ] = False,
     serial: Annotated[bool, typer.Option("--serial", help="Use one thread; the results are the same.")] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: do not change the map.")] = False,
     resume: Annotated[
@@ -100,6 +104,7 @@ def main(
             load_map=_text(load_map),
             save_map=_text(save_map),
             save_masks=save_masks,
+            realtime=realtime,
         )
         if resume is None:
             start_run(request, out, display)

@@ -9,21 +9,21 @@ _T = TypeVar("_T")
 
 
 class LatestQueue(Generic[_T]):
-    """Queue of length one: a new item replaces an item that was not taken yet.
+    """Queue of length one: a new item replaces one that was not taken yet.
 
-    One thread puts items, another one takes them. Memory and waiting time are bounded, however slow the taker is.
+    One thread puts items and closes the queue, another one takes them. However slow it is, no more than one item waits.
     """
 
     def __init__(self) -> None:
         self._changed = Condition()
         self._item: _T | None = None
-        self._closed = False
+        self._is_closed = False
         self._error: BaseException | None = None
 
     def put(self, item: _T) -> None:
-        """Put an item in place of the present one, if there is one; after `close` the item is ignored."""
+        """Put an item in place of the one that waits, if any. A closed queue ignores it."""
         with self._changed:
-            if not self._closed:
+            if not self._is_closed:
                 self._item = item
                 self._changed.notify()
 
@@ -34,22 +34,22 @@ class LatestQueue(Generic[_T]):
             The newest item; None if the queue is closed and empty.
 
         Raises:
-            BaseException: The error with which the queue was closed, after its last item was taken.
+            BaseException: The error with which the queue was closed, once its last item was taken.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._item is not None or self._closed)
+            self._changed.wait_for(lambda: self._item is not None or self._is_closed)
             item, self._item = self._item, None
         if item is None and self._error is not None:
             raise self._error
         return item
 
     def close(self, error: BaseException | None = None) -> None:
-        """Announce that no item follows; only the first call counts.
+        """Accept no more items. Only the first call has an effect.
 
         Args:
-            error: Error that `take` raises after the last item; None to return None.
+            error: Error that `take` raises after the last item; None if it returns None then.
         """
         with self._changed:
-            if not self._closed:
-                self._closed, self._error = True, error
+            if not self._is_closed:
+                self._is_closed, self._error = True, error
                 self._changed.notify()

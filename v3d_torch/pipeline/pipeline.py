@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Generator, Iterator, Mapping, Sized
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import Any, Protocol
 
 import torch
 
-from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
+from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
+from v3d_torch.live.live_slam import LiveSLAM
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
@@ -93,6 +94,9 @@ class Pipeline:
     Attributes:
         record: Records of the run.
         between_frames: False while a frame is processed, and if the processing of a frame failed.
+
+    Raises:
+        ConfigError: If the sequence is live, and the configuration allows no threads.
     """
 
     def __init__(
@@ -110,6 +114,7 @@ class Pipeline:
         self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.record = RunRecord()
         self.between_frames = True
+        self._live = LiveSLAM(sequence, slam) if isinstance(sequence, LiveStream) else None
         self._masks = masks
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
@@ -117,8 +122,9 @@ class Pipeline:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames of the sequence; of a live stream, the number processed so far."""
-        return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses)
+        """Number of frames of the sequence; of a stream, the number so far, with those that were left out."""
+        so_far = len(self.slam.poses) + self.record.live.dropped
+        return len(self.sequence) if isinstance(self.sequence, Sized) else so_far
 
     def __call__(self, on_frame: FrameCallback | None = None) -> RunRecord:
         """Process all frames. If a frame cannot be read or the user interrupts, the results so far are kept.
@@ -135,11 +141,9 @@ class Pipeline:
         record.failure, record.interrupted = None, False
         previous_seconds, start = record.seconds, time.perf_counter()
         try:
-            prefetcher = FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
-            with torch.inference_mode(), closing(prefetcher):
-                for preprocessed in prefetcher:
-                    self.between_frames = False
-                    frame, result = preprocessed.frame, self.slam.track(preprocessed)
+            tracked = self._track_frames() if self._live is None else self._track_live(self._live)
+            with torch.inference_mode(), closing(tracked):
+                for frame, result in tracked:
                     times = self.slam.timer.lap()
                     record.times.append(frame, times)
                     self._record_frame(frame, result)
@@ -147,8 +151,6 @@ class Pipeline:
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
-                    if len(record.times) % _TRIM_INTERVAL == 0:
-                        trim_memory()
         except V3DError as error:
             record.failure = str(error)
         except Exception as error:  # an error of the program must not cost the results so far
@@ -182,6 +184,26 @@ class Pipeline:
         self.record = state["record"]
         self.views.load_state_dict(state["views"])
 
+    def _track_frames(self) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
+        """Track the frames of a sequence, and yield each with its result."""
+        with closing(
+            FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
+        ) as prefetcher:
+            for preprocessed in prefetcher:
+                self.between_frames = False
+                yield preprocessed.frame, self.slam.track(preprocessed)
+                if len(self.slam.poses) % _TRIM_INTERVAL == 0:
+                    trim_memory()
+
+    def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
+        """Track the frames of a live stream, and yield each with its result."""
+        with closing(iter(live)) as results:
+            for result in results:
+                self.between_frames = False
+                self.record.live.append_result(result)
+                self.record.rejected = live.rejected
+                yield result.frame, result
+
     def _remaining_frames(self) -> Iterator[RGBDFrame]:
         done = len(self.slam.poses) if isinstance(self.sequence, RGBDSequence) else 0
         if isinstance(self.sequence, StoredSequence):
@@ -189,6 +211,7 @@ class Pipeline:
         return islice(iter(self.sequence), done, None)
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
+        self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result.objects)
         self._evaluate_masks(frame, result)
         if self._masks is not None:

@@ -143,14 +143,16 @@ class CheckedSLAM(V3DSLAM):
             check_finite("the input", frame)
         super().check(frame)
 
-    def segment_instances(self, frame: RGBDFrame, prediction: PosePrediction | None) -> Segmentation:
+    def segment_instances(
+        self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
+    ) -> Segmentation:
         """Run `V3DSLAM.segment_instances`.
 
         Raises:
             NumericsError: If the result of the segmenter is not finite.
         """
         with _frame_in_message(frame):
-            return super().segment_instances(frame, prediction)
+            return super().segment_instances(frame, prediction, is_due)
 
     def extract_features(self, frame: RGBDFrame) -> Extraction:
         """Run `V3DSLAM.extract_features`.

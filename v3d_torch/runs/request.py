@@ -33,6 +33,7 @@ class RunRequest:
         load_map: Map file in which the camera is localised; None to start a new map.
         save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
+        realtime: True to play the sequence at its own rate, like a live camera.
     """
 
     seq: str
@@ -48,6 +49,7 @@ class RunRequest:
     load_map: str | None = None
     save_map: str | None = None
     save_masks: bool = False
+    realtime: bool = False
 
     @property
     def source_options(self) -> SourceOptions:

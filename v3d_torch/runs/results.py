@@ -29,6 +29,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import fuse_points
+from v3d_torch.runs.state_table import make_state_table
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -107,6 +108,7 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
         with suppress(InputError):  # too few poses for scores
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frame_count)
     _write_table(folder / "frames.parquet", _frame_table(pipeline))
+    _write_table(folder / "states.parquet", make_state_table(pipeline.record))
     _write_table(folder / "dynamics.parquet", _object_table(pipeline.record.dynamics))
     return trajectory, evaluation
 
@@ -180,6 +182,9 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
         "failure": failure,
+        "latency": run.live.latency_statistics(),
+        "dropped": run.live.dropped,
+        "rejected": run.rejected,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,
         "seconds_per_stage": dict(slam.timer.seconds),
@@ -213,7 +218,9 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
     keyframes = slam.map.active_keyframes
-    frames = [keyframe.frame for keyframe in keyframes]
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
+    positions = torch.searchsorted(trajectory.stamps, stamps).masked_fill(known, -1)
     statuses = [status.value for status in slam.poses.statuses]
-    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), frames, pipeline.sequence.camera)
+    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)

@@ -42,7 +42,7 @@ class CameraPath:
 
 
 def make_camera_path(
-    trajectory: Trajectory, statuses: list[str], T_wk: Tensor, frames: list[int], camera: PinholeCamera
+    trajectory: Trajectory, statuses: list[str], T_wk: Tensor, positions: Tensor, camera: PinholeCamera
 ) -> CameraPath:
     """Create the mesh of a camera path.
 
@@ -50,7 +50,7 @@ def make_camera_path(
         trajectory: Poses of all frames.
         statuses: Tracking status of each frame: "tracked", or a key of `PATH_COLOURS`.
         T_wk: Camera-to-world poses of the keyframes, float64, shape :math:`(K, 4, 4)`.
-        frames: Frame index of each keyframe, -1 for a keyframe of an earlier run.
+        positions: Position of each keyframe in the trajectory, -1 for one of an earlier run, int64, shape :math:`(K,)`.
         camera: Camera, which determines the shape of the frustums.
     """
     right, bottom = camera.width - 0.5, camera.height - 0.5
@@ -63,7 +63,7 @@ def make_camera_path(
     indices = torch.arange(len(trajectory))
     return CameraPath(
         points=torch.cat([trajectory.T_wc[:, :3, 3], frustums.flatten(0, 1)]),
-        colours=torch.cat([colours[:-1], colours[frames].repeat_interleave(len(frustum), dim=0)]),
+        colours=torch.cat([colours[:-1], colours[positions].repeat_interleave(len(frustum), dim=0)]),
         faces=(first_vertex + _FACES).flatten(0, 1),
         edges=torch.cat([torch.stack([indices[:-1], indices[1:]], dim=1), (first_vertex + _EDGES).flatten(0, 1)]),
     )
