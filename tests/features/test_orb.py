@@ -1,11 +1,13 @@
-"""ORB detection on a synthetic image."""
+"""ORB detection on synthetic images and photographs."""
 
 from __future__ import annotations
 
+import kornia_rs
 import numpy as np
 import torch
+from helpers.photographs import photograph
 
-from v3d_torch.config import Config
+from v3d_torch.config import Config, FeaturesConfig
 from v3d_torch.features.orb import ORB
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -45,3 +47,37 @@ def test_in_mask_selects_features_by_their_pixel() -> None:
     mask = torch.zeros(480, 640, dtype=torch.bool)
     mask[:, :320] = True
     assert torch.equal(features.in_mask(mask), features.pixel[:, 0] < 320)
+
+
+def test_most_features_lie_beside_those_of_kornia_rs() -> None:
+    """kornia-rs selects several pixels of a corner, and no corners with little contrast."""
+    image = photograph("coffee")
+    height, width = image.shape[1:]
+    camera = PinholeCamera(500.0, 500.0, width / 2, height / 2, width, height)
+    features = ORB(FeaturesConfig(count=1500), camera)(image, torch.ones(1, height, width))
+    orb = kornia_rs.features.orb_detect_and_compute(image.permute(1, 2, 0).contiguous().numpy(), n_keypoints=1500)
+    for octave in range(8):
+        scale = 1.2**octave
+        ours = (features.uv[features.octave == octave] + 0.5) / scale - 0.5
+        theirs = torch.from_numpy(orb.keypoints_xy[orb.octaves == octave] / scale).to(torch.float64)
+        assert (torch.cdist(theirs, ours).amin(dim=1) < 2).to(torch.float64).mean() > 0.5
+
+
+def test_features_of_all_levels_lie_at_the_same_point() -> None:
+    """A level's pixel covers a square of the image; its centre is not the corner's pixel times the scale."""
+    image = torch.full((3, 480, 640), 60, dtype=torch.uint8)
+    image[:, 200:, 300:] = 200  # its corner lies between pixels 299 and 300, and 199 and 200
+    features = ORB(Config().features, CAMERA)(image, torch.ones(1, 480, 640))
+    octaves = features.octave.unique()
+    assert len(octaves) >= 6
+    for octave in octaves.tolist():
+        # FAST finds corners inside of the bright quarter, at the same distance in pixels of each level.
+        inside = (features.uv[features.octave == octave] - torch.tensor([299.5, 199.5])) / 1.2**octave
+        assert (inside[:, 0] - inside[:, 1]).abs().max() < 3.5
+        assert inside.abs().max() < 4.5
+
+
+def test_features_are_found_at_low_contrast() -> None:
+    blocks = _random_blocks().to(torch.float32)
+    dim = (100 + blocks * 19 / 255).to(torch.uint8)  # all differences are below the first threshold
+    assert len(ORB(Config().features, CAMERA)(dim, torch.ones(1, 480, 640))) > 300

@@ -3,16 +3,42 @@
 from __future__ import annotations
 
 import kornia_rs
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig
+from v3d_torch.features import brief
+from v3d_torch.features.corner_selection import select_corners, select_strong_corners
 from v3d_torch.features.features import Features, sample_depth
+from v3d_torch.features.scale_pyramid import ScalePyramid
 from v3d_torch.geometry.camera import PinholeCamera
+
+Ints = NDArray[np.int64]
+
+_THRESHOLD, _MIN_THRESHOLD = 20, 7
+"""Difference of brightness between a corner and its surroundings, grey levels; the low one is used in cells without
+other corners (ORB-SLAM2)."""
+
+_CELL = 32
+"""Side of these cells, pixels of a level (ORB-SLAM2 has 30 or 35). Between two levels lies a margin that is wider."""
+
+_WHITE = 255
+"""Grey level of white. The response of kornia-rs is a fraction of it."""
+
+_ARC = 9
+"""Number of adjacent pixels on the circle around a corner that are brighter, or darker (FAST-9)."""
+
+_SMOOTHING_SIZE, _SMOOTHING_SIGMA = (7, 7), (2.0, 2.0)
+"""Gaussian filter before the comparisons of BRIEF, pixels (OpenCV)."""
 
 
 class ORB:
-    """Detector and descriptor of ORB features, by kornia-rs.
+    """Detector and descriptor of ORB features.
+
+    FAST and the smoothing are those of kornia-rs. Its own ORB takes longer, selects several pixels of one corner, and
+    leaves surfaces with little contrast without features.
 
     Args:
         config: Number of features, scale pyramid, maximum depth.
@@ -20,8 +46,12 @@ class ORB:
     """
 
     def __init__(self, config: FeaturesConfig, camera: PinholeCamera) -> None:
-        self._config = config
         self._camera = camera
+        self._max_depth = config.max_depth
+        self._pyramid = ScalePyramid(camera.width, camera.height, config.levels, config.scale, brief.MARGIN)
+        # A geometric series, so that the density is the same on all levels.
+        shares = config.scale ** -np.arange(len(self._pyramid.sizes), dtype=np.float64)
+        self._counts = np.round(config.count * shares / shares.sum()).astype(int).tolist()
 
     def __call__(self, image: Tensor, depth: Tensor) -> Features:
         """Detect features in the whole image; masks are applied later, by `Features.in_mask`.
@@ -33,20 +63,32 @@ class ORB:
         Returns:
             Features with the depth of their nearest pixel.
         """
-        detected = kornia_rs.features.orb_detect_and_compute(
-            image.permute(1, 2, 0).contiguous().numpy(),
-            n_keypoints=self._config.count,
-            n_scales=self._config.levels,
-            downscale=self._config.scale,
-        )
-        height, width = image.shape[-2:]
-        position = torch.from_numpy(detected.keypoints_xy.copy()).to(torch.float64).reshape(-1, 2)
+        grey = np.asarray(kornia_rs.imgproc.gray_from_rgb(image.permute(1, 2, 0).contiguous().numpy()))[..., 0]
+        canvas = self._pyramid.build(grey)
+        corners, level = self._detect(canvas)
+        smoothed = kornia_rs.imgproc.gaussian_blur(canvas[..., None], _SMOOTHING_SIZE, _SMOOTHING_SIGMA)[..., 0]
+        descriptors = brief.describe(*map(torch.from_numpy, (canvas, smoothed, corners)))
+        # Pixel centres lie at integers, so the borders of the images are half a pixel outside of them.
+        sizes = np.array(self._pyramid.sizes)
+        corners[:, 1] -= self._pyramid.tops[level]
+        position = torch.from_numpy((corners + 0.5) * (sizes[0] / sizes)[level] - 0.5)
         pixel = position.round().to(torch.int64)
-        pixel = torch.stack([pixel[:, 0].clamp(0, width - 1), pixel[:, 1].clamp(0, height - 1)], dim=1)
         return Features(
             uv=self._camera.undistort(position),
             pixel=pixel,
-            depth=sample_depth(pixel, depth, self._config.max_depth),
-            octave=torch.from_numpy(detected.octaves.astype("int64")),
-            descriptors=torch.from_numpy(detected.descriptors.copy()).reshape(-1, 32),
+            depth=sample_depth(pixel, depth, self._max_depth),
+            octave=torch.from_numpy(level),
+            descriptors=descriptors,
         )
+
+    def _detect(self, canvas: NDArray[np.uint8]) -> tuple[Ints, Ints]:
+        """Return the corners (column, row) in the image of all levels, (N, 2), and the level of each, sorted, (N,)."""
+        pyramid = self._pyramid
+        found, response = kornia_rs.features.fast_detect(canvas, _MIN_THRESHOLD, _ARC, brief.MARGIN)
+        strength = (response * _WHITE).round().astype(np.uint8)
+        strong = select_strong_corners(found, strength, pyramid.is_inside, _THRESHOLD, _CELL)
+        corners, strength = found[strong].astype(np.int64), strength[strong].astype(np.int64)
+        level = pyramid.level_of_row[corners[:, 1]]
+        in_level = corners - np.stack([np.zeros_like(level), pyramid.tops[level]], axis=1)
+        selected = select_corners(in_level, strength, level, pyramid.sizes, self._counts)
+        return corners[selected], level[selected]

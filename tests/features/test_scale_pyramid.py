@@ -1,0 +1,34 @@
+"""Scale pyramid in one image."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from v3d_torch.features.scale_pyramid import ScalePyramid
+
+
+def test_levels_are_below_each_other() -> None:
+    pyramid = ScalePyramid(100, 80, 3, 1.25, 10)
+    assert pyramid.sizes == [(100, 80), (80, 64), (64, 51)]
+    assert pyramid.tops.tolist() == [0, 80, 144]
+    grey = np.random.default_rng(0).integers(0, 256, (80, 100), np.uint8)
+    canvas = pyramid.build(grey)
+    assert canvas.shape == (195, 100)
+    np.testing.assert_array_equal(canvas[:80], grey)
+    second = np.asarray(cv2.resize(grey, (80, 64), interpolation=cv2.INTER_LINEAR))
+    np.testing.assert_array_equal(canvas[80:144, :80], second)
+    np.testing.assert_array_equal(canvas[144:, :64], cv2.resize(second, (64, 51), interpolation=cv2.INTER_LINEAR))
+
+
+def test_pixels_inside_of_levels_are_marked() -> None:
+    pyramid = ScalePyramid(100, 80, 3, 1.25, 10)
+    column, row = np.array([9, 10, 89, 90, 10, 69, 70, 50, 50]), np.array([10, 10, 69, 10, 90, 133, 133, 134, 154])
+    assert pyramid.is_inside[row, column].tolist() == [False, True, True, False, True, True, False, False, True]
+    assert pyramid.level_of_row[row].tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2]
+
+
+@pytest.mark.parametrize(("size", "levels"), [((20, 20), 1), ((48, 60), 1), ((50, 60), 2), ((640, 480), 8)])
+def test_levels_without_pixels_inside_are_left_out(size: tuple[int, int], levels: int) -> None:
+    assert len(ScalePyramid(*size, 8, 1.2, 20).sizes) == levels

@@ -1,0 +1,146 @@
+"""Selection of corners that are spread over images, by contrast and by quadtrees (Mur-Artal et al., T-RO 2015)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.kernels import corner_selection as kernels
+from v3d_torch.kernels.compiler import compiled_by
+
+_DEPTH = 10
+"""Depth of the quadtrees; their smallest cells are below a pixel."""
+
+_CELL_BITS = 2 * _DEPTH + 4
+"""Bits of the code of a cell: two for each level, and four for the square cells of the first level."""
+
+_PIXELS_BEFORE = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0]], np.uint8)
+"""Neighbours of a pixel that come before it in row-major order."""
+
+Ints = NDArray[np.int64]
+Points = NDArray[np.float32]
+
+
+def _select_strong_corners_compiled(
+    corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
+) -> Ints:
+    return kernels.select_strong_corners(corners, response, is_inside, threshold, cell)
+
+
+@compiled_by(_select_strong_corners_compiled)
+def select_strong_corners(
+    corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
+) -> Ints:
+    """Select the local maxima that are strong, and weak ones in cells without a strong one.
+
+    The weak ones lie on surfaces with little contrast. Of equal neighbours, the first one is the maximum.
+
+    Args:
+        corners: Corners (column, row), whole numbers, float32, shape :math:`(N, 2)`.
+        response: Strength of the corners, at least 1, uint8, shape :math:`(N,)`.
+        is_inside: True for the pixels whose corners are selected, none of them at the border, bool, shape
+            :math:`(H, W)`.
+        threshold: Corners above it are strong.
+        cell: Side of a cell, pixels.
+
+    Returns:
+        Indices of the selected corners in their order, int64, shape :math:`(K,)`.
+    """
+    columns, rows = corners.T.astype(np.int64)
+    inside = is_inside[rows, columns]
+    strength = np.zeros(is_inside.shape, np.uint8)
+    strength[rows[inside], columns[inside]] = response[inside]
+    before, after = (cv2.dilate(strength, neighbours) for neighbours in (_PIXELS_BEFORE, _PIXELS_BEFORE[::-1, ::-1]))
+    is_maximum = inside & ((strength > before) & (strength >= after))[rows, columns]
+    cells = rows // cell * (is_inside.shape[1] // cell + 1) + columns // cell
+    is_strong = response > threshold
+    has_strong = np.bincount(cells, is_strong & inside) > 0
+    return np.flatnonzero(is_maximum & (is_strong | ~has_strong[cells]))
+
+
+def select_corners(
+    corners: Ints, response: Ints, image: Ints, sizes: Sequence[tuple[int, int]], counts: Sequence[int]
+) -> Ints:
+    """Select the strongest corner of each cell of a quadtree, for several images at once.
+
+    Cells with several corners are divided into four, all at once as long as at most the wanted number of cells are
+    occupied, then those with the most corners first.
+
+    Args:
+        corners: Corners (column, row) of all images, int64, shape :math:`(N, 2)`.
+        response: Strength of the corners, from 0 to 255, int64, shape :math:`(N,)`; of equal corners of a cell the
+            first one is selected.
+        image: Index of the image of each corner, int64, shape :math:`(N,)`.
+        sizes: Width and height of the M images, pixels.
+        counts: Number of corners to select in each image; up to three more are selected if the last cell gives them.
+
+    Returns:
+        Indices of the selected corners, sorted by image, int64, shape :math:`(K,)`.
+    """
+    code = image << _CELL_BITS | _cell_codes(corners, np.array(sizes)[image])
+    return _select_strongest(code, response, np.array(counts))
+
+
+def _select_strongest_compiled(code: Ints, response: Ints, counts: Ints) -> Ints:
+    return kernels.select_corners(code, response, _DEPTH, _CELL_BITS, counts)
+
+
+@compiled_by(_select_strongest_compiled)
+def _select_strongest(code: Ints, response: Ints, counts: Ints) -> Ints:
+    """Select the strongest corner of each cell; ``code`` is the image of each corner, then its smallest cell."""
+    if len(code) == 0:
+        return np.zeros(0, np.int64)
+    index = np.lexsort((-response, code))  # stable
+    code, image = code[index], code[index] >> _CELL_BITS
+    # The cells of a level are the ranges of equal prefixes of the codes. A corner begins a cell on all levels from the
+    # first one on which its prefix differs from that of the corner before it.
+    begins = np.zeros(len(code), np.int64)
+    begins[1:] = np.maximum(_DEPTH - (_bit_length(code[1:] ^ code[:-1]) - 1) // 2, 0)
+    # Number of occupied cells of each image on each level, and the last level on which there are few enough of them.
+    begun = np.bincount(image * (_DEPTH + 2) + begins, minlength=len(counts) * (_DEPTH + 2))
+    cells = begun.reshape(len(counts), -1)[:, :-1].cumsum(axis=1)
+    level = np.maximum((cells <= counts[:, None]).sum(axis=1) - 1, 0)
+    missing = np.where(level < _DEPTH, counts - cells[np.arange(len(counts)), level], 0)
+    # Divide further cells, the fullest ones first, until no more are missing.
+    above = begins <= level[image]
+    below = begins == level[image] + 1
+    first = np.flatnonzero(above)
+    size, owner, gained = np.diff(first, append=len(code)), image[first], np.add.reduceat(below, first, dtype=np.int64)
+    order = np.lexsort((-size, owner))
+    gained_before = gained[order].cumsum() - gained[order]
+    begin = np.searchsorted(owner, owner)  # the first cell of the same image, in both orders
+    divided = np.zeros(len(first), np.bool_)
+    divided[order] = gained_before - gained_before[begin] < missing[owner]
+    first = np.flatnonzero(above | (below & divided.repeat(size)))
+    cell = np.arange(len(first)).repeat(np.diff(first, append=len(code)))
+    return np.asarray(index[np.lexsort((index, -response[index], cell))[first]], np.int64)
+
+
+def _cell_codes(corners: Ints, sizes: Ints) -> Ints:
+    """Codes of the smallest cells of corners: two bits for each level, after the index of the square cell.
+
+    Args:
+        corners: Corners (column, row), (N, 2).
+        sizes: Width and height of the image of each corner, (N, 2).
+    """
+    width, height = sizes.T
+    squares = np.clip(np.rint(width / height), 1, 15).astype(np.int64)
+    column = corners[:, 0] * (squares << _DEPTH) // width
+    row = (corners[:, 1] << _DEPTH) // height
+    inner = (1 << _DEPTH) - 1
+    return (column >> _DEPTH) << 2 * _DEPTH | _spread_bits(column & inner) | _spread_bits(row) << 1
+
+
+def _spread_bits(x: Ints) -> Ints:
+    """Insert a zero before each of the lowest 16 bits."""
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        x = (x | x << shift) & mask
+    return x
+
+
+def _bit_length(x: Ints) -> Ints:
+    """Number of bits of non-negative integers; 0 for 0."""
+    return np.frexp(x.astype(np.float64))[1].astype(np.int64)
