@@ -72,6 +72,8 @@ class V3DSLAM:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
         states: States of the camera in the last seconds.
+        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None if no frame
+            has a measured one.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -121,6 +123,7 @@ class V3DSLAM:
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
         self.loop_closer.rebuild(self.map.active_keyframes)
+        self.gravity: Tensor | None = None
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
@@ -242,6 +245,7 @@ class V3DSLAM:
             keyframe = self.mapper(frame, static, pose, reference)
             T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
             self._apply_world_correction(T_new_old)
+            self._update_gravity(frame, T_new_old)
             if pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
@@ -297,14 +301,14 @@ class V3DSLAM:
         """
         state = {name: component.state_dict() for name, component in self._stateful_components().items()}
         own = {"previous": self._previous, "predictions": list(self.predictions), "segmenter": self._segmenter_state}
-        return {**state, **own}
+        return {**state, **own, "gravity": self.gravity}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`; the next frames give the same results as without the interruption."""
         for name, component in self._stateful_components().items():
             component.load_state_dict(state[name])
         self.loop_closer.rebuild(each for each in self.map.active_keyframes if each is not self.back_end.keyframe)
-        self._previous = state["previous"]
+        self._previous, self.gravity = state["previous"], state["gravity"]
         self.predictions = deque(state["predictions"])
         self._segmenter_state = state["segmenter"]
         restore_segmenter(self.segment, self._segmenter_state)
@@ -332,6 +336,13 @@ class V3DSLAM:
         """Predict the motion of the camera; None if it has not been localised in a known map yet."""
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_located else None
+
+    def _update_gravity(self, frame: RGBDFrame, T_new_old: Tensor | None) -> None:
+        """Take over the first measured gravity; move it with a guessed world frame when the camera is first found."""
+        if frame.gravity is not None and self.gravity is None:
+            self.gravity = self.poses.T_cw[:3, :3].T @ frame.gravity
+        elif T_new_old is not None and self.gravity is not None:
+            self.gravity = T_new_old[:3, :3] @ self.gravity
 
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
         """Move everything outside the map that is stored in the world frame, after a correction of the map."""

@@ -22,7 +22,9 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_NOT_STAGES = frozenset({"camera", "config", "timer", "map", "poses", "motion_model", "predictions", "states"})
+_NOT_STAGES = frozenset(
+    {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions"}
+)
 """Public attributes of `V3DSLAM` that are not stages."""
 
 _STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
