@@ -70,7 +70,6 @@ def test_integer_depth_in_camera_units_becomes_metres(demo: RGBDSequence) -> Non
     assert (
         RGBDFrame.from_arrays(0, 0.0, image, units, demo.camera).depth.unique().item() == 5000 / demo.camera.depth_scale
     )
-    assert RGBDFrame.from_arrays(0, 0.0, image, units).depth.unique().item() == 5.0
     assert RGBDFrame.from_arrays(0, 0.0, image, torch.full((480, 640), -1.0)).depth.unique().item() == 0.0
 
 

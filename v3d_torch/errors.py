@@ -33,5 +33,9 @@ class GroundTruthWarning(UserWarning):
     """The ground truth of a sequence cannot be read. Its frames are available without true poses."""
 
 
+class DepthScaleWarning(UserWarning):
+    """The depth scale of a sequence is not stated, and was estimated from its images."""
+
+
 class NumericsError(V3DError):
     """A stage returned NaN or infinity; raised in debug mode by `v3d_torch.runs.numerics_check.CheckedSLAM`."""

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
 
 
 @runtime_checkable
@@ -76,14 +77,14 @@ class RGBDFrame:
                 are accepted.
             depth: Depth registered to the colour image, shape :math:`(H, W)`: metres if floating point, else in the
                 units of the camera; 0 or NaN = no measurement.
-            camera: Camera of both images, which gives the depth units; without a camera they are millimetres.
+            camera: Camera of both images, whose ``depth_scale`` gives the unit of depth in whole numbers.
             depth_delay: Time of the depth image minus time of the colour image, seconds.
             gravity: Direction of gravity in the camera frame, of any length, shape :math:`(3,)`; None if it was not
                 measured. An accelerometer at rest measures the opposite direction.
 
         Raises:
-            InputError: If an image or the gravity has the wrong shape, type or size, or if a time is not a finite
-                number.
+            InputError: If an image or the gravity has the wrong shape, type or size, if depth has whole numbers and the
+                camera no depth scale, or if a time is not a finite number.
         """
         colour, measured = _array(image), _array(depth)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
@@ -111,16 +112,16 @@ class RGBDFrame:
                 f"frame {index}: has {colour.shape[1]}x{colour.shape[0]} pixels, the camera"
                 f" {camera.width}x{camera.height}; give the camera that took it"
             )
-        metres = torch.from_numpy(measured.astype(np.float32))
-        if measured.dtype.kind != "f":
-            metres = metres / (camera.depth_scale if camera is not None else 1000)
-        metres = metres.where(metres.isfinite() & (metres > 0), 0.0)
+        scale = camera.depth_scale if camera is not None else None
+        if measured.dtype.kind != "f" and scale is None:
+            raise InputError(f"frame {index}: depth is {measured.dtype}, {estimate_depth_scale([measured]).request}")
+        metres = depth_to_metres(measured, scale)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
         return RGBDFrame(
             index,
             to_float(stamp),
             channels,
-            metres[None],
+            metres,
             camera=camera,
             depth_delay=to_float(depth_delay),
             gravity=None if gravity is None else _unit_vector(_array(gravity), index),

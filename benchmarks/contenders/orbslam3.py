@@ -16,7 +16,9 @@ import torch
 
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.distortion import COEFFICIENTS
 from v3d_torch.types import Trajectory
 
 VIEWER = (
@@ -87,8 +89,9 @@ def settings(camera: PinholeCamera, fps: int) -> str:
 
     The depth factor is 1 because depth is passed in metres.
     """
-    k1, k2, p1, p2, k3 = camera.distortion
-    lens = {"k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3} if camera.is_distorted else {}
+    if camera.distortion_model != "plumb_bob":
+        raise InputError(f"the contender ORB-SLAM3 is not set up for the lens model {camera.distortion_model}")
+    lens = dict(zip(COEFFICIENTS["plumb_bob"], camera.distortion, strict=True)) if camera.is_distorted else {}
     intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, **lens}
     return f"""%YAML:1.0
 ---

@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 LICENCES_BY_HAND = {
     "apsw": "Zlib",  # its metadata states "any-OSI", its LICENSE file Zlib
     "atheris": "Apache-2.0",  # not in its metadata
+    "openexr": "BSD-3-Clause",  # not in its metadata
 }
 """Licences of packages without a licence name in their metadata."""
 

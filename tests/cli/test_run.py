@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -404,3 +405,21 @@ def test_demo_moving_people_are_not_in_the_map(demo: tuple[Path, str]) -> None:
     # The corridor that the walker crosses is empty above the furniture, except for a few stray points.
     corridor = (np.abs(y - WALKER_Y) < 0.2) & (z > 1.0) & (z < 1.6) & (np.abs(x) < 1.2)
     assert corridor.sum() < 0.002 * len(points)
+
+
+def test_estimated_depth_scale_is_reported_on_the_console_and_in_the_log(moment: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "millimetres"
+    shutil.copytree(moment, folder)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5).astype(np.uint16))
+    lines = (folder / "camera.yaml").read_text().splitlines()
+    (folder / "camera.yaml").write_text("\n".join(line for line in lines if not line.startswith("depth_scale")))
+    done = call_here("--seq", folder, "--out", "out", "--segmenter", "none", cwd=tmp_path)
+    assert (done.exit_code, done.stderr) == (0, "")
+    note = re.search(
+        r"^note: millimetres: (depth scale 1000 \(millimetres\), estimated from .*)$", done.stdout, re.MULTILINE
+    )
+    assert note is not None and "in steps of 1; state depth_scale in camera.yaml" in note[1]
+    assert f"WARNING {note[1]}" in (tmp_path / "out" / "run.log").read_text()
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["ate"]["rmse"] < 0.01 and not [text for text in metrics["notes"] if "depth_scale" in text]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -54,6 +55,28 @@ def test_depth_delay_is_depth_stamp_minus_colour_stamp(tmp_path: Path) -> None:
     assert listed == paired and [pair.depth_delay for pair in listed] == [-1 / 64, 1 / 64]
     path.write_text("10.0 rgb/a.png 5009.99 depth/a.png")  # stamps of two clocks give no delay
     assert [pair.depth_delay for pair in read_associations(path)] == [0.0]
+
+
+@pytest.mark.parametrize("written", ["rgb\\{}", "rgb/{}\u00a0", "rgb\u200b/{}", "\u00a0rgb\\{}\u200b"])
+def test_backslashes_and_odd_spaces_in_file_names_are_understood(tmp_path: Path, written: str) -> None:
+    (tmp_path / "rgb").mkdir()
+    for name in ("a.png", "b c.png"):
+        (tmp_path / "rgb" / name).touch()
+    listed = [written.format(name) for name in ("a.png", "b c.png")]
+    (tmp_path / "rgb.txt").write_text(f"1.0\u00a0{listed[0]}\r\n2.0\u200b {listed[1]}\n", encoding="utf-8")
+    assert read_image_list(tmp_path / "rgb.txt") == [(1.0, "rgb/a.png"), (2.0, "rgb/b c.png")]
+    lines = f"1.0 {listed[0]} 1.01\u200b {listed[1]}\n"
+    (tmp_path / "associations.txt").write_text(lines, encoding="utf-8")
+    (pair,) = read_associations(tmp_path / "associations.txt")
+    assert (pair.colour, pair.depth, pair.depth_delay) == ("rgb/a.png", "rgb/b c.png", pytest.approx(0.01))
+
+
+def test_file_names_that_exist_are_not_changed(tmp_path: Path) -> None:
+    names = ["back\\slash.png", "no\u00a0break.png", "zero\u200bwidth.png"]
+    for name in names:
+        (tmp_path / name).touch()
+    (tmp_path / "rgb.txt").write_text("".join(f"{i}.0 {name}\n" for i, name in enumerate(names)), encoding="utf-8")
+    assert [name for _, name in read_image_list(tmp_path / "rgb.txt")] == names
 
 
 @given(content=st.binary(max_size=200))

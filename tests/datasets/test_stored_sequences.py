@@ -15,10 +15,12 @@ from PIL import Image
 
 from v3d_torch.datasets import RGBDSequence, load_sequence, locate, tum
 from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.images import read_colour, read_depth
+from v3d_torch.datasets.depth_files import read_depth_file
+from v3d_torch.datasets.images import read_colour
 from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_metres
 
 WALKING_XYZ = "rgbd_dataset_freiburg3_walking_xyz"
 
@@ -65,7 +67,8 @@ def test_tum_frames_match_files(folder: Path) -> None:
 def test_convention_depth_is_in_metres_and_zero_or_saturated_is_missing(folder: Path) -> None:
     units = np.array([[0, 1, 5000, 65535]], dtype=np.uint16)
     Image.fromarray(units).save(folder / "depth.png")
-    assert read_depth(folder / "depth.png", 5000).tolist() == [[pytest.approx([0.0, 0.0002, 1.0, 0.0])]]
+    depth = depth_to_metres(read_depth_file(folder / "depth.png"), 5000)
+    assert depth.tolist() == [[pytest.approx([0.0, 0.0002, 1.0, 0.0])]]
 
 
 def test_convention_images_are_rgb(folder: Path) -> None:

@@ -4,35 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of
-from numpy.typing import NDArray
+from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of, depth_of
+from helpers.videos import write_video
 
 from v3d_torch.datasets import SourceOptions, load_sequence
 from v3d_torch.datasets.video import VideoSequence
 from v3d_torch.errors import InputError
 
-SIZE = (WIDTH, HEIGHT)
-
 
 def write_colour(path: Path, fps: float, frames: int) -> None:
-    """Write a lossless colour video, so that pixels can be compared."""
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), fps, SIZE)
-    assert writer.isOpened()
-    for i in range(frames):
-        writer.write(cv2.cvtColor(colour_of(i), cv2.COLOR_RGB2BGR))
-    writer.release()
-
-
-def write_depth(path: Path, fps: float, images: list[NDArray[np.uint16]]) -> None:
-    options = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
-    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), fps, SIZE, options)
-    assert writer.isOpened()
-    for image in images:
-        writer.write(image)
-    writer.release()
+    write_video(path, fps, [colour_of(i) for i in range(frames)])
 
 
 @pytest.fixture
@@ -42,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
     root.mkdir()
     (root / "camera.yaml").write_text(CAMERA_YAML)
     write_colour(root / "rgb.avi", 30, 6)
-    write_depth(root / "depth.mkv", 15, [depth_of(i) for i in range(3)])
+    write_video(root / "depth.mkv", 15, [depth_of(i) for i in range(3)])
     return root
 
 
@@ -74,7 +57,7 @@ def test_fps_of_the_user_sets_the_timestamps(folder: Path) -> None:
 
 def test_pair_is_found_by_name_among_several_videos(folder: Path) -> None:
     write_colour(folder / "second.mkv", 15, 2)
-    write_depth(folder / "second_depth.mkv", 15, [depth_of(7), depth_of(8)])
+    write_video(folder / "second_depth.mkv", 15, [depth_of(7), depth_of(8)])
     sequence = load_sequence(str(folder / "second.mkv"))
     assert isinstance(sequence, VideoSequence)
     assert_frame(sequence, 1, 1, 8)
@@ -116,7 +99,7 @@ def test_video_of_another_size_than_the_camera_is_an_input_error(folder: Path) -
 
 def test_truncated_video_raises_after_its_last_frame(folder: Path) -> None:
     write_colour(folder / "rgb.avi", 30, 90)
-    write_depth(folder / "depth.mkv", 30, [depth_of(i) for i in range(90)])
+    write_video(folder / "depth.mkv", 30, [depth_of(i) for i in range(90)])
     content = (folder / "rgb.avi").read_bytes()
     (folder / "rgb.avi").write_bytes(content[: len(content) // 2])
     sequence = load_sequence(str(folder))

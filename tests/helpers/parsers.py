@@ -13,9 +13,10 @@ import torch
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
-from v3d_torch.datasets import openloris
+from v3d_torch.datasets import icl_nuim, openloris
 from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour, read_depth
+from v3d_torch.datasets.depth_files import read_depth_file
+from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour
 from v3d_torch.datasets.lists import read_associations, read_image_list
 from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.ros import BagSequence
@@ -24,6 +25,7 @@ from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.io.extract import extract_tar
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.runs import stored_run
@@ -83,6 +85,11 @@ def extract_archive(path: Path) -> object:
         shutil.rmtree(folder, ignore_errors=True)  # an existing folder is an error
 
 
+def read_metres(path: Path) -> torch.Tensor:
+    """Read a depth file in units of 1/5000 m, or in metres."""
+    return depth_to_metres(read_depth_file(path), 5000.0)
+
+
 CAMERA = PinholeCamera(fx=8.0, fy=8.0, cx=3.5, cy=2.5, width=8, height=6)
 
 PARSERS: dict[str, Parser] = {
@@ -97,14 +104,18 @@ PARSERS: dict[str, Parser] = {
     "--set": parse_overrides,
     "colour file": from_file("image.png", read_colour),
     "JPEG file": from_file("image.jpg", read_colour),
-    "depth file": from_file("image.png", lambda path: read_depth(path, 5000.0)),
+    "depth file": from_file("image.png", read_metres),
+    "NumPy depth file": from_file("image.npy", read_metres),
+    "POV-Ray depth file": from_file("scene_00_0000.depth", icl_nuim._read_numbers),
     "colour in a message": lambda content, folder: decode_colour(content, "topic"),
     "depth in a message": lambda content, folder: decode_depth(content, "topic"),
     "colour message": lambda content, folder: decode_colour_message(image_message(content), "topic"),
-    "depth message": lambda content, folder: decode_depth_message(image_message(content), 1000.0, "topic"),
+    "depth message": lambda content, folder: depth_to_metres(
+        decode_depth_message(image_message(content), "topic"), 1000.0
+    ),
     "compressed colour message": lambda content, folder: decode_colour_message(compressed_message(content), "topic"),
-    "compressed depth message": lambda content, folder: decode_depth_message(
-        compressed_message(content), 1000.0, "topic"
+    "compressed depth message": lambda content, folder: depth_to_metres(
+        decode_depth_message(compressed_message(content), "topic"), 1000.0
     ),
     "sensors.yaml": from_file("sensors.yaml", openloris._read_camera),
     "trans_matrix.yaml": from_file("trans_matrix.yaml", openloris._read_transforms),
@@ -143,6 +154,7 @@ def assert_valid(result: object) -> None:
         torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand_as(R), rtol=0, atol=0.02)
     elif isinstance(result, PinholeCamera):
         assert math.isfinite(result.cx + result.cy + sum(result.distortion))
-        assert min(result.fx, result.fy, result.depth_scale, result.width, result.height) >= 1
+        assert min(result.fx, result.fy, result.width, result.height) >= 1
+        assert result.depth_scale is None or result.depth_scale >= 1
     elif isinstance(result, torch.Tensor):
         assert result.ndim == 3 and (result.dtype == torch.uint8 or bool((result >= 0).all()))

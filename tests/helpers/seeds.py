@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 from helpers.bags import DEPTH, INFO, RGB, Kind, MessageFactory
+from helpers.camera_files import FILES
 from helpers.parsers import CAMERA
 from v3d_torch.config import Config
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
@@ -83,6 +84,13 @@ def _image(file_format: str, mode: str) -> bytes:
     return file.getvalue()
 
 
+def _array(dtype: str) -> bytes:
+    """NumPy array of 8x6 pixels."""
+    file = BytesIO()
+    np.save(file, np.arange(48).reshape(6, 8).astype(dtype))
+    return file.getvalue()
+
+
 def _message(encoding: int, pixel: int) -> bytes:
     """Image of 8x6 pixels in the format of `image_message`."""
     return struct.pack("<BBHHH", encoding, 0, 8, 6, 8 * pixel) + bytes(range(48 * pixel))
@@ -134,13 +142,15 @@ SEEDS: dict[str, list[bytes]] = {
     "trajectory": [_POSES, b"1403636579763555584 0 0 0 0 0 0 1\n"],
     "matrix": [_POSE, b"525 0 319.5\n0 525 239.5\n0 0 1\n"],
     "pose": [_POSE, _POSE.replace(b"-inf", b"1")],
-    "camera.yaml": [_CAMERA],
+    "camera.yaml": [_CAMERA, *(text.encode() for text, _ in FILES.values())],
     "K.txt": [b"525 525 319.5 239.5 5000 640 480\n", b"525 0 319.5\n0 525 239.5\n0 0 1\n"],
     "configuration": [_YAML],
     "--set": [b"objects.voting.distance_threshold=0.1\nseed=3\nfeatures={count: 30}\n"],
     "colour file": _RASTERS,
     "JPEG file": _JPEGS,
     "depth file": _RASTERS,
+    "NumPy depth file": [_array(dtype) for dtype in ("float32", "uint16", ">f8")],
+    "POV-Ray depth file": [b"1.5 2.25 3e0\n4 5.125\n"],
     "colour in a message": _RASTERS,
     "depth in a message": _RASTERS,
     "colour message": [_message(i, COLOUR_ENCODINGS[encoding][0]) for i, encoding in enumerate(COLOUR_ENCODINGS)],

@@ -18,6 +18,8 @@ pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not insta
 CAMERAS = [
     PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48),
     PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=(0.45, -2.5, 0.0006, -0.0003, 1.4, 0.33, -2.3, 1.4)),
+    PinholeCamera(32.0, 32.0, 31.5, 23.5, 64, 48, distortion=(-0.01, 0.02), distortion_model="equidistant"),
 ]
 
 

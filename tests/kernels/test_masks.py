@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.distortion import DistortionModel
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 from v3d_torch.objects import mask_refiner, silhouette
@@ -68,9 +69,17 @@ def test_selected_pixels_equal_their_twin(step: int, first: tuple[int, int], inc
     assert torch.equal(found, expected)
 
 
-@pytest.mark.parametrize("distortion", [(), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)])
-def test_projected_cells_equal_their_twin(distortion: tuple[float, ...]) -> None:
-    camera = PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=(*distortion, *[0.0] * (5 - len(distortion))))
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [
+        ((), "plumb_bob"),
+        ((0.2624, -0.9531, -0.0054, 0.0026, 1.1633), "plumb_bob"),
+        ((0.45, -2.5, 0.0006, -0.0003, 1.4, 0.33, -2.3, 1.4), "rational_polynomial"),
+        ((-0.01, 0.02, -0.01, 0.002), "equidistant"),
+    ],
+)
+def test_projected_cells_equal_their_twin(distortion: tuple[float, ...], model: DistortionModel) -> None:
+    camera = PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=distortion, distortion_model=model)
     rng = np.random.default_rng(0)
     clouds = [torch.from_numpy(rng.normal(0, 2, (count, 3))) for count in (0, 1, 1000)]
     clouds.append(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [torch.nan, 0.0, 1.0]], dtype=torch.float64))

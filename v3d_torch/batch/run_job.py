@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import GroundTruthWarning, InputError, V3DError
+from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
 from v3d_torch.runs.log import log_to
@@ -41,6 +41,7 @@ def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
         with log_to(job.folder / "run.log", append=checkpoint is not None):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
+                warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run
                 sequence = load_sequence(job.source, data_root=job.data_root)
             if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
                 clear_earlier_results(job.folder)

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from v3d_torch.errors import GroundTruthWarning, V3DError
+from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, V3DError
 
 
 @contextmanager
@@ -15,7 +15,8 @@ def exit_on_error() -> Iterator[None]:
     """Print an error that the user can act on as one line on stderr, and exit with code 2."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", GroundTruthWarning)  # the commands report it after the results
+            for reported in (GroundTruthWarning, DepthScaleWarning):  # by the commands, as errors and notes
+                warnings.simplefilter("ignore", reported)
             yield
     except V3DError as error:
         print(f"error: {_printable(error)}", file=sys.stderr)

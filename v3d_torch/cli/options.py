@@ -14,7 +14,10 @@ DataRoot = Annotated[
 ]
 Camera = Annotated[
     str | None,
-    typer.Option(help="Camera, if the source does not describe it: camera.yaml, K.txt or a preset (tum_fr3)."),
+    typer.Option(
+        help="Camera, if the source does not describe it: a preset (tum_fr3), camera.yaml, K.txt, or a file of"
+        " ORB-SLAM, Kalibr or ROS."
+    ),
 ]
 RgbTopic = Annotated[str | None, typer.Option(help="Topic of the colour images in a bag [detected].")]
 DepthTopic = Annotated[str | None, typer.Option(help="Topic of the depth images in a bag [detected].")]

@@ -40,13 +40,14 @@ def main(
     from v3d_torch.datasets.stored import StoredSequence
     from v3d_torch.datasets.tum_writer import TUMWriter
     from v3d_torch.errors import InputError
-    from v3d_torch.runs.console import interrupts_between_frames
+    from v3d_torch.runs.console import interrupts_between_frames, print_assumptions
 
     console = Console(soft_wrap=True)
     with exit_on_error():
         with console.status(f"opening {seq}"):
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
+        print_assumptions(source, console)
         with interrupts_between_frames() as interrupted, TUMWriter(out, source.camera, source.groundtruth) as writer:
             for frame in track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal):
                 writer.add(frame)

@@ -21,7 +21,7 @@ from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
-from v3d_torch.runs.console import ProgressBar, progress_bars, run_with_progress
+from v3d_torch.runs.console import ProgressBar, print_assumptions, progress_bars, run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
@@ -124,6 +124,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if map_file is not None:
         check_writable(map_file)
     sequence = _open_sequence(request, console)
+    print_assumptions(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
         raise InputError(
             f"{request.seq}: has changed since the run in {checkpoint.folder} began ({change}); restore the sequence,"

@@ -17,7 +17,7 @@ from v3d_torch.config.validation import first_error
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.io.paths import StrPath, expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text import read_text, replace_odd_spaces
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""
@@ -97,7 +97,7 @@ def _validate(tree: Mapping[str, Any], source: str) -> Config:
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        tree = parse_yaml(read_text(path, "a configuration is a YAML file"))
+        tree = parse_yaml(replace_odd_spaces(read_text(path, "a configuration is a YAML file")))
     except InputError as error:
         raise ConfigError(str(error)) from error
     except ValueError as error:
@@ -110,7 +110,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
-    key, separator, text = override.partition("=")
+    key, separator, text = replace_odd_spaces(override).partition("=")
     if not separator or not key.strip():
         raise ConfigError(f"--set {override!r}: write section.key=value, such as objects.voting.vote_threshold=2")
     *sections, leaf = key.strip().split(".")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.locate import is_tum
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.geometry.camera import PinholeCamera
@@ -14,9 +14,14 @@ from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(
-    542.822841, 542.576870, 315.593520, 237.756098, distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0)
+    542.822841,
+    542.576870,
+    315.593520,
+    237.756098,
+    distortion=(0.039903, -0.099343, -0.000730, -0.000144, 0.0),
+    depth_scale=5000.0,
 )
-"""Published camera of the dataset, with 5000 depth units per metre."""
+"""Published camera of the dataset."""
 
 _T_ROS = torch.tensor(
     [[-1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]],
@@ -53,7 +58,7 @@ class BonnSequence(TUMSequence):
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
-        super().__init__(folder, choose_camera(camera, folder, CAMERA))
+        super().__init__(folder, camera, published=CAMERA)
         if self.groundtruth is not None:
             self.groundtruth = camera_poses(self.groundtruth)
 

@@ -1,22 +1,23 @@
-"""Camera parameters from files (``camera.yaml``, ``K.txt``) and presets of the package."""
+"""Choice of the camera of a sequence: camera files, presets of the package, published cameras."""
 
 from __future__ import annotations
 
 import difflib
 import os
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-
-from v3d_torch.config.validation import first_error
+from v3d_torch.datasets.camera_fields import camera_from_fields, check_distortion
+from v3d_torch.datasets.camera_formats import fields_from_numbers, fields_from_yaml
+from v3d_torch.datasets.sequence_names import canonical_name
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import expand_user
-from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.safe_yaml import parse_yaml, plain_yaml
 from v3d_torch.io.text import read_text
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
@@ -28,50 +29,47 @@ PRESETS: tuple[str, ...] = tuple(
 CameraChoice = str | Path | PinholeCamera | None
 """Camera chosen by the user: a camera, the name of a preset or a file; None for the camera of the sequence."""
 
-_Focal = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
-_Pixels = Annotated[int, Field(gt=0, le=1 << 13)]
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
+ImageSize = Callable[[], tuple[int, int]]
+"""Function that returns width and height of the images of a sequence."""
+
+_DEFAULT_SIZE = (PinholeCamera.width, PinholeCamera.height)
 
 
-class _CameraFile(BaseModel):
-    """Fields of a ``camera.yaml``. Fields whose default would be silently wrong for other cameras are required."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    fx: _Focal
-    fy: _Focal
-    cx: _Finite
-    cy: _Finite
-    width: _Pixels
-    height: _Pixels
-    distortion: tuple[_Finite, _Finite, _Finite, _Finite, _Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    depth_scale: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
-    readout: Annotated[float, Field(ge=-MAX_READOUT, le=MAX_READOUT)] | None = None
-
-
-def load_camera(path_or_name: str | Path) -> PinholeCamera:
+def load_camera(path_or_name: str | Path, image_size: ImageSize | None = None) -> PinholeCamera:
     """Load a camera from a file or a preset.
 
     Args:
         path_or_name: Name of a preset (`PRESETS`, such as ``tum_fr3``), or path of a file. A YAML file contains the
-            fields of `PinholeCamera` by name. Any other file contains numbers: ``fx fy cx cy depth_scale width
-            height``, or a 3x3 camera matrix of images with 640x480 pixels and 5000 depth units per metre.
+            fields of `PinholeCamera` by name, or is a camera file of ORB-SLAM2 or 3, Kalibr, ROS or OpenCV. Any other
+            file contains numbers: ``fx fy cx cy depth_scale width height``, or a 3x3 camera matrix.
+        image_size: Function that gives the size of the images for a file that does not state it; None for 640x480.
+
+    Returns:
+        The camera; its ``depth_scale`` is None if the file does not state it.
 
     Raises:
         InputError: If there is no such preset or file, or the file does not contain a valid camera.
     """
     if str(path_or_name) in PRESETS:
-        return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name))
+        return _from_yaml((_PRESETS / f"{path_or_name}.yaml").read_text(encoding="utf-8"), str(path_or_name), None)
     path = expand_user(path_or_name)
     if not path.is_file():
         similar = difflib.get_close_matches(str(path_or_name), PRESETS, n=1, cutoff=0.6)
         hint = f"did you mean {similar[0]}?" if similar else f"the presets are {', '.join(PRESETS)}"
         raise InputError(f"{path_or_name}: is not a camera file or preset; {hint}")
     text = read_text(path, "a camera is a YAML file or a K.txt")
-    return _from_yaml(text, str(path)) if path.suffix in (".yaml", ".yml") else _from_numbers(text, str(path))
+    parse = _from_yaml if path.suffix in (".yaml", ".yml") else _from_numbers
+    return parse(text, str(path), image_size)
 
 
-def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera | None = None) -> PinholeCamera:
+def choose_camera(
+    camera: CameraChoice,
+    folder: Path,
+    published: PinholeCamera | None = None,
+    *,
+    depth_scale: float | None = None,
+    image_size: ImageSize | None = None,
+) -> PinholeCamera:
     """Choose the camera of a sequence.
 
     The first one available is used: the user's choice, ``camera.yaml`` or ``K.txt`` in the folder, the published camera
@@ -81,98 +79,84 @@ def choose_camera(camera: CameraChoice, folder: Path, published: PinholeCamera |
         camera: Camera chosen by the user.
         folder: Folder of the sequence.
         published: Camera of the dataset, if all its sequences have the same.
+        depth_scale: Depth units per metre that the layout prescribes, for a camera that does not state them; None for
+            those of the published camera, or of the TUM benchmark if the folder is named like one of its sequences.
+        image_size: Function that gives the size of the images for a camera file that does not state it.
+
+    Returns:
+        The camera. Its ``depth_scale`` is None if neither the camera nor the dataset states it.
 
     Raises:
         InputError: If there is no camera, or the camera is invalid.
     """
+    preset = _tum_preset(folder)
     if isinstance(camera, PinholeCamera):
-        return camera
-    chosen = _find_camera(camera, folder, published)
-    if not _is_invertible_at_corners(chosen):
-        raise InputError(
-            f"{camera or folder}: the distortion {chosen.distortion} cannot be inverted at the image corners; correct"
-            " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
-        )
-    return chosen
+        chosen = camera
+    else:
+        chosen = _find_camera(camera, folder, published or preset, image_size)
+        check_distortion(chosen, camera or folder)
+    if chosen.depth_scale is not None:
+        return chosen
+    is_tum = canonical_name(folder.resolve().name) is not None
+    known = published or (preset if is_tum else None)
+    if depth_scale is None and known is not None:
+        depth_scale = known.depth_scale
+    return replace(chosen, depth_scale=depth_scale)
 
 
-def _find_camera(camera: str | Path | None, folder: Path, published: PinholeCamera | None) -> PinholeCamera:
+def _find_camera(
+    camera: str | Path | None, folder: Path, published: PinholeCamera | None, image_size: ImageSize | None
+) -> PinholeCamera:
     if camera is not None and not isinstance(camera, str | os.PathLike):
         raise InputError(f"camera is a {type(camera).__name__}; pass a PinholeCamera, the name of a preset or a file")
     if camera is not None:
-        return load_camera(camera)
+        return load_camera(camera, image_size)
     for name in ("camera.yaml", "K.txt"):
         if (folder / name).is_file():
-            return load_camera(folder / name)
+            return load_camera(folder / name, image_size)
     if published is not None:
         return published
-    if match := re.search(r"(?:freiburg|fr)_?([123])(?!\d)", folder.resolve().name.lower()):
-        return load_camera(f"tum_fr{match[1]}")
     raise InputError(
         f"{folder}: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height, depth_scale) or pass"
         f" --camera with a file or one of {', '.join(PRESETS)}"
     )
 
 
-def _from_yaml(text: str, source: str) -> PinholeCamera:
+def _tum_preset(folder: Path) -> PinholeCamera | None:
+    """Camera of a sequence of the TUM RGB-D benchmark, by the name of its folder; None for other names."""
+    match = re.search(r"(?:freiburg|fr)_?([123])(?!\d)", folder.resolve().name.lower())
+    return load_camera(f"tum_fr{match[1]}") if match else None
+
+
+def _from_yaml(text: str, source: str, image_size: ImageSize | None) -> PinholeCamera:
     try:
-        tree = parse_yaml(text)
+        tree = parse_yaml(plain_yaml(text))
     except ValueError as error:
         raise InputError(f"{source}: is not valid YAML ({error}); repair it") from error
     if not isinstance(tree, dict):
         raise InputError(
             f"{source}: does not contain a camera; write fx, fy, cx, cy, width, height, depth_scale as keys"
         )
-    return camera_from_fields(tree, source)
+    fields = fields_from_yaml(tree, source)
+    return camera_from_fields(tree, source) if fields is None else _complete(fields, source, image_size)
 
 
-def _from_numbers(text: str, source: str) -> PinholeCamera:
-    words = re.sub(r"#.*", "", text).replace(",", " ").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError as error:
+def _from_numbers(text: str, source: str, image_size: ImageSize | None) -> PinholeCamera:
+    return _complete(fields_from_numbers(text, source), source, image_size)
+
+
+def _complete(fields: dict[str, Any], source: str, image_size: ImageSize | None) -> PinholeCamera:
+    """Create a camera from fields that can lack the size of the images."""
+    if "width" in fields and "height" in fields:
+        return camera_from_fields(fields, source)
+    width, height = _DEFAULT_SIZE if image_size is None else image_size()
+    camera = camera_from_fields(fields | {"width": width, "height": height}, source)
+    if image_size is None:
+        return camera
+    # Images of another size than that of the calibration have another principal point.
+    if abs(camera.cx - width / 2) > width / 4 or abs(camera.cy - height / 2) > height / 4:
         raise InputError(
-            f"{source}: contains a value that is not a number ({error}); write fx fy cx cy depth_scale width height"
-        ) from error
-    if len(numbers) == 7:
-        fx, fy, cx, cy, depth_scale, width, height = numbers
-    elif len(numbers) == 9 and numbers[1] == numbers[3] == numbers[6] == numbers[7] == 0.0 and numbers[8] == 1.0:
-        fx, cx, fy, cy = numbers[0], numbers[2], numbers[4], numbers[5]
-        depth_scale, width, height = PinholeCamera.depth_scale, PinholeCamera.width, PinholeCamera.height
-    else:
-        raise InputError(
-            f"{source}: contains {len(numbers)} numbers that do not form a camera; write fx fy cx cy depth_scale width"
-            " height, or a 3x3 camera matrix without skew"
-        )
-    fields = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height, "depth_scale": depth_scale}
-    return camera_from_fields(fields, source)
-
-
-def camera_from_fields(fields: dict[Any, Any], source: str) -> PinholeCamera:
-    """Create a camera from unchecked fields.
-
-    Args:
-        fields: Fields of `PinholeCamera` by name.
-        source: Origin of the fields, for messages.
-
-    Raises:
-        InputError: If a field is missing, unknown or out of range.
-    """
-    try:
-        camera = PinholeCamera(**_CameraFile.model_validate(fields).model_dump())
-    except ValidationError as error:
-        raise InputError(f"{source}: {first_error(error)}; correct the camera") from error
-    if not (-camera.width <= camera.cx <= 2 * camera.width and -camera.height <= camera.cy <= 2 * camera.height):
-        raise InputError(
-            f"{source}: the principal point ({camera.cx:g}, {camera.cy:g}) is far outside the"
-            f" {camera.width}x{camera.height} image; correct cx and cy, or width and height"
+            f"{source}: the principal point ({camera.cx:g}, {camera.cy:g}) is far from the centre of the"
+            f" {width}x{height} images; give the camera of these images, not of a larger or smaller size"
         )
     return camera
-
-
-def _is_invertible_at_corners(camera: PinholeCamera) -> bool:
-    """Check whether undistortion inverts distortion at the image corners. Invalid coefficients fold rays back there."""
-    right, bottom = camera.width - 1.0, camera.height - 1.0
-    corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
-    projected = camera.distort(camera.undistort(corners))
-    return bool(((projected - corners).abs() < 1).all())

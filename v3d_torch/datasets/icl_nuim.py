@@ -1,20 +1,24 @@
-"""ICL-NUIM (Handa et al., ICRA 2014), in its "TUM RGB-D compatible" version with PNG images."""
+"""ICL-NUIM (Handa et al., ICRA 2014): its "TUM RGB-D compatible" version, and its original files from POV-Ray."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.image_files import pair_by_number
 from v3d_torch.datasets.lists import ImagePair, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.text import read_text
 from v3d_torch.types import Trajectory
 
-CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5, readout=0.0)
+CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5, depth_scale=5000.0, readout=0.0)
 """Published camera of the dataset, except for the sign of fy: the ray tracer's y axis points up (fy = -480), the y axis
 of the images points down. All rows of a rendered image have the same time, so the readout is 0."""
 
@@ -25,7 +29,11 @@ _FLIP_Y = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
 
 
 class ICLNUIMSequence(PairedImages):
-    """Sequence of ICL-NUIM, such as ``living_room_traj0_frei_png``: ``associations.txt`` and ``*.gt.freiburg``.
+    """Sequence of ICL-NUIM with ground truth in ``*.gt.freiburg``, in one of two layouts.
+
+    The TUM-compatible version, such as ``living_room_traj0_frei_png``, has ``associations.txt`` and depth along z as
+    16-bit PNG. The original files, such as ``living_room_traj0_loop``, are ``scene_00_0000.png`` and
+    ``scene_00_0000.depth``: a text with the distance along the ray of each pixel, metres. It is converted to depth.
 
     Args:
         folder: Folder of the sequence.
@@ -36,10 +44,7 @@ class ICLNUIMSequence(PairedImages):
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
-        pairs = [
-            ImagePair(pair.stamp / _RATE, pair.colour, pair.depth)
-            for pair in read_associations(folder / "associations.txt")
-        ]
+        self._is_original = _is_original(folder)
         groundtruth_files = sorted(folder.glob("*.gt.freiburg*"))
         if len(groundtruth_files) > 1:
             raise InputError(
@@ -48,15 +53,28 @@ class ICLNUIMSequence(PairedImages):
             )
         super().__init__(
             folder,
-            pairs,
-            choose_camera(camera, folder, CAMERA),
-            lambda: camera_poses(read_trajectory(groundtruth_files[0])),
+            _original_pairs(folder) if self._is_original else _listed_pairs(folder),
+            camera,
+            lambda: camera_poses(read_trajectory(groundtruth_files[0])) if groundtruth_files else None,
+            published=CAMERA,
         )
+
+    def _read_depth(self, index: int) -> NDArray[np.generic]:
+        if not self._is_original:
+            return super()._read_depth(index)
+        path = self._sources(index)[1]
+        width, height = self.camera.width, self.camera.height
+        distances = _read_numbers(path)
+        if distances.size != width * height:
+            raise InputError(
+                f"{path}: has {distances.size} numbers, expected {width}x{height}, one for each pixel; copy it again"
+            )
+        return distances.reshape(height, width) / self.camera.rays.norm(dim=-1).numpy()
 
 
 def is_icl_nuim(path: Path) -> bool:
     """Check whether a folder contains the files of an ICL-NUIM sequence."""
-    return (path / "associations.txt").is_file() and any(path.glob("*.gt.freiburg*"))
+    return _is_original(path) or ((path / "associations.txt").is_file() and any(path.glob("*.gt.freiburg*")))
 
 
 def camera_poses(published: Trajectory) -> Trajectory:
@@ -66,3 +84,27 @@ def camera_poses(published: Trajectory) -> Trajectory:
     result.
     """
     return Trajectory(published.stamps / _RATE, _FLIP_Y @ published.T_wc @ _FLIP_Y)
+
+
+def _is_original(folder: Path) -> bool:
+    return any(folder.glob("scene_*.depth"))
+
+
+def _original_pairs(folder: Path) -> list[ImagePair]:
+    """Pairs of the original files. The ground truth of frame n has the number n, as its files."""
+    return pair_by_number(folder, folder.glob("scene_*.png"), folder.glob("scene_*.depth"), _RATE)
+
+
+def _listed_pairs(folder: Path) -> list[ImagePair]:
+    return [
+        ImagePair(pair.stamp / _RATE, pair.colour, pair.depth)
+        for pair in read_associations(folder / "associations.txt")
+    ]
+
+
+def _read_numbers(path: Path) -> NDArray[np.float64]:
+    """Read a text of numbers."""
+    try:
+        return np.array(read_text(path, "it contains a distance for each pixel").split(), dtype=np.float64)
+    except ValueError as error:
+        raise InputError(f"{path}: contains a value that is not a number ({error}); copy it again") from error

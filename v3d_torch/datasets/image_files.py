@@ -6,11 +6,12 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from v3d_torch.datasets.depth_files import DEPTH_SUFFIXES
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import parse_timestamp
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"})
+SUFFIXES = DEPTH_SUFFIXES | {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp"}
 """Suffixes of image files, in lower case."""
 
 _PARTS = re.compile(r"(\D*)(\d*)")

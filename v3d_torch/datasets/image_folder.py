@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import list_images, stamp_in_name
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair
 from v3d_torch.datasets.paired_images import PairedImages
@@ -42,7 +42,7 @@ class ImageFolder(PairedImages):
             ImagePair(stamp, *(str(path.relative_to(folder)) for path in pair))
             for stamp, pair in sorted(dict(zip(stamps, files, strict=True)).items())
         ]
-        super().__init__(folder, pairs, choose_camera(camera, folder))
+        super().__init__(folder, pairs, camera)
 
 
 def is_image_folder(path: Path) -> bool:

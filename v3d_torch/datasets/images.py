@@ -1,11 +1,10 @@
-"""Decoding of colour and depth images to tensors."""
+"""Decoding of colour images, and of 16-bit and floating-point images for depth."""
 
 from __future__ import annotations
 
 import warnings
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,12 +18,9 @@ from v3d_torch.errors import InputError
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
 """Formats that Pillow is allowed to open: some of its other decoders start external programs."""
 
-_MAX_PIXELS = 1 << 26
+MAX_PIXELS = 1 << 26
 """Maximum number of pixels of an image, far more than any RGB-D camera has. The header of a small file can claim an
 image that fills the memory."""
-
-SATURATED_DEPTH = np.iinfo(np.uint16).max
-"""Largest 16-bit depth value. No camera measures this value, and some datasets write it for missing depth."""
 
 
 def read_colour(path: Path) -> Tensor:
@@ -49,25 +45,23 @@ def read_colour(path: Path) -> Tensor:
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
-def read_depth(path: Path, depth_scale: float) -> Tensor:
-    """Read a 16-bit depth image. PNG is decoded by kornia_rs, other formats by Pillow.
+def read_depth_image(path: Path) -> NDArray[np.generic]:
+    """Read a depth image. 16-bit PNG is decoded by kornia_rs, other formats by Pillow.
 
     Args:
-        path: Path of the image.
-        depth_scale: Depth units per metre.
+        path: Path of an image with 16 or 32 bits per pixel.
 
     Returns:
-        Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+        Whole numbers in units of the file, or metres in floating point, shape (H, W).
 
     Raises:
-        InputError: If the file is missing, truncated, not an image, too large, or not 16-bit.
+        InputError: If the file is missing, truncated, not an image, too large, or not a depth image.
     """
     image_size(path)
     try:
-        units = io.read_image_png_u16(str(path), "mono")[..., 0]
-    except Exception:
-        units = _decode_depth_with_pillow(path, path)
-    return depth_to_metres(units, depth_scale)
+        return io.read_image_png_u16(str(path), "mono")[..., 0]
+    except Exception:  # kornia_rs raises bare Exception for every cause: Pillow decodes the image or names the cause
+        return _decode_depth_with_pillow(path, path)
 
 
 def decode_colour(content: bytes, source: object) -> Tensor:
@@ -92,38 +86,19 @@ def decode_colour(content: bytes, source: object) -> Tensor:
 
 
 def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
-    """Decode a 16-bit depth image from the bytes of an image file.
+    """Decode a depth image from the bytes of an image file, like `read_depth_image`.
 
     Args:
         content: Bytes of the image file.
         source: Origin of the bytes, for messages.
 
     Returns:
-        Depth in units of the file, shape (H, W).
+        Whole numbers in units of the file, or metres in floating point, shape (H, W).
 
     Raises:
-        InputError: See `read_depth`.
+        InputError: See `read_depth_image`.
     """
     return _decode_depth_with_pillow(BytesIO(content), source)
-
-
-def depth_to_metres(units: NDArray[Any], depth_scale: float) -> Tensor:
-    """Convert depth units to metres.
-
-    Args:
-        units: Depth in units of the file, shape (H, W); negative and saturated values are no measurements.
-        depth_scale: Depth units per metre.
-
-    Returns:
-        Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-    """
-    invalid = units >= SATURATED_DEPTH
-    if units.dtype.kind != "u":
-        invalid |= units < 0
-    metres = np.divide(units, np.float32(depth_scale), dtype=np.float32, order="C")
-    if invalid.any():
-        metres[invalid] = 0
-    return torch.from_numpy(metres).unsqueeze(0)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -136,20 +111,26 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def is_depth(path: Path) -> bool:
+def is_depth_image(path: Path) -> bool:
     """Check whether a file is a single-channel image of more than 8 bits. Only the header is read."""
     try:
         with _read_header(path, path) as image:
-            return image.mode.startswith("I")
+            return _is_depth_mode(image.mode)
     except InputError:
         return False
 
 
+def _is_depth_mode(mode: str) -> bool:
+    """Check a mode of Pillow: I for whole numbers of 16 or 32 bits, F for 32-bit floating point."""
+    return mode.startswith("I") or mode == "F"
+
+
 def _decode_colour_with_pillow(file: Path | BytesIO, source: object) -> NDArray[np.uint8]:
     with _decode(file, source) as image:
-        if image.mode.startswith("I"):
+        if _is_depth_mode(image.mode):
+            kind = "floating-point" if image.mode == "F" else "16-bit"
             raise InputError(
-                f"{source}: is a 16-bit depth image, expected a colour image; check that colour and depth are not"
+                f"{source}: is a {kind} depth image, expected a colour image; check that colour and depth are not"
                 " swapped"
             )
         return np.array(image.convert("RGB"))
@@ -157,10 +138,8 @@ def _decode_colour_with_pillow(file: Path | BytesIO, source: object) -> NDArray[
 
 def _decode_depth_with_pillow(file: Path | BytesIO, source: object) -> NDArray[np.generic]:
     with _decode(file, source) as image:
-        if image.mode.startswith("I"):
+        if _is_depth_mode(image.mode):
             return np.array(image)
-        if image.mode == "F":
-            raise InputError(f"{source}: is a floating-point image; export depth as 16-bit PNG")
         if image.mode in ("L", "1", "P"):
             raise InputError(f"{source}: is an 8-bit image, depth needs 16 bits; export depth again without rescaling")
         raise InputError(
@@ -188,20 +167,32 @@ def _read_header(file: Path | BytesIO, source: object) -> Image.Image:
     except FileNotFoundError as error:
         raise InputError(f"{source}: is listed but does not exist; copy the whole sequence again") from error
     except UnidentifiedImageError as error:
+        if _is_tiff(file):
+            raise InputError(
+                f"{source}: is a TIFF image of an unsupported kind; export depth as 16-bit PNG, or as 32-bit"
+                " floating-point TIFF in metres"
+            ) from error
         raise InputError(f"{source}: is not a PNG, JPEG or TIFF image; copy or export it again") from error
     except Image.DecompressionBombError as error:
-        raise _too_large(source) from error
+        raise too_large_error(source) from error
     except Exception as error:  # an error of the file system, or any exception of a decoder on invalid data
         if isinstance(error, OSError) and error.errno is not None:
             raise InputError(f"{source}: cannot be read ({error.strerror}); check its permissions") from error
         raise InputError(f"{source}: is truncated or damaged; copy or download it again") from error
-    if image.width * image.height > _MAX_PIXELS:
+    if image.width * image.height > MAX_PIXELS:
         image.close()
-        raise _too_large(source)
+        raise too_large_error(source)
     return image
 
 
-def _too_large(source: object) -> InputError:
+def _is_tiff(file: Path | BytesIO) -> bool:
+    """Check the first bytes of a file."""
+    content = file.getvalue() if isinstance(file, BytesIO) else file.read_bytes()
+    return content.startswith((b"II*\0", b"MM\0*"))
+
+
+def too_large_error(source: object) -> InputError:
+    """Return the error for an image whose header claims more than `MAX_PIXELS`."""
     return InputError(
-        f"{source}: has more than {_MAX_PIXELS >> 20} million pixels according to its header; copy or export it again"
+        f"{source}: has more than {MAX_PIXELS >> 20} million pixels according to its header; copy or export it again"
     )

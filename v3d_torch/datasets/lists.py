@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import TypeVar
 
-from v3d_torch.datasets.images import is_depth
+from v3d_torch.datasets.depth_files import is_depth_file
 from v3d_torch.errors import InputError
-from v3d_torch.io.text import numbered_lines
+from v3d_torch.io.text import numbered_lines, replace_odd_spaces
 from v3d_torch.io.timestamps import associate, parse_timestamp
 
 _T = TypeVar("_T")
@@ -68,7 +69,7 @@ def read_image_list(path: Path) -> list[tuple[float, str]]:
             raise InputError(
                 f"{path}: line {number} is {line[:80]!r}, expected a timestamp and a file name; correct or remove it"
             )
-        entries.append((_parse_stamp(match[1], path, number), match[2]))
+        entries.append((_parse_stamp(match[1], path, number), _find_file(path.parent, match[2])))
     return _sort_unique(entries, path)
 
 
@@ -100,9 +101,10 @@ def read_associations(path: Path) -> list[ImagePair]:
                 " remove this list and use rgb.txt and depth.txt"
             )
         first, second = words[0][0], words[middle][0]
-        names = (line[words[1].start() : words[middle - 1].end()], line[words[middle + 1].start() :])
+        listed = (line[words[1].start() : words[middle - 1].end()], line[words[middle + 1].start() :])
+        names = [_find_file(path.parent, name) for name in listed]
         rows.append((_parse_stamp(first, path, number), names[0], _parse_stamp(second, path, number), names[1]))
-    if rows and is_depth(path.parent / rows[0][1]) and not is_depth(path.parent / rows[0][3]):
+    if rows and is_depth_file(path.parent / rows[0][1]) and not is_depth_file(path.parent / rows[0][3]):
         rows = [(stamp, colour, depth_stamp, depth) for depth_stamp, depth, stamp, colour in rows]
     ordered = _sort_unique(
         ((stamp, (colour, depth, depth_stamp)) for stamp, colour, depth_stamp, depth in rows),
@@ -160,12 +162,29 @@ def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
 
 def _is_second_stamp(previous: str, word: str) -> bool:
     """Check whether a word is the timestamp between two file names."""
-    return re.fullmatch(r"[-+\d.e]+", word) is not None and re.search(r"\.\w+$", previous) is not None
+    is_number = re.fullmatch(r"[-+\d.e]+", replace_odd_spaces(word)) is not None
+    return is_number and re.search(r"\.\w+$", replace_odd_spaces(previous)) is not None
+
+
+def _find_file(folder: Path, name: str) -> str:
+    """Return the name of a listed file, as it exists: with slashes for the backslashes of Windows, with plain spaces.
+
+    Args:
+        folder: Folder of the list.
+        name: Name in the list; it stays unchanged if the file exists, or if no variant of the name exists.
+    """
+    variants = dict.fromkeys((name, name.replace("\\", "/"), replace_odd_spaces(name).strip()))
+    variants[replace_odd_spaces(name).strip().replace("\\", "/")] = None
+    if len(variants) == 1:
+        return name
+    with suppress(OSError, ValueError):  # such as a name that is too long; reported when the images are looked up
+        return next((variant for variant in variants if (folder / variant).is_file()), name)
+    return name
 
 
 def _parse_stamp(word: str, path: Path, number: int) -> float:
     try:
-        stamp = parse_timestamp(word)
+        stamp = parse_timestamp(replace_odd_spaces(word))
     except ValueError:
         stamp = math.nan
     if not math.isfinite(stamp):

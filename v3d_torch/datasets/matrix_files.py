@@ -13,15 +13,12 @@ from numpy.typing import NDArray
 
 from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE
 from v3d_torch.errors import InputError
-from v3d_torch.io.safe_yaml import parse_yaml
-from v3d_torch.io.text import numbered_lines, read_text
+from v3d_torch.io.safe_yaml import parse_yaml, plain_yaml
+from v3d_torch.io.text import numbered_lines, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
 
 _ROTATION_TOLERANCE = 0.01
 """Maximum deviation of an element of R R^T from the identity: files with few digits round their rotations."""
-
-_OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
-"""First line and matrix tag of OpenCV's files. Neither is valid YAML, so both are removed before parsing."""
 
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
@@ -36,7 +33,10 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file cannot be read or does not contain such a matrix.
     """
-    rows = [line.replace(",", " ").split() for _, line in numbered_lines(path, "a matrix has a line per row")]
+    rows = [
+        replace_odd_spaces(line).replace(",", " ").split()
+        for _, line in numbered_lines(path, "a matrix has a line per row")
+    ]
     try:
         matrix = np.array(rows, dtype=np.float64)
     except ValueError:
@@ -79,9 +79,7 @@ def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
 
 
 def read_opencv_yaml(path: Path) -> Any:
-    """Read a YAML file written by OpenCV.
-
-    Standard YAML parsers reject OpenCV's dialect, and OpenCV's own parser is not robust against damaged files.
+    """Read a YAML file written by OpenCV, see `plain_yaml`.
 
     Args:
         path: Path of the file.
@@ -94,7 +92,7 @@ def read_opencv_yaml(path: Path) -> Any:
     """
     text = read_text(path, "it contains YAML written by OpenCV")
     try:
-        return parse_yaml(text.removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, ""))
+        return parse_yaml(plain_yaml(text))
     except ValueError as error:
         raise InputError(f"{path}: is not valid OpenCV YAML ({error}); copy it again") from error
 

@@ -8,12 +8,13 @@ from pathlib import Path
 
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
 from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.locate import find_or_download
 from v3d_torch.datasets.realsense import open_realsense_camera
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
-from v3d_torch.errors import GroundTruthWarning, InputError
+from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError
 from v3d_torch.io.download import Progress, cache_dir
 from v3d_torch.io.paths import StrPath, expand_user
 
@@ -55,9 +56,10 @@ def open_source(
 
     Warns:
         GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
+        DepthScaleWarning: If the depth scale is not stated, and was estimated from the images.
     """
     source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
-    _warn_about_groundtruth(source)
+    _warn(source)
     return source
 
 
@@ -86,7 +88,7 @@ def load_sequence(
             f"{name}: is a stream, whose frames cannot be indexed; record it first with"
             f" v3d-torch record --seq {name} --out FOLDER"
         )
-    _warn_about_groundtruth(source)
+    _warn(source)
     return source
 
 
@@ -129,12 +131,14 @@ def _open_by_name(
         return open_realsense_camera(name, camera, fps=options.fps)
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)
     source = open_path(path, camera, options, progress)
-    if isinstance(source, StoredSequence):
+    if isinstance(source, ImageSequence):
         source.check_first_frame(path)
     return source
 
 
-def _warn_about_groundtruth(source: RGBDStream) -> None:
-    """Warn, at the line that called this module, if the ground truth of a source could not be read."""
+def _warn(source: RGBDStream) -> None:
+    """Warn, at the line that called this module, about what a source does not state or cannot be read from it."""
     if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
         warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)
+    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
+        warnings.warn(f"{source.name}: {source.depth_scale_note}", DepthScaleWarning, stacklevel=3)

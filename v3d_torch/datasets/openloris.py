@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
+from v3d_torch.datasets.camera_fields import camera_from_fields
+from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.lists import pair_lists
 from v3d_torch.datasets.matrix_files import opencv_matrix, read_opencv_yaml
 from v3d_torch.datasets.paired_images import PairedImages
@@ -42,8 +43,10 @@ class OpenLORISSequence(PairedImages):
         super().__init__(
             folder,
             pairs,
-            choose_camera(camera, folder, published),
+            camera,
             lambda: _camera_poses(groundtruth, folder / "trans_matrix.yaml") if groundtruth.is_file() else None,
+            published=published,
+            depth_scale=_DEPTH_SCALE,
         )
 
 
@@ -63,7 +66,7 @@ def _read_camera(path: Path) -> PinholeCamera:
         raise InputError(
             f"{path}: has no {_COLOUR} with width, height and intrinsics; copy it again, or pass --camera"
         ) from error
-    fields |= {"distortion": distortion + [0.0] * (5 - len(distortion)), "depth_scale": _DEPTH_SCALE}
+    fields |= {"distortion": distortion, "distortion_model": "plumb_bob", "depth_scale": _DEPTH_SCALE}
     return camera_from_fields(fields, str(path))
 
 

@@ -4,55 +4,85 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.images import read_colour, read_depth
+from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.depth_files import read_depth_file
+from v3d_torch.datasets.image_sequence import ImageSequence
+from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
-from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence
+from v3d_torch.datasets.stored import ReadGroundTruth
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 
-class PairedImages(StoredSequence):
+class PairedImages(ImageSequence):
     """Sequence of paired colour and depth image files.
 
     Args:
         folder: Folder of the sequence.
         pairs: Image files of the frames, in temporal order.
-        camera: Camera of all frames.
+        camera: Camera chosen by the user; None for the camera of the folder or the layout (`choose_camera`).
         groundtruth: Function that reads the measured poses of the camera.
+        published: Camera of all sequences of the layout; None if they have different ones.
+        depth_scale: Depth units per metre that the layout prescribes; None if it prescribes none.
         name: Name used in tables; None for the folder's name.
 
     Raises:
-        InputError: If an image file is missing.
+        InputError: If an image file is missing, there is no camera, or the unit of depth is neither stated nor told by
+            the images.
     """
 
     def __init__(
         self,
         folder: Path,
         pairs: list[ImagePair],
-        camera: PinholeCamera,
+        camera: CameraChoice,
         groundtruth: ReadGroundTruth | None = None,
         *,
+        published: PinholeCamera | None = None,
+        depth_scale: float | None = None,
         name: str | None = None,
     ) -> None:
+        chosen = choose_camera(
+            camera,
+            folder,
+            published,
+            depth_scale=depth_scale,
+            image_size=lambda: self._image_size(folder, pairs[0]),
+        )
         missing = [file for pair in pairs for file in (pair.colour, pair.depth) if not (folder / file).is_file()]
         if missing:
             raise InputError(
                 f"{folder / missing[0]}: is listed but does not exist ({len(missing)} missing in total);"
-                " copy the whole sequence again"
+                f" {_explain_missing(missing[0])}"
             )
         stamps, delays = [pair.stamp for pair in pairs], [pair.depth_delay for pair in pairs]
-        super().__init__(name or folder.resolve().name, stamps, camera, groundtruth, delays)
+        super().__init__(name or folder.resolve().name, stamps, chosen, groundtruth, delays)
         self.folder = folder
         self._pairs = pairs
+        self._settle_depth_scale(folder)
 
-    def _read(self, index: int) -> tuple[Tensor, Tensor]:
-        colour, depth = (self.folder / file for file in (self._pairs[index].colour, self._pairs[index].depth))
-        return self._check_registered(
-            (colour, self._read_colour(colour)), (depth, read_depth(depth, self.camera.depth_scale))
-        )
+    @staticmethod
+    def _image_size(folder: Path, pair: ImagePair) -> tuple[int, int]:
+        """Width and height of the images of the camera, given the files of a frame."""
+        return image_size(folder / pair.colour)
 
-    def _read_colour(self, path: Path) -> Tensor:
-        """Read the colour image of a frame; a subclass can also warp the image to the depth camera."""
-        return read_colour(path)
+    def _sources(self, index: int) -> tuple[Path, Path]:
+        pair = self._pairs[index]
+        return self.folder / pair.colour, self.folder / pair.depth
+
+    def _read_colour(self, index: int) -> Tensor:
+        return read_colour(self._sources(index)[0])
+
+    def _read_depth(self, index: int) -> NDArray[np.generic]:
+        return read_depth_file(self._sources(index)[1])
+
+
+def _explain_missing(name: str) -> str:
+    """Return what to do about a file in a list that does not exist."""
+    if "\\" in name:
+        return "the list has Windows paths; write them relative to its folder, such as rgb/1.png"
+    return "copy the whole sequence again"

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
+from v3d_torch.datasets.camera_fields import camera_from_fields
+from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
-from v3d_torch.datasets.images import image_size, read_colour
+from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.paired_images import PairedImages
@@ -50,16 +51,22 @@ class ScanNetSequence(PairedImages):
         super().__init__(
             frames,
             pairs,
-            choose_camera(camera, frames, published),
+            camera,
             lambda: read_poses({stamp: pose_files[number] for number, stamp in stamps.items() if number in pose_files}),
+            published=published,
+            depth_scale=_DEPTH_SCALE,
             name=folder.resolve().name,
         )
         colour = _intrinsics_file(frames, "color")
         self._K_colour = _read_camera_matrix(colour)[:3, :3] if colour is not None else None
 
-    def _read_colour(self, path: Path) -> Tensor:
+    @staticmethod
+    def _image_size(folder: Path, pair: ImagePair) -> tuple[int, int]:
+        return image_size(folder / pair.depth)
+
+    def _read_colour(self, index: int) -> Tensor:
         """Read a colour image and warp it to the depth camera."""
-        colour = read_colour(path)
+        colour = super()._read_colour(index)
         height, width = colour.shape[1:]
         size = (self.camera.width, self.camera.height)
         if (width, height) == size:

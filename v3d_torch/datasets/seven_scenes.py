@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import pair_by_number
 from v3d_torch.datasets.matrix_files import read_poses
 from v3d_torch.datasets.paired_images import PairedImages
@@ -35,8 +35,9 @@ class SevenScenesSequence(PairedImages):
         super().__init__(
             folder,
             pairs,
-            choose_camera(camera, folder, CAMERA),
+            camera,
             lambda: read_poses({stamp: path for stamp, path in pose_files.items() if path.is_file()}),
+            published=CAMERA,
             name="/".join(folder.resolve().parts[-2:]),
         )
 

@@ -20,10 +20,6 @@ _T = TypeVar("_T")
 ReadGroundTruth = Callable[[], Trajectory | None]
 """Function that reads the ground truth; it returns None if the sequence has none."""
 
-_MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
-"""Plausible range for the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
-wrong depth scale falls outside of it."""
-
 
 class StoredSequence(ABC):
     """Base class of every `RGBDSequence` with stored frames. A subclass reads the images of a frame.
@@ -101,48 +97,9 @@ class StoredSequence(ABC):
             gravity=self.gravity if index == 0 else None,
         )
 
-    def check_first_frame(self, source: object) -> None:
-        """Decode the first frame, so that an error common to all frames is reported before anything is computed.
-
-        Args:
-            source: Path of the sequence, for messages.
-
-        Raises:
-            InputError: If the frame cannot be decoded or its median depth is implausible.
-        """
-        depth = self._read(0)[1]
-        median = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
-        if not _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
-            raise InputError(
-                f"{source}: the median depth of the first frame is {median:.2g} m at {self.camera.depth_scale:g} units"
-                " per metre; correct the camera's depth_scale (1000 if depth is in millimetres) or the depth images"
-            )
-
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         """Read the colour and depth image of an existing frame, in the format of `RGBDFrame`."""
-
-    def _check_registered(
-        self,
-        colour: tuple[object, Tensor],
-        depth: tuple[object, Tensor],
-        fix: str = "export depth that is registered to the colour image",
-    ) -> tuple[Tensor, Tensor]:
-        """Return both images (C, H, W), given with their sources, if they have the same size as the camera."""
-        depth_size, colour_size = (f"{image.shape[2]}x{image.shape[1]}" for _, image in (depth, colour))
-        if depth_size != colour_size:
-            raise InputError(f"{depth[0]}: has {depth_size} pixels, but its colour image has {colour_size}; {fix}")
-        return self._check_size(*colour), depth[1]
-
-    def _check_size(self, source: object, image: Tensor) -> Tensor:
-        """Return the image (C, H, W) read from ``source`` if it has the camera's size."""
-        height, width = image.shape[1:]
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise InputError(
-                f"{source}: has {width}x{height} pixels, but the camera has {self.camera.width}x{self.camera.height};"
-                " pass the camera of these images with --camera"
-            )
-        return image
 
 
 class Cursor(Generic[_T]):

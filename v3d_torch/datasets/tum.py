@@ -8,13 +8,14 @@ import torch
 from kornia_rs import io
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.sequence_names import short_name
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
 
 
 class TUMSequence(PairedImages):
@@ -26,13 +27,21 @@ class TUMSequence(PairedImages):
     Args:
         folder: Folder of the sequence.
         camera: A camera, the name of a preset or a camera file; None for the camera of the folder (`choose_camera`).
+        published: Camera of all sequences of a data set in this layout; None for the TUM RGB-D benchmark.
         name: Name used in tables; None to derive it from the folder's name.
 
     Raises:
         InputError: If the folder or one of its files is missing or invalid.
     """
 
-    def __init__(self, folder: Path, camera: CameraChoice = None, *, name: str | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        camera: CameraChoice = None,
+        *,
+        published: PinholeCamera | None = None,
+        name: str | None = None,
+    ) -> None:
         if not folder.is_dir():
             cause = "is not a folder" if folder.exists() else "does not exist"
             raise InputError(f"{folder}: {cause}; pass a folder with rgb.txt and depth.txt")
@@ -42,8 +51,9 @@ class TUMSequence(PairedImages):
         super().__init__(
             folder,
             pairs,
-            choose_camera(camera, folder),
+            camera,
             lambda: read_trajectory(groundtruth) if groundtruth.is_file() else None,
+            published=published,
             name=short_name(folder.resolve().name) if name is None else name,
         )
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import StrPath
-from v3d_torch.io.text import numbered_lines
+from v3d_torch.io.text import numbered_lines, replace_odd_spaces
 from v3d_torch.io.timestamps import parse_timestamp
 from v3d_torch.types import Trajectory
 
@@ -100,7 +100,7 @@ def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
     """Parse a file to line numbers, counted from 1, and the eight columns of each line, shape (N, 8)."""
     line_numbers, poses = [], []
     for number, line in numbered_lines(path, f"a trajectory has lines of {_COLUMNS}"):
-        words = line.replace(",", " ").split()
+        words = replace_odd_spaces(line).replace(",", " ").split()
         try:
             pose = [parse_timestamp(word) for word in words[:1]] + [float(word) for word in words[1:]]
         except ValueError:

@@ -11,12 +11,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from v3d_torch.datasets.images import SATURATED_DEPTH
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import SATURATED_DEPTH
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.types import RGBDFrame, Trajectory
+
+_DEPTH_SCALE = 5000.0
+"""Depth scale of the TUM benchmark, units per metre."""
 
 
 class TUMWriter:
@@ -26,7 +29,8 @@ class TUMWriter:
 
     Args:
         folder: Folder of the sequence, new or empty.
-        camera: Camera of the frames, written to ``camera.yaml``; its depth scale is the unit of the depth images.
+        camera: Camera of the frames, written to ``camera.yaml``; its depth scale is the unit of the depth images, or
+            5000 units per metre, as in the TUM benchmark, if it has none.
         groundtruth: Measured poses of the camera, written to ``groundtruth.txt``; None for no such file.
 
     Raises:
@@ -37,9 +41,9 @@ class TUMWriter:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")
         self.folder = folder
-        self.camera = camera
+        self._depth_scale = _DEPTH_SCALE if camera.depth_scale is None else camera.depth_scale
         self._written: list[tuple[str, str]] = []
-        fields = asdict(camera) | {"distortion": list(camera.distortion)}
+        fields = asdict(camera) | {"distortion": list(camera.distortion), "depth_scale": self._depth_scale}
         write_text(folder / "camera.yaml", yaml.safe_dump(fields, sort_keys=False))
         if groundtruth is not None:
             write_trajectory(folder / "groundtruth.txt", groundtruth)
@@ -65,7 +69,7 @@ class TUMWriter:
     def add(self, frame: RGBDFrame) -> None:
         """Write the images of a frame. Depth beyond the 16-bit range is written as 0, no measurement."""
         stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
-        units = np.rint(frame.depth[0].numpy() * self.camera.depth_scale)
+        units = np.rint(frame.depth[0].numpy() * self._depth_scale)
         units[units >= SATURATED_DEPTH] = 0
         colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
         _save(self.folder / "rgb" / f"{stamps[0]}.png", colour)

@@ -11,12 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.images import depth_to_metres
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
-from v3d_torch.datasets.stored import Cursor, StoredSequence
+from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
 from v3d_torch.io.timestamps import associate
@@ -31,10 +32,13 @@ _MIN_DECODED_FRACTION = 0.9
 The stated duration is approximate: OpenCV estimates the number of frames if the file does not store it.
 """
 
+_SAMPLED_FRAMES = 64
+"""Number of frames from which an unknown depth scale is estimated; all frames before a sampled one are decoded."""
+
 _SUFFIXES = frozenset({".mkv", ".mp4", ".avi", ".mov", ".webm", ".m4v"})
 
 
-class VideoSequence(StoredSequence):
+class VideoSequence(ImageSequence):
     """RGB-D frames of a colour video and a depth video, paired by their timestamps.
 
     Depth needs lossless 16-bit video, such as FFV1 in an ``.mkv`` or ``.avi`` (``ffmpeg -c:v ffv1 -pix_fmt
@@ -59,7 +63,7 @@ class VideoSequence(StoredSequence):
         progress: Progress | None = None,
     ) -> None:
         self._colour_path, self._depth_path = colour_path, depth_path = _find_pair(path)
-        chosen = choose_camera(camera, colour_path.parent)
+        chosen = choose_camera(camera, colour_path.parent, image_size=lambda: _frame_size(depth_path))
         stamps, colour_truncation = _read_stamps(colour_path, fps, progress)
         depth_stamps, depth_truncation = _read_stamps(depth_path, fps, is_depth=True)
         self._truncation = colour_truncation or depth_truncation
@@ -72,6 +76,7 @@ class VideoSequence(StoredSequence):
         super().__init__(path.resolve().stem, [stamps[i] for i, _ in self._pairs], chosen)
         self._colour_frames = Cursor(lambda: _open_frames(colour_path))
         self._depth_frames = Cursor(lambda: _open_frames(depth_path, is_depth=True))
+        self._settle_depth_scale(path, _SAMPLED_FRAMES)
 
     def frames_from(self, index: int) -> Iterator[RGBDFrame]:
         """Read the frames from ``index`` on, see `StoredSequence.frames_from`.
@@ -83,12 +88,15 @@ class VideoSequence(StoredSequence):
         if self._truncation is not None:
             raise InputError(self._truncation)
 
-    def _read(self, index: int) -> tuple[Tensor, Tensor]:
-        i, j = self._pairs[index]
-        pixels, units = self._colour_frames[i].retrieve()[1], self._depth_frames[j].retrieve()[1]
-        image = torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
-        depth = depth_to_metres(units.squeeze(), self.camera.depth_scale)
-        return self._check_registered((self._colour_path, image), (self._depth_path, depth))
+    def _sources(self, index: int) -> tuple[Path, Path]:
+        return self._colour_path, self._depth_path
+
+    def _read_colour(self, index: int) -> Tensor:
+        pixels = self._colour_frames[self._pairs[index][0]].retrieve()[1]
+        return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
+
+    def _read_depth(self, index: int) -> NDArray[np.generic]:
+        return self._depth_frames[self._pairs[index][1]].retrieve()[1].squeeze()
 
 
 def is_video(path: Path) -> bool:
@@ -123,6 +131,19 @@ def _find_pair(path: Path) -> tuple[Path, Path]:
     return colour[0], depth[0]
 
 
+def _frame_size(path: Path) -> tuple[int, int]:
+    """Width and height of a depth video."""
+    capture = next(_open_frames(path, is_depth=True), None)
+    if capture is None:
+        raise _undecodable_error(path)
+    height, width = capture.retrieve()[1].shape[:2]
+    return width, height
+
+
+def _undecodable_error(path: Path) -> InputError:
+    return InputError(f"{path}: cannot be decoded as a video; copy it again, or convert it with ffmpeg")
+
+
 def _read_stamps(
     path: Path, fps: float | None, progress: Progress | None = None, *, is_depth: bool = False
 ) -> tuple[list[float], str | None]:
@@ -142,7 +163,7 @@ def _read_stamps(
         if progress is not None:
             progress(index + 1, max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), index + 1))
     if not stamps:
-        raise InputError(f"{path}: cannot be decoded as a video; copy it again, or convert it with ffmpeg")
+        raise _undecodable_error(path)
     if any(later <= earlier for earlier, later in pairwise(stamps)):
         raise InputError(f"{path}: its timestamps do not increase; pass the frame rate with --fps")
     if position < _MIN_DECODED_FRACTION * duration:

@@ -87,8 +87,9 @@ class ProjectionMatcher:
         self._camera = camera
         # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower ones are inclusive.
         margin = self._LEVEL_MARGIN
-        lower = [MIN_DEPTH, 0.0, 0.0, self._MIN_COSINE, -margin]
-        upper = [math.inf, camera.width, camera.height, math.inf, pyramid.levels - 1 + margin]
+        u_min, v_min, u_max, v_max = camera.undistorted_bounds
+        lower = [MIN_DEPTH, u_min, v_min, self._MIN_COSINE, -margin]
+        upper = [math.inf, u_max, v_max, math.inf, pyramid.levels - 1 + margin]
         self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
 
     def __call__(

@@ -5,22 +5,31 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import cast
 
-import cv2
-import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.distortion import (
+    DistortionModel,
+    complete_distortion,
+    distort,
+    kernel_coefficients,
+    undistort_pixels,
+)
 from v3d_torch.kernels.camera import Bounds, Intrinsics
 
 MAX_READOUT = 0.05
 """Longest accepted readout, seconds: no RGB-D camera takes longer to read the rows of an image."""
 
-# The corners of an image with strong lens distortion take about 20 steps. The tolerance is in pixels.
-_UNDISTORT_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
+NEGATIVE_FY = (
+    "a negative fy, as published with ICL-NUIM, means that y points up; in images y points down, so give its absolute"
+    " value, and mirror the y axis of the ground truth"
+)
+"""Explanation of a negative focal length along v."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +47,15 @@ class PinholeCamera:
         cy: Principal point along v, pixels.
         width: Number of image columns.
         height: Number of image rows.
-        distortion: Coefficients k1, k2, p1, p2, k3 of the Brown-Conrady model in OpenCV's order. An array of four or
-            five coefficients, as OpenCV returns it, is accepted.
-        depth_scale: Units of the depth image per metre (TUM: 5000).
+        distortion: Coefficients of the distortion model in OpenCV's order, see `COEFFICIENTS`. An array as OpenCV
+            returns it, with four, five or eight coefficients, is accepted.
+        depth_scale: Units per metre of depth images with whole numbers (TUM: 5000, millimetres: 1000); None if it is
+            not known. Depth images in floating point are in metres and need no depth scale.
         readout: Time from the first to the last row of a colour image, seconds. 0 for a global shutter, negative if the
             rows are read from the bottom up, None if unknown; an unknown readout is calibrated while mapping.
+        distortion_model: Name of the distortion model in ROS: ``plumb_bob`` (Brown-Conrady), ``rational_polynomial``
+            (eight coefficients) or ``equidistant`` (fisheye, Kannala-Brandt). As in OpenCV, the number of coefficients
+            distinguishes the first two.
 
     Raises:
         InputError: If a value is not a finite number in its range. Focal lengths are positive: a negative ``fy``, as
@@ -55,26 +68,29 @@ class PinholeCamera:
     cy: float
     width: int = 640
     height: int = 480
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    depth_scale: float = 5000.0
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_scale: float | None = None
     readout: float | None = None
+    distortion_model: DistortionModel = "plumb_bob"
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "width", "height", "depth_scale"):
             given = getattr(self, name)
+            if name == "depth_scale" and given is None:
+                continue
             value = to_float(given)
             if not math.isfinite(value) or (value <= 0 and name not in ("cx", "cy")):
                 above = "" if name in ("cx", "cy") else " above 0"
-                raise InputError(f"the camera's {name} is {given!r}; give a finite number{above}")
+                hint = f" ({NEGATIVE_FY})" if name == "fy" and value < 0 else ""
+                raise InputError(f"the camera's {name} is {given!r}; give a finite number{above}{hint}")
             if name in ("width", "height"):
                 if value % 1:
                     raise InputError(f"the camera's {name} is {given!r}; give whole pixels")
                 value = int(value)
             object.__setattr__(self, name, value)
-        coefficients = [to_float(value) for value in np.ravel(self.distortion)]
-        if not all(map(math.isfinite, coefficients)):
-            raise InputError(f"the camera's distortion is {self.distortion!r}; give the numbers k1, k2, p1, p2, k3")
-        object.__setattr__(self, "distortion", (*coefficients, *[0.0] * (5 - len(coefficients))))
+        distortion, model = complete_distortion(self.distortion, self.distortion_model)
+        object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "distortion_model", model)
         if self.readout is not None:
             readout = to_float(self.readout)
             if not abs(readout) <= MAX_READOUT:
@@ -108,7 +124,8 @@ class PinholeCamera:
     @cached_property
     def intrinsics(self) -> Intrinsics:
         """Focal lengths, principal point and distortion coefficients as numbers, for kernels."""
-        return (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        coefficients = kernel_coefficients(self.distortion_model, self.distortion)
+        return cast("Intrinsics", (self.fx, self.fy, self.cx, self.cy, *coefficients))
 
     @cached_property
     def bounds(self) -> Bounds:
@@ -118,8 +135,8 @@ class PinholeCamera:
 
     @property
     def is_distorted(self) -> bool:
-        """True if any distortion coefficient is not 0."""
-        return any(self.distortion)
+        """True if undistorted and distorted pixels differ: a distortion coefficient is not 0, or the lens a fisheye."""
+        return self.distortion_model == "equidistant" or any(self.distortion)
 
     def undistort(self, uv: Tensor) -> Tensor:
         """Map distorted pixels to undistorted pixels.
@@ -133,9 +150,7 @@ class PinholeCamera:
         uv = uv.to(torch.float64)
         if not self.is_distorted or uv.shape[0] == 0:
             return uv
-        K, coefficients = self.K.numpy(), np.array(self.distortion)
-        pixels = cv2.undistortImagePoints(uv.numpy(), K, coefficients, None, _UNDISTORT_CRITERIA)
-        return torch.from_numpy(pixels).view_as(uv)
+        return undistort_pixels(uv, self.K, self.distortion_model, self.distortion)
 
     def distort(self, uv: Tensor) -> Tensor:
         """Map undistorted pixels to distorted pixels; the inverse of `undistort`.
@@ -160,13 +175,9 @@ class PinholeCamera:
         return (uv.to(torch.float64) - self._principal_point) / self.focal_lengths
 
     def _project_normalised(self, xy: Tensor) -> Tensor:
-        """Distorted pixels at normalised image coordinates, by the Brown-Conrady model, both (N, 2) and float64."""
+        """Distorted pixels at normalised image coordinates, both (N, 2) and float64."""
         if self.is_distorted:
-            k1, k2, p1, p2, k3 = self.distortion
-            tangential = xy.new_tensor([p2, p1])
-            r2 = xy.square().sum(dim=1, keepdim=True)
-            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            xy = xy * (radial + 2 * (xy @ tangential)[:, None]) + r2 * tangential
+            xy = distort(xy, self.distortion_model, self.distortion)
         return xy * self.focal_lengths + self._principal_point
 
     def project(self, points: Tensor) -> Tensor:
@@ -188,6 +199,17 @@ class PinholeCamera:
         extremes = self.rays[..., :2].flatten(0, 1).to(torch.float64).aminmax(dim=0)
         pixel = torch.tensor([1 / self.fx, 1 / self.fy], dtype=torch.float64)
         return torch.stack([extremes.min - pixel, extremes.max + pixel])
+
+    @cached_property
+    def undistorted_bounds(self) -> tuple[float, float, float, float]:
+        """Undistorted pixels that the image covers: minimum u and v, inclusive, and maximum u and v, exclusive.
+
+        The undistorted image of a fisheye lens is much larger than the recorded one, that of other lenses about equal.
+        """
+        if self.distortion_model != "equidistant":
+            return 0.0, 0.0, float(self.width), float(self.height)
+        low, high = (self._normalised_bounds * self.focal_lengths + self._principal_point).tolist()
+        return low[0], low[1], high[0], high[1]
 
     def project_to_image(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
         """Project points to distorted pixels and check which of them lie in the image.

@@ -2,13 +2,35 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from typing import Any
 
 import yaml
 
+from v3d_torch.io.text import replace_odd_spaces
+
 _MAX_LENGTH = 100_000
 """Largest YAML text, characters: more than any valid file has, and few enough for a slow parser."""
+
+
+_OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
+"""First line and matrix tag of OpenCV's files. Neither is valid YAML."""
+
+
+def plain_yaml(text: str) -> str:
+    """Remove what makes the files of OpenCV and ROS invalid for a parser of single YAML documents, and odd spaces.
+
+    OpenCV's own parser is not robust against damaged files. ``rostopic echo`` ends each message with ``---``.
+
+    Args:
+        text: Content of a file.
+
+    Returns:
+        The first document, without OpenCV's header and its matrix tags: a matrix is a mapping with the key ``data``.
+    """
+    text = replace_odd_spaces(text).strip().removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, "").strip()
+    return re.split(r"^---\s*$", text.removeprefix("---"), maxsplit=1, flags=re.MULTILINE)[0]
 
 
 def parse_yaml(text: str) -> Any:

@@ -11,6 +11,24 @@ _MAX_LENGTH = 100 << 20
 """Largest text that is read, characters: more than an hour of poses at 200 Hz, and a bound for endless devices."""
 
 
+_ODD_SPACES = str.maketrans(
+    dict.fromkeys(
+        "\u00a0\u1680\u2000\u2001\u2002\u2003\u2004\u2005\u2006\u2007\u2008\u2009\u200a\u202f\u205f\u3000", " "
+    )
+    | dict.fromkeys("\u00ad\u200b\u2060\ufeff", "")
+)
+"""Spaces that word processors and web pages insert, and invisible characters without width."""
+
+
+def replace_odd_spaces(text: str) -> str:
+    """Replace no-break and other typographic spaces by plain ones, and remove invisible characters.
+
+    Args:
+        text: Text of a configuration or of numbers. A file name can contain these characters on purpose.
+    """
+    return text.translate(_ODD_SPACES)
+
+
 def read_text(path: Path, expected: str) -> str:
     r"""Read a UTF-8 text file.
 

@@ -6,20 +6,34 @@ import math
 
 from v3d_torch.kernels.compiler import device
 
-Intrinsics = tuple[float, float, float, float, float, float, float, float, float]
-"""``fx, fy, cx, cy, k1, k2, p1, p2, k3``; in signatures ``UniTuple(f8, 9)``."""
+Intrinsics = tuple[float, float, float, float, float, float, float, float, float, float, float, float, float]
+"""``fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, equidistant``; in signatures ``UniTuple(f8, 13)``. The last number
+is 1 for the fisheye model with k1 to k4, else 0."""
 
 Bounds = tuple[float, float, float, float, float, float]
 """Minimum and maximum of x / z and of y / z in the image, width and height; in signatures ``UniTuple(f8, 6)``."""
 
 
+_MIN_RADIUS = 1e-9
+"""As in `v3d_torch.geometry.distortion`."""
+
+
 @device
 def distort(x: float, y: float, intrinsics: Intrinsics) -> tuple[float, float]:
-    """Return the distorted pixel (u, v) at normalised image coordinates, by the Brown-Conrady model."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = intrinsics
-    if k1 != 0 or k2 != 0 or p1 != 0 or p2 != 0 or k3 != 0:
-        r2 = x * x + y * y
-        factor = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)) + 2 * (x * p2 + y * p1)
+    """Return the distorted pixel (u, v) at normalised image coordinates; see `v3d_torch.geometry.distortion`."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, equidistant = intrinsics
+    r2 = x * x + y * y
+    if equidistant != 0:
+        r = max(math.sqrt(r2), _MIN_RADIUS)
+        theta = math.atan(r)
+        t2 = theta * theta
+        factor = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
+        x, y = x * factor, y * factor
+    elif k1 != 0 or k2 != 0 or p1 != 0 or p2 != 0 or k3 != 0 or k4 != 0 or k5 != 0 or k6 != 0:
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        if k4 != 0 or k5 != 0 or k6 != 0:
+            radial /= 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        factor = radial + 2 * (x * p2 + y * p1)
         x, y = x * factor + r2 * p2, y * factor + r2 * p1
     return x * fx + cx, y * fy + cy
 

@@ -35,7 +35,7 @@ def _is_free(
     return 1.0 if measured > z + tolerance else 0.0
 
 
-@kernel("(f8[:,:], f8[:,::1], f4[:,::1], UniTuple(f8, 9), UniTuple(f8, 6), UniTuple(f8, 4))")
+@kernel("(f8[:,:], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4))")
 def is_free_space(
     points: Array, T_cw: Array, nearest_depth: Depth, intrinsics: Intrinsics, bounds: Bounds, limits: Limits
 ) -> Array:
@@ -60,7 +60,7 @@ def is_free_space(
 
 
 @kernel(
-    "(f4[:,::1], i8, f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(f8, 9), UniTuple(f8, 6), UniTuple(f8, 4),"
+    "(f4[:,::1], i8, f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4),"
     " f8[:,::1])"
 )
 def newly_occupied(

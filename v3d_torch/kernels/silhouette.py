@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 
 
-@kernel("(f8[:,:], f8, i8, UniTuple(f8, 9), UniTuple(f8, 6))")
+@kernel("(f8[:,:], f8, i8, UniTuple(f8, 13), UniTuple(f8, 6))")
 def project_to_cells(
     points: Array, min_depth: float, cell: int, intrinsics: Intrinsics, bounds: Bounds
 ) -> tuple[Cells, Depth]:

@@ -168,11 +168,14 @@ def _is_same_camera(a: PinholeCamera, b: PinholeCamera) -> bool:
     first, second = (
         np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]) for camera in (a, b)
     )
-    return np.allclose(first, second, rtol=0, atol=_PIXEL_TOLERANCE) and np.allclose(
-        a.distortion, b.distortion, rtol=0, atol=_DISTORTION_TOLERANCE
+    return (
+        np.allclose(first, second, rtol=0, atol=_PIXEL_TOLERANCE)
+        and a.distortion_model == b.distortion_model
+        and np.allclose(a.distortion, b.distortion, rtol=0, atol=_DISTORTION_TOLERANCE)
     )
 
 
 def _describe(camera: PinholeCamera) -> str:
     pinhole = f"fx {camera.fx:g}, fy {camera.fy:g}, cx {camera.cx:g}, cy {camera.cy:g}, {camera.width}x{camera.height}"
-    return f"{pinhole}, distortion {list(camera.distortion)}" if camera.is_distorted else pinhole
+    lens = f"{camera.distortion_model} distortion {list(camera.distortion)}"
+    return f"{pinhole}, {lens}" if camera.is_distorted else pinhole

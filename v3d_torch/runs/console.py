@@ -16,7 +16,8 @@ from types import FrameType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation
@@ -33,7 +34,16 @@ from v3d_torch.types import RGBDFrame
 def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
     """Open a sequence as `load_sequence` does, with a progress bar for downloads."""
     with progress_bars(console) as progress:
-        return load_sequence(name, data_root=data_root, camera=camera, progress=ProgressBar(progress, "sequence"))
+        bar = ProgressBar(progress, "sequence")
+        sequence = load_sequence(name, data_root=data_root, camera=camera, progress=bar)
+    print_assumptions(sequence, console)
+    return sequence
+
+
+def print_assumptions(source: RGBDStream, console: Console) -> None:
+    """Print what was assumed about a source because it is not stated: an estimated depth scale."""
+    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
+        console.print(f"note: {source.name}: {source.depth_scale_note}", markup=False, highlight=False)
 
 
 def open_sequences(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:

@@ -11,6 +11,7 @@ import torch
 
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets import RGBDStream
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_text
@@ -97,6 +98,8 @@ class Run:
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
+        if isinstance(sequence, ImageSequence) and sequence.depth_scale_note is not None:
+            _LOG.warning(sequence.depth_scale_note)
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"

@@ -254,10 +254,18 @@ def camera_with(intrinsics: Any, depth_unit: float = 0.001) -> PinholeCamera:
     return RealSenseStream("simulated", lambda: device).camera
 
 
-@pytest.mark.parametrize("model", ["brown_conrady", "inverse_brown_conrady"])
-def test_convention_distortion_is_that_of_librealsense(model: str) -> None:
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("brown_conrady", (-0.056, 0.066, -0.0007, 0.0003, -0.0217)),  # of a D455
+        ("inverse_brown_conrady", (-0.056, 0.066, -0.0007, 0.0003, -0.0217)),
+        ("kannala_brandt4", (-0.0057, 0.0119, -0.0064, 0.0009, 0.0)),  # of a T265
+        ("kannala_brandt4", (0.0, 0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_convention_distortion_is_that_of_librealsense(model: str, coefficients: tuple[float, ...]) -> None:
     """Pixels back-project to the same rays as in librealsense."""
-    intrinsics = make_intrinsics(COLOUR_K, (-0.056, 0.066, -0.0007, 0.0003, -0.0217), model)  # of a D455
+    intrinsics = make_intrinsics(COLOUR_K, coefficients, model)
     camera = camera_with(intrinsics)
     generator = torch.Generator().manual_seed(0)
     pixels = torch.rand(50, 2, dtype=torch.float64, generator=generator) * torch.tensor([WIDTH - 1, HEIGHT - 1])
@@ -268,11 +276,9 @@ def test_convention_distortion_is_that_of_librealsense(model: str) -> None:
 
 
 def test_unsupported_distortion_model_is_rejected_unless_it_is_zero() -> None:
-    with pytest.raises(
-        InputError, match="simulated: has the unsupported distortion model kannala_brandt4; pass --camera"
-    ):
-        camera_with(make_intrinsics(COLOUR_K, (0.1, 0, 0, 0, 0), "kannala_brandt4"))
-    assert camera_with(make_intrinsics(COLOUR_K, model="kannala_brandt4")).distortion == (0, 0, 0, 0, 0)
+    with pytest.raises(InputError, match="simulated: has the unsupported distortion model ftheta; pass --camera"):
+        camera_with(make_intrinsics(COLOUR_K, (0.1, 0, 0, 0, 0), "ftheta"))
+    assert camera_with(make_intrinsics(COLOUR_K, model="ftheta")).distortion == (0, 0, 0, 0, 0)
 
 
 def test_depth_unit_of_the_device_sets_the_depth_scale() -> None:

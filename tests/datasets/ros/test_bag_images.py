@@ -14,8 +14,14 @@ from PIL import Image
 
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.depth_units import depth_to_metres
 
 ROS2 = MessageFactory("db3")
+
+
+def decode_metres(message: Any, depth_scale: float) -> torch.Tensor:
+    """Decode a depth message and convert it to metres."""
+    return depth_to_metres(decode_depth_message(message, "x"), depth_scale)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +42,7 @@ def test_raw_colour_of_all_channel_orders_is_rgb(encoding: str, pixels: Any, pad
 
 def test_decoded_images_do_not_share_memory_with_the_message() -> None:
     colour, depth = ROS2.image(1, "rgb8", colour_of(0)), ROS2.image(1, "16UC1", depth_of(0))
-    images = decode_colour_message(colour, "x"), decode_depth_message(depth, 1000, "x")
+    images = decode_colour_message(colour, "x"), decode_metres(depth, 1000)
     for message, image in zip((colour, depth), images, strict=True):
         before = image.clone()
         message.data[:] = 7
@@ -79,11 +85,11 @@ def test_compressed_colour_is_decoded() -> None:
 def test_convention_depth_is_metres_and_zero_is_no_measurement(big_endian: bool, pad: int) -> None:
     units = depth_of(0)
     for encoding in ("16UC1", "mono16"):
-        depth = decode_depth_message(ROS2.image(1, encoding, units, pad=pad, big_endian=big_endian), 1000, "x")
+        depth = decode_metres(ROS2.image(1, encoding, units, pad=pad, big_endian=big_endian), 1000)
         np.testing.assert_allclose(depth[0], units / 1000, rtol=1e-6)
     metric = (units / 1000).astype(np.float32)
     metric[0, :4] = [np.nan, np.inf, -np.inf, -1]
-    depth = decode_depth_message(ROS2.image(1, "32FC1", metric, pad=pad, big_endian=big_endian), 5000, "x")
+    depth = decode_metres(ROS2.image(1, "32FC1", metric, pad=pad, big_endian=big_endian), 5000)
     expected = np.where(np.isfinite(metric) & (metric > 0), metric, 0)
     assert depth.dtype == torch.float32 and np.array_equal(depth[0].numpy(), expected)
 
@@ -91,9 +97,9 @@ def test_convention_depth_is_metres_and_zero_is_no_measurement(big_endian: bool,
 def test_compressed_depth_of_integers_and_floats_is_decoded() -> None:
     units = depth_of(0)
     for compression in ("16UC1; compressedDepth", "16UC1; compressedDepth png"):
-        depth = decode_depth_message(ROS2.compressed(1, compression, compressed_depth(units)), 1000, "x")
+        depth = decode_metres(ROS2.compressed(1, compression, compressed_depth(units)), 1000)
         np.testing.assert_allclose(depth[0], units / 1000, rtol=1e-6)
-    depth = decode_depth_message(ROS2.compressed(1, "16UC1; png compressed ", png(units)), 1000, "x")
+    depth = decode_metres(ROS2.compressed(1, "16UC1; png compressed ", png(units)), 1000)
     np.testing.assert_allclose(depth[0], units / 1000, rtol=1e-6)
     # The transport stores floats as quantised inverse depth in 16 bits; its defaults are 100 and 10 m.
     a, max_depth = 100.0 * 101.0, 10.0
@@ -101,9 +107,7 @@ def test_compressed_depth_of_integers_and_floats_is_decoded() -> None:
     metric = np.linspace(0.3, 9.9, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
     stored = np.rint(a / metric + b).astype(np.uint16)
     stored[0, 0] = 0
-    depth = decode_depth_message(
-        ROS2.compressed(1, "32FC1; compressedDepth", compressed_depth(stored, a, b)), 1000, "x"
-    )
+    depth = decode_metres(ROS2.compressed(1, "32FC1; compressedDepth", compressed_depth(stored, a, b)), 1000)
     assert depth[0, 0, 0] == 0
     np.testing.assert_allclose(depth[0].numpy().flat[1:], metric.flat[1:], atol=0.5 * 9.9**2 / a * 1.1)
 
@@ -134,7 +138,7 @@ def test_compressed_depth_of_integers_and_floats_is_decoded() -> None:
 )
 def test_invalid_message_is_an_input_error(kind: str, message: Any, error: str) -> None:
     with pytest.raises(InputError, match=f"^here: .*{error}"):
-        decode_colour_message(message, "here") if kind == "colour" else decode_depth_message(message, 1000, "here")
+        decode_colour_message(message, "here") if kind == "colour" else decode_depth_message(message, "here")
 
 
 def test_image_with_too_little_data_is_an_input_error() -> None:

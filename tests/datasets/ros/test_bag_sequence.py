@@ -119,10 +119,15 @@ def test_distortion_models_are_read_or_rejected(tmp_path: Path) -> None:
         folder.mkdir()
         camera = load_camera_from_bag(folder, (INFO, 10.5, ROS2.info(WIDTH, HEIGHT, K, distortion, P, model)))
         assert camera.distortion == tuple((distortion + [0.0] * 5)[:5])
-    for distortion, model in (([*D, 0.1, 0, 0], "rational_polynomial"), (D[:4], "equidistant")):
+    for distortion, model in (([*D, 0.1, 0, 0], "rational_polynomial"), ([0.01, 0, 0, 0], "equidistant")):
         folder = tmp_path / model
         folder.mkdir()
-        with pytest.raises(InputError, match=f"{INFO} has the unsupported distortion model {model}; record rectified"):
+        camera = load_camera_from_bag(folder, (INFO, 10.5, ROS2.info(WIDTH, HEIGHT, K, distortion, P, model)))
+        assert (camera.distortion, camera.distortion_model) == (tuple(distortion), model)
+    for distortion, model in ((D, "thin_prism"), ([*D, 0, 0, 0, 0.1, 0, 0, 0], "rational_polynomial")):
+        folder = tmp_path / f"{model} rejected"
+        folder.mkdir()
+        with pytest.raises(InputError, match=f"take: {INFO}: the .*distortion .*{model}.*; (calibrate|give) "):
             load_camera_from_bag(folder, (INFO, 10.5, ROS2.info(WIDTH, HEIGHT, K, distortion, P, model)))
 
 

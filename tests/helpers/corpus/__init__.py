@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from helpers.corpus import (
     archives,
+    camera_formats,
     cameras,
     configs,
     images,
@@ -25,6 +26,7 @@ CATEGORIES = {
     "image content": views.CASES,
     "ground truth": truths.CASES,
     "cameras": cameras.CASES,
+    "camera formats, lenses and depth scales": camera_formats.CASES,
     "configurations": configs.CASES,
     "masks and weights": segmenters.CASES,
     "bags": recordings.CASES,

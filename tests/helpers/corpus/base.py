@@ -13,7 +13,7 @@ from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
 
-WIDTH, HEIGHT, FRAMES = 80, 60, 8
+WIDTH, HEIGHT, FRAMES = 128, 96, 8
 FOCAL, SCALE, DEPTH = 64.0, 5000, 1.0
 STEP = 2
 """Motion of the image between two frames, pixels."""
@@ -27,8 +27,8 @@ STAMPS = [f"{1305031102 + i / 10:.6f}" for i in range(FRAMES)]
 
 def colour(x: int, y: int = 0) -> NDArray[np.uint8]:
     """Colour image at a camera position on the wall (pixels), BGR, shape (H, W, 3)."""
-    noise = np.random.default_rng(0).integers(0, 256, (28, 40, 3), dtype=np.uint8)
-    wall = cv2.resize(noise, (120, 84), interpolation=cv2.INTER_CUBIC)
+    noise = np.random.default_rng(0).integers(0, 256, (40, 56, 3), dtype=np.uint8)
+    wall = cv2.resize(noise, (168, 120), interpolation=cv2.INTER_CUBIC)
     return wall[y : y + HEIGHT, x : x + WIDTH]
 
 

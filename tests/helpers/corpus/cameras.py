@@ -79,7 +79,7 @@ CASES = [
         "missing field",
         edit(YAML, replace_text("fy:", "#fy:")),
         Fails(
-            "{seq}/camera.yaml: fy: field required, got {'cx': 39.5, 'cy': 29.5, 'depth_scale': 5000, 'fx':"
+            "{seq}/camera.yaml: fy: field required, got {'cx': 63.5, 'cy': 47.5, 'depth_scale': 5000, 'fx':"
             " 64.0, ...}; correct the camera"
         ),
     ),
@@ -135,7 +135,7 @@ CASES = [
         "principal point far outside the image",
         field("cx", "1e6"),
         Fails(
-            "{seq}/camera.yaml: the principal point (1e+06, 29.5) is far outside the 80x60 image; correct cx"
+            "{seq}/camera.yaml: the principal point (1e+06, 47.5) is far outside the 128x96 image; correct cx"
             " and cy, or width and height"
         ),
     ),
@@ -163,7 +163,7 @@ CASES = [
         "size of a different camera",
         field("width", "640"),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x60; pass the camera of"
+            "{seq}/rgb/1305031102.000000.png: has 128x96 pixels, but the camera has 640x96; pass the camera of"
             " these images with --camera"
         ),
     ),
@@ -176,7 +176,7 @@ CASES = [
             )
         ),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 60x80; pass the camera of"
+            "{seq}/rgb/1305031102.000000.png: has 128x96 pixels, but the camera has 96x128; pass the camera of"
             " these images with --camera"
         ),
     ),
@@ -215,7 +215,10 @@ CASES = [
     Case(
         "distortion with four numbers",
         edit(YAML, lambda content: content + b"distortion: [0.1, 0.1, 0, 0]\n"),
-        Fails("{seq}/camera.yaml: distortion.4: field required, got [0.1, 0.1, 0, 0]; correct the camera"),
+        Fails(
+            "{seq}/camera.yaml: distortion has 4 numbers; write k1, k2, p1, p2, k3, or state distortion_model: one of"
+            " plumb_bob, rational_polynomial, equidistant"
+        ),
     ),
     Case(
         "distortion with NaN",
@@ -301,15 +304,15 @@ CASES = [
         numbers(NUMBERS.replace(f" {WIDTH} ", f" {WIDTH}.5 ")),
         Fails(
             "{seq}/K.txt: width: input should be a valid integer, got a number with a fractional part, got"
-            " 80.5; correct the camera"
+            " 128.5; correct the camera"
         ),
     ),
     Case(
         "K.txt with a matrix, for 640x480 pixels",
         numbers("525 0 319.5\n0 525 239.5\n0 0 1\n"),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
-            " these images with --camera"
+            "{seq}/K.txt: the principal point (319.5, 239.5) is far outside the 128x96 image; correct cx and cy, or"
+            " width and height"
         ),
     ),
     Case(
@@ -342,7 +345,7 @@ CASES = [
         "--camera with another image size",
         add_options("--camera", "tum_fr3"),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 80x60 pixels, but the camera has 640x480; pass the camera of"
+            "{seq}/rgb/1305031102.000000.png: has 128x96 pixels, but the camera has 640x480; pass the camera of"
             " these images with --camera"
         ),
     ),

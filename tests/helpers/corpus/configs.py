@@ -24,6 +24,12 @@ CASES = [
     Case("byte order mark", config("\ufeffseed: 1\n"), Succeeds()),
     Case("Windows line endings", config("seed: 1\r\nthreads: 1\r\n"), Succeeds()),
     Case(
+        "no-break spaces",
+        config("seed:\u00a01\nobjects:\n\u00a0\u00a0voting: {vote_threshold:\u202f2}\u200b\n"),
+        Succeeds(),
+    ),
+    Case("no-break space in --set", setting("seed=\u00a01"), Succeeds()),
+    Case(
         "missing file",
         add_options("--config", "{root}/none.yaml"),
         Fails(

@@ -21,6 +21,7 @@ from helpers.corpus.case import (
     Workspace,
     all_of,
     edit,
+    fails_after_run,
     fails_at_frame,
     first_half,
     write,
@@ -97,6 +98,20 @@ def swap_lists(place: Workspace) -> None:
     depths.write_text(text)
 
 
+def arrays(image: NDArray[np.generic]) -> Damage:
+    """Replace the depth images by files of NumPy."""
+
+    def make(place: Workspace) -> None:
+        for file in DEPTH:
+            (place.folder / file).unlink()
+            np.save(place.folder / file.replace(".png", ".npy"), image, allow_pickle=True)
+        path = place.folder / "depth.txt"
+        path.write_text(path.read_text().replace(".png", ".npy"))
+
+    return make
+
+
+METRES = np.full((HEIGHT, WIDTH), 1.0, np.float32)
 SMALL = cv2.resize(colour(*camera_position(0)), (WIDTH // 2, HEIGHT // 2))
 PAGE = "<!DOCTYPE html>\n<html><body>404 Not Found</body></html>\n"
 
@@ -223,7 +238,46 @@ CASES = [
     Case(
         "floating-point depth with NaN",
         every(DEPTH, lambda i: saved(np.full((HEIGHT, WIDTH), np.nan, np.float32), "tiff")),
-        Fails("{seq}/depth/1305031102.000000.png: is a floating-point image; export depth as 16-bit PNG"),
+        fails_after_run(
+            "seq: the camera was not found in any of the 8 frames, the depth images are empty; record or export them"
+            " again"
+        ),
+    ),
+    Case("floating-point depth in metres", every(DEPTH, lambda i: saved(METRES, "tiff")), Succeeds()),
+    Case(
+        "floating-point depth in millimetres",
+        every(DEPTH, lambda i: saved(1000 * METRES, "tiff")),
+        Fails(
+            "{seq}: the median depth of the first frame is 1e+03 m, although depth in floating point is in metres;"
+            " export it in metres"
+        ),
+    ),
+    Case(
+        "floating-point depth in one frame only",
+        write(DEPTH[4], saved(METRES, "tiff")),
+        Succeeds(),
+    ),
+    Case("depth as NumPy arrays in metres", arrays(METRES), Succeeds()),
+    Case("depth as NumPy arrays in units", arrays(depth()), Succeeds()),
+    Case(
+        "depth as truncated NumPy arrays",
+        all_of(arrays(METRES), edit(DEPTH[5].replace(".png", ".npy"), first_half)),
+        fails_at_frame(
+            5, "{seq}/depth/1305031102.500000.npy: is truncated or not a NumPy array; copy or export it again"
+        ),
+    ),
+    Case(
+        "depth as NumPy arrays of objects",
+        arrays(np.array([[None]])),
+        Fails("{seq}/depth/1305031102.000000.npy: is truncated or not a NumPy array; copy or export it again"),
+    ),
+    Case(
+        "colour and depth swapped in the lists, depth in floating point",
+        all_of(every(DEPTH, lambda i: saved(METRES, "tiff")), swap_lists),
+        Fails(
+            "{seq}/depth/1305031102.000000.png: is a floating-point depth image, expected a colour image; check that"
+            " colour and depth are not swapped"
+        ),
     ),
     Case(
         "depth as OpenEXR",
@@ -244,7 +298,7 @@ CASES = [
         "colour smaller than depth",
         every(RGB, lambda i: png(cv2.resize(colour(*camera_position(i)), (WIDTH // 2, HEIGHT // 2)))),
         Fails(
-            "{seq}/depth/1305031102.000000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            "{seq}/depth/1305031102.000000.png: has 128x96 pixels, but its colour image has 64x48; export depth"
             " that is registered to the colour image"
         ),
     ),
@@ -252,7 +306,7 @@ CASES = [
         "depth smaller than colour",
         every(DEPTH, lambda i: png(depth()[::2, ::2])),
         Fails(
-            "{seq}/depth/1305031102.000000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            "{seq}/depth/1305031102.000000.png: has 64x48 pixels, but its colour image has 128x96; export depth"
             " that is registered to the colour image"
         ),
     ),
@@ -260,7 +314,7 @@ CASES = [
         "both images smaller than the camera",
         all_of(every(RGB, lambda i: png(SMALL)), every(DEPTH, lambda i: png(depth()[::2, ::2]))),
         Fails(
-            "{seq}/rgb/1305031102.000000.png: has 40x30 pixels, but the camera has 80x60; pass the camera of"
+            "{seq}/rgb/1305031102.000000.png: has 64x48 pixels, but the camera has 128x96; pass the camera of"
             " these images with --camera"
         ),
     ),
@@ -269,7 +323,7 @@ CASES = [
         write(RGB[3], png(SMALL)),
         fails_at_frame(
             3,
-            "{seq}/depth/1305031102.300000.png: has 80x60 pixels, but its colour image has 40x30; export depth"
+            "{seq}/depth/1305031102.300000.png: has 128x96 pixels, but its colour image has 64x48; export depth"
             " that is registered to the colour image",
         ),
     ),
@@ -278,7 +332,7 @@ CASES = [
         write(DEPTH[3], png(depth()[::2, ::2])),
         fails_at_frame(
             3,
-            "{seq}/depth/1305031102.300000.png: has 40x30 pixels, but its colour image has 80x60; export depth"
+            "{seq}/depth/1305031102.300000.png: has 64x48 pixels, but its colour image has 128x96; export depth"
             " that is registered to the colour image",
         ),
     ),
@@ -287,7 +341,7 @@ CASES = [
         write(DEPTH[3], png(depth().T.copy())),
         fails_at_frame(
             3,
-            "{seq}/depth/1305031102.300000.png: has 60x80 pixels, but its colour image has 80x60; export depth"
+            "{seq}/depth/1305031102.300000.png: has 96x128 pixels, but its colour image has 128x96; export depth"
             " that is registered to the colour image",
         ),
     ),

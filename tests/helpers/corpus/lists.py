@@ -106,6 +106,24 @@ CASES = [
     Case("commas", edit("rgb.txt", replace_text(" ", ", ")), Succeeds()),
     Case("spaces in file names", renamed(lambda kind, stamp: f"{kind}/my take {stamp}.png"), Succeeds()),
     Case("non-ASCII file names", renamed(lambda kind, stamp: f"bilder für {kind}/{stamp} 深度.png"), Succeeds()),
+    Case("backslashes of Windows", edit("rgb.txt", replace_text("rgb/", "rgb\\")), Succeeds()),
+    Case(
+        "backslashes of Windows in associations",
+        all_of(associated("T C T D"), edit("associations.txt", replace_text("/", "\\"))),
+        Succeeds(),
+    ),
+    Case(
+        "paths of a disk of Windows",
+        edit("rgb.txt", replace_text("rgb/", "C:\\data\\rgb\\")),
+        Fails(
+            "{seq}/C:\\data\\rgb\\1305031102.000000.png: is listed but does not exist (8 missing in total); the list"
+            " has Windows paths; write them relative to its folder, such as rgb/1.png"
+        ),
+    ),
+    Case("no-break spaces", edit("rgb.txt", replace_text(" ", "\u00a0")), Succeeds()),
+    Case("no-break spaces at the ends of lines", edit("depth.txt", replace_text("\n", "\u00a0\n")), Succeeds()),
+    Case("invisible spaces", edit("rgb.txt", replace_text(" ", "\u200b \u200b")), Succeeds()),
+    Case("no-break spaces in the ground truth", edit("groundtruth.txt", replace_text(" ", "\u00a0\u2009")), Succeeds()),
     Case("absolute paths", renamed(lambda kind, stamp: f"{kind}/{stamp}.png", absolute=True), Succeeds()),
     Case("paths through the parent folder", edit("rgb.txt", replace_text("rgb/", "../seq/rgb/")), Succeeds()),
     Case(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from typer.testing import CliRunner
 
-from helpers.corpus.base import NOISE, STAMPS, png, write_base
+from helpers.corpus.base import HEIGHT, NOISE, STAMPS, WIDTH, png, write_base
 from helpers.corpus.case import (
     Case,
     Damage,
@@ -74,8 +74,8 @@ def with_array(name: str, array: np.ndarray, claim: int | None = None) -> Callab
 def show_another_room(place: Workspace) -> None:
     """Replace the images by images without any feature of the map."""
     for i, stamp in enumerate(STAMPS):
-        noise = np.random.default_rng(50).integers(0, 256, (60, 120, 3), dtype=np.uint8)
-        (place.folder / "rgb" / f"{stamp}.png").write_bytes(png(noise[:, 2 * i : 2 * i + 80]))
+        noise = np.random.default_rng(50).integers(0, 256, (HEIGHT, WIDTH + 40, 3), dtype=np.uint8)
+        (place.folder / "rgb" / f"{stamp}.png").write_bytes(png(noise[:, 2 * i : 2 * i + WIDTH]))
 
 
 def save_map(path: str) -> Damage:

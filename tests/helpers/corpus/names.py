@@ -36,6 +36,7 @@ def loop(place: Workspace) -> None:
 CASES = [
     Case("folder name with a line break", rename("two\nlines"), Succeeds()),
     Case("folder name with markup of rich and matplotlib", rename("[red] $x^{$"), Succeeds()),
+    Case("folder name in other scripts", rename("部屋 комната 😀 हिन्दी"), Succeeds()),
     Case("folder name that is not UTF-8", rename("caf\udce9"), Succeeds()),
     Case("empty name", set_sequence(""), Fails("the sequence name is empty; pass a name, a folder or a file")),
     Case(

@@ -214,8 +214,8 @@ CASES = [
         "depth of another size",
         bag("mcap", replace_messages(DEPTH, lambda to, at: to.image(at, "16UC1", MILLIMETRES[::2]))),
         Fails(
-            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 80x30 pixels, but its colour"
-            " image has 80x60; choose depth registered to colour with --depth-topic"
+            "{root}/take/take.mcap: /camera/aligned_depth_to_color/image_raw: has 128x48 pixels, but its colour"
+            " image has 128x96; choose depth registered to colour with --depth-topic"
         ),
     ),
     Case("depth with NaN", bag("mcap", replace_messages(DEPTH, depth_with_nan)), Succeeds(max_ate=None)),
@@ -223,7 +223,7 @@ CASES = [
         "images with too little data",
         bag("mcap", replace_messages(RGB, image_shorter_than_its_height)),
         Fails(
-            "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 80x1000000"
+            "{root}/take/take.mcap: /camera/color/image_raw: an image has less data than its 128x1000000"
             " pixels need; record the bag again"
         ),
     ),
@@ -272,10 +272,10 @@ CASES = [
     ),
     Case(
         "unsupported distortion model",
-        bag("mcap", replace_camera(K, (0.1, 0.2, 0.3, 0.4), "equidistant")),
+        bag("mcap", replace_camera(K, (0.1, 0.2, 0.3, 0.4), "thin_prism")),
         Fails(
-            "{root}/take/take.mcap: /camera/color/camera_info has the unsupported distortion model"
-            " equidistant; record rectified images, or pass --camera with k1, k2, p1, p2, k3"
+            "{root}/take/take.mcap: /camera/color/camera_info: the distortion model thin_prism is not supported;"
+            " calibrate with one of plumb_bob, rational_polynomial, equidistant"
         ),
     ),
     Case(

@@ -119,7 +119,7 @@ CASES = [
         masks(lambda i: png(np.zeros((HEIGHT * 2, WIDTH * 2), np.uint8))),
         fails_at_frame(
             0,
-            "{seq}/ids/1305031102.000000.png: has 160x120 pixels, its frame 80x60; write id images of the size"
+            "{seq}/ids/1305031102.000000.png: has 256x192 pixels, its frame 128x96; write id images of the size"
             " of the frames",
         ),
     ),
@@ -147,7 +147,7 @@ CASES = [
         masks(lambda i: png(np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH))),
         fails_at_frame(
             0,
-            "{seq}/ids/1305031102.000000.png: has 4799 different ids, more than 255; an id image has one value"
+            "{seq}/ids/1305031102.000000.png: has 12287 different ids, more than 255; an id image has one value"
             " for each instance and 0 for the background, name the folder of such images with --masks",
         ),
     ),

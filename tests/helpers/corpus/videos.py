@@ -68,7 +68,7 @@ CASES = [
     Case(
         "truncated depth",
         change_bytes("depth.mkv", first_half),
-        Fails("{root}/take/depth.mkv: cannot be decoded as a video; copy it again, or convert it with ffmpeg"),
+        fails_at_frame(2, "{root}/take/depth.mkv: is truncated at 0.1 of 0.7 s; copy it again"),
     ),
     Case(
         "depth truncated in its header",
@@ -102,7 +102,7 @@ CASES = [
         "depth of another size",
         replace_video("depth.mkv", depth()[::2, ::2].copy()),
         Fails(
-            "{root}/take/depth.mkv: has 40x30 pixels, but its colour image has 80x60; export depth that is"
+            "{root}/take/depth.mkv: has 64x48 pixels, but its colour image has 128x96; export depth that is"
             " registered to the colour image"
         ),
     ),

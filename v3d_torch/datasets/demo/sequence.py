@@ -18,7 +18,7 @@ from v3d_torch.datasets.demo.room import build_room
 from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
 
-CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, readout=0.0)
+CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, depth_scale=5000.0, readout=0.0)
 """Default calibration of a Kinect, with a global shutter: all rows of a rendered image have the same time."""
 FRAME_COUNT = 120
 """Number of frames."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.distortion import DistortionModel
 
 
 def import_librealsense(source: str) -> Any:
@@ -44,19 +45,23 @@ def camera_from_intrinsics(name: str, intrinsics: Any, depth_unit: float) -> Pin
     Raises:
         InputError: If the distortion model is not supported.
     """
+    coefficients, model = _distortion(name, intrinsics)
     return PinholeCamera(
         *(intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy, intrinsics.width, intrinsics.height),
-        _distortion(name, intrinsics),
-        depth_scale_from(depth_unit),
+        distortion=coefficients,
+        depth_scale=depth_scale_from(depth_unit),
+        distortion_model=model,
     )
 
 
-def _distortion(name: str, intrinsics: Any) -> tuple[float, float, float, float, float]:
-    """Coefficients k1, k2, p1, p2, k3 of the Brown model."""
+def _distortion(name: str, intrinsics: Any) -> tuple[tuple[float, ...], DistortionModel]:
+    """Coefficients and distortion model."""
     rs = import_librealsense(name)
-    k1, k2, p1, p2, k3 = (float(value) for value in intrinsics.coeffs)
+    coefficients = tuple(float(value) for value in intrinsics.coeffs)
+    if intrinsics.model == rs.distortion.kannala_brandt4:
+        return coefficients[:4], "equidistant"
     # librealsense undistorts inverse_brown_conrady like brown_conrady, to within a hundredth of a pixel.
     supported = (rs.distortion.brown_conrady, rs.distortion.inverse_brown_conrady)
-    if any((k1, k2, p1, p2, k3)) and intrinsics.model not in supported:
+    if any(coefficients) and intrinsics.model not in supported:
         raise InputError(f"{name}: has the unsupported distortion model {intrinsics.model.name}; pass --camera")
-    return k1, k2, p1, p2, k3
+    return coefficients, "plumb_bob"

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
-from v3d_torch.datasets.images import depth_to_metres
 from v3d_torch.datasets.realsense.camera import camera_from_intrinsics, depth_scale_from, import_librealsense
 from v3d_torch.datasets.realsense.device import Device, open_live_device, open_recorded_device
 from v3d_torch.datasets.ros import read_topic_types
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS, convert_to_rgb
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.types import RGBDFrame
 
 _WAIT_MS = 200
@@ -48,7 +48,8 @@ class RealSenseStream:
         device = open_device()
         calibrated = None if camera is not None else camera_from_intrinsics(name, device.intrinsics, device.depth_unit)
         self.name = name
-        self.camera: PinholeCamera = choose_camera(camera, Path(name), calibrated)
+        depth_scale = depth_scale_from(device.depth_unit)
+        self.camera: PinholeCamera = choose_camera(camera, Path(name), calibrated, depth_scale=depth_scale)
         self._open_device = open_device
 
     def __iter__(self) -> Iterator[RGBDFrame]:

@@ -7,11 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.images import decode_colour, decode_depth, depth_to_metres
+from v3d_torch.datasets.images import decode_colour, decode_depth
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS, convert_to_rgb
 from v3d_torch.errors import InputError
 
@@ -52,30 +51,29 @@ def decode_colour_message(message: Any, source: str) -> Tensor:
         ) from error
 
 
-def decode_depth_message(message: Any, depth_scale: float, source: str) -> Tensor:
+def decode_depth_message(message: Any, source: str) -> NDArray[np.generic]:
     """Decode a ROS depth image.
 
     Args:
         message: ``sensor_msgs/Image`` with 16-bit integers or float metres, or ``CompressedImage`` with PNG, from
             rosbags.
-        depth_scale: Units per metre of 16-bit depth; 1000 in ROS (REP 118).
         source: Bag and topic of the message, for error messages.
 
     Returns:
-        Depth in metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+        16-bit depth in its unit, or depth in metres in floating point, shape (H, W); 0 and values that are not positive
+        or not finite are no measurement.
 
     Raises:
         InputError: If the image is damaged or is not a depth image.
     """
     if not hasattr(message, "encoding"):
-        return _decode_compressed_depth(message, depth_scale, source)
+        return _decode_compressed_depth(message, source)
     if message.encoding not in _DEPTH_ENCODINGS:
         raise InputError(
             f"{source}: holds {message.encoding} images, not depth; choose another topic with --depth-topic"
         )
     dtype = np.dtype((">" if message.is_bigendian else "<") + _DEPTH_ENCODINGS[message.encoding])
-    pixels = _unpad_rows(message, dtype, source)
-    return _zero_invalid(pixels) if dtype.kind == "f" else depth_to_metres(pixels, depth_scale)
+    return _unpad_rows(message, dtype, source)
 
 
 def _unpad_rows(message: Any, pixel: np.dtype[Any], source: str) -> NDArray[Any]:
@@ -91,25 +89,19 @@ def _unpad_rows(message: Any, pixel: np.dtype[Any], source: str) -> NDArray[Any]
     return flat.reshape(message.height, message.width, *pixel.shape)
 
 
-def _decode_compressed_depth(message: Any, depth_scale: float, source: str) -> Tensor:
+def _decode_compressed_depth(message: Any, source: str) -> NDArray[np.generic]:
     """Decode a ``CompressedImage`` of the transports compressed and compressedDepth."""
     content = message.data.tobytes()
     if "compressedDepth" not in message.format:
-        return depth_to_metres(decode_depth(content, source), depth_scale)
+        return decode_depth(content, source)
     if "rvl" in message.format.lower():
         raise InputError(
             f"{source}: RVL-compressed depth is not supported; republish it as raw or PNG images and record those"
         )
     units = decode_depth(content[_DEPTH_HEADER.size :], source)
     if not message.format.startswith("32FC1"):
-        return depth_to_metres(units, depth_scale)
+        return units
     _, a, b = _DEPTH_HEADER.unpack(content[: _DEPTH_HEADER.size])
     inverse = units.astype(np.float32)  # quantised inverse depth: depth = a / (inverse - b), 0 = no measurement
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return _zero_invalid(np.where(inverse > 0, a / (inverse - b), 0.0))
-
-
-def _zero_invalid(depth: NDArray[Any]) -> Tensor:
-    """Set NaN, infinite and negative depth (metres, shape (H, W)) to 0 and add a channel dimension."""
-    tensor = torch.from_numpy(depth.astype(np.float32))
-    return torch.where(tensor.isfinite() & (tensor > 0), tensor, 0.0).unsqueeze(0)
+        return np.where(inverse > 0, a / (inverse - b), 0.0)

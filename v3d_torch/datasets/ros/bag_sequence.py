@@ -9,14 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, camera_from_fields, choose_camera
+from v3d_torch.datasets.camera_fields import camera_from_fields
+from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
-from v3d_torch.datasets.stored import Cursor, StoredSequence
+from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.download import Progress
@@ -37,11 +40,8 @@ _REPAIR_COMMANDS = {
 }
 """Command that repairs a bag, by file suffix; the folder of a ROS 2 bag has no suffix."""
 
-_DISTORTION_MODELS = ("plumb_bob", "rational_polynomial", "")
-"""Distortion models whose first coefficients are k1, k2, p1, p2, k3; rational_polynomial has further ones."""
 
-
-class BagSequence(StoredSequence):
+class BagSequence(ImageSequence):
     """RGB-D frames of a bag: colour and depth images of two topics, paired by their header stamps.
 
     The constructor reads the bag once for the stamps; images are decoded when a frame is requested.
@@ -58,6 +58,8 @@ class BagSequence(StoredSequence):
         InputError: If the bag is damaged or has no matching colour, depth and camera.
     """
 
+    registration_fix = "choose depth registered to colour with --depth-topic"
+
     def __init__(
         self,
         path: Path,
@@ -71,7 +73,13 @@ class BagSequence(StoredSequence):
         self.path = path
         types = read_topic_types(path)
         self.topics = topics = choose_topics(path, types, rgb_topic, depth_topic, info_topic)
-        chosen = choose_camera(camera, path, None if camera is not None else _read_camera(path, topics))
+        chosen = choose_camera(
+            camera,
+            path,
+            None if camera is not None else _read_camera(path, topics),
+            depth_scale=_DEPTH_SCALE,
+            image_size=lambda: _image_size(path, topics),
+        )
         stamps, frame_ids = _index_messages(path, topics, progress)
         depth_frame, colour_frame = frame_ids[topics.depth], frame_ids[topics.rgb]
         is_confirmed = depth_topic is not None or topics.is_registered
@@ -102,14 +110,16 @@ class BagSequence(StoredSequence):
         self._read(0)  # raise errors that concern every frame now
         self.gravity = read_gravity(path, types, partial(_read_messages, path), colour_frame, float(self.stamps[0]))
 
-    def _read(self, index: int) -> tuple[Tensor, Tensor]:
-        i, j = self._message_indices[index]
-        colour_source, depth_source = f"{self.path}: {self.topics.rgb}", f"{self.path}: {self.topics.depth}"
-        image = decode_colour_message(self._colour_messages[i][-1], colour_source)
-        depth = decode_depth_message(self._depth_messages[j][-1], self.camera.depth_scale, depth_source)
-        return self._check_registered(
-            (colour_source, image), (depth_source, depth), "choose depth registered to colour with --depth-topic"
-        )
+    def _sources(self, index: int) -> tuple[str, str]:
+        return f"{self.path}: {self.topics.rgb}", f"{self.path}: {self.topics.depth}"
+
+    def _read_colour(self, index: int) -> Tensor:
+        message = self._colour_messages[self._message_indices[index][0]][-1]
+        return decode_colour_message(message, self._sources(index)[0])
+
+    def _read_depth(self, index: int) -> NDArray[np.generic]:
+        message = self._depth_messages[self._message_indices[index][1]][-1]
+        return decode_depth_message(message, self._sources(index)[1])
 
 
 def is_bag(path: Path) -> bool:
@@ -213,12 +223,16 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
     K, D, P = (getattr(info, name if hasattr(info, name) else name.lower()) for name in "KDP")
     rows = (np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)).tolist()
     intrinsics = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
-    distortion = [] if topics.is_rectified else np.asarray(D).tolist()
-    if any(distortion[5:]) or (any(distortion) and info.distortion_model not in _DISTORTION_MODELS):
-        raise InputError(
-            f"{path}: {topics.info} has the unsupported distortion model {info.distortion_model}; record rectified"
-            " images, or pass --camera with k1, k2, p1, p2, k3"
-        )
+    distortion, model = ([], "") if topics.is_rectified else (np.asarray(D).tolist(), info.distortion_model)
     size = {"width": info.width, "height": info.height, "depth_scale": _DEPTH_SCALE}
-    fields = intrinsics | size | {"distortion": (distortion + [0.0] * 5)[:5]}
-    return camera_from_fields(fields, f"{path}: {topics.info}")
+    lens = {"distortion": distortion, "distortion_model": model}
+    return camera_from_fields(intrinsics | size | lens, f"{path}: {topics.info}")
+
+
+def _image_size(path: Path, topics: BagTopics) -> tuple[int, int]:
+    """Width and height of the first depth image."""
+    message = next((message for _, _, message in _read_messages(path, topics.depth)), None)
+    if message is None:
+        raise InputError(f"{path}: has no messages on {topics.depth}; choose another topic with --depth-topic")
+    height, width = decode_depth_message(message, f"{path}: {topics.depth}").shape
+    return width, height

@@ -1,0 +1,45 @@
+"""Text of the user in figures: no warnings and no boxes for characters that the default font lacks."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from matplotlib import font_manager, get_data_path
+
+from v3d_torch.types import Trajectory
+from v3d_torch.viz.fonts import _characters, _families, drawable_text
+from v3d_torch.viz.trajectory_figure import save_trajectory_figure
+
+NAMES = ["部屋 室", "हिन्दी", "مطبخ", "a\tb\x07\x1b", "two\nlines", "😀\u200d\U000e0001", "$x^{"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_figure_with_any_name_is_drawn_without_warnings(name: str, tmp_path: Path) -> None:
+    poses = Trajectory(torch.arange(3.0), torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    with warnings.catch_warnings(action="error"):
+        save_trajectory_figure(None, poses, tmp_path / "figure.png", name)
+
+
+def test_text_of_the_default_font_is_unchanged() -> None:
+    for name in ("fr3/w/xyz", "кухня", "Größe", "two\nlines"):
+        assert drawable_text(name) == (name, ["DejaVu Sans"])
+
+
+def test_characters_without_a_font_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v3d_torch.viz.fonts._families", dict)
+    assert drawable_text("部屋 1\t2") == ("?? 1 2", ["DejaVu Sans"])
+
+
+def test_characters_of_another_font_are_drawn_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The font of mathematics that comes with matplotlib has letters that the default font lacks."""
+    path = str(Path(get_data_path()) / "fonts/ttf/STIXNonUni.ttf")
+    letter = min(_characters(path) - _characters(font_manager.findfont("DejaVu Sans")))
+    monkeypatch.setattr("v3d_torch.viz.fonts._families", lambda: {"broken": "/dev/null", "STIXNonUnicode": path})
+    assert drawable_text(f"a{letter}部") == (f"a{letter}?", ["DejaVu Sans", "STIXNonUnicode"])
+
+
+def test_fonts_of_boxes_are_not_used() -> None:
+    assert _families() and not any(name.startswith("Last Resort") for name in _families())

@@ -1,0 +1,136 @@
+"""Stored sequences whose colour and depth images are read from files or messages, depth in its own unit."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
+
+_MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
+"""Plausible range for the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
+wrong depth scale falls outside of it."""
+
+_SAMPLES = 8
+"""Number of frames from which an unknown depth scale is estimated."""
+
+
+class ImageSequence(StoredSequence):
+    """Base class of sequences that read the colour and depth image of a frame separately.
+
+    The constructor of a subclass ends with `_settle_depth_scale`.
+
+    Args:
+        name: Name of the sequence, used in tables.
+        stamps: Timestamps of the colour images, seconds, strictly increasing.
+        camera: Camera of all frames.
+        groundtruth: Function that reads the measured poses of the camera.
+        delays: Depth delay of each frame (depth stamp minus colour stamp), seconds; None if it is always 0.
+
+    Attributes:
+        depth_scale_note: One sentence that says how the depth scale was estimated; None if it is stated.
+    """
+
+    registration_fix = "export depth that is registered to the colour image"
+    """What to do if colour and depth have different sizes, for messages."""
+
+    def __init__(
+        self,
+        name: str,
+        stamps: Sequence[float],
+        camera: PinholeCamera,
+        groundtruth: ReadGroundTruth | None = None,
+        delays: Sequence[float] | None = None,
+    ) -> None:
+        super().__init__(name, stamps, camera, groundtruth, delays)
+        self.depth_scale_note: str | None = None
+
+    def check_first_frame(self, source: object) -> None:
+        """Decode the first frame, so that an error common to all frames is reported before anything is computed.
+
+        Args:
+            source: Path of the sequence, for messages.
+
+        Raises:
+            InputError: If the frame cannot be decoded or its median depth is implausible.
+        """
+        depth = self._read(0)[1]
+        median = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
+        if _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
+            return
+        found = f"{source}: the median depth of the first frame is {median:.2g} m"
+        if self._read_depth(0).dtype.kind == "f" or self.camera.depth_scale is None:
+            raise InputError(f"{found}, although depth in floating point is in metres; export it in metres")
+        raise InputError(
+            f"{found} at {self.camera.depth_scale:g} units per metre; correct the camera's depth_scale (1000 if depth"
+            " is in millimetres) or the depth images"
+        )
+
+    @abstractmethod
+    def _sources(self, index: int) -> tuple[object, object]:
+        """Return the origins of the colour and depth image of a frame, for messages."""
+
+    @abstractmethod
+    def _read_colour(self, index: int) -> Tensor:
+        """Read the colour image of an existing frame, in the format of `RGBDFrame`."""
+
+    @abstractmethod
+    def _read_depth(self, index: int) -> NDArray[np.generic]:
+        """Read the depth image of an existing frame: whole numbers in units, or metres in floating point, (H, W)."""
+
+    def _read(self, index: int) -> tuple[Tensor, Tensor]:
+        """Read the colour and depth image of an existing frame, in the format of `RGBDFrame`."""
+        colour_source, depth_source = self._sources(index)
+        image = self._read_colour(index)
+        depth = depth_to_metres(self._read_depth(index), self.camera.depth_scale)
+        depth_size, colour_size = (f"{each.shape[2]}x{each.shape[1]}" for each in (depth, image))
+        if depth_size != colour_size:
+            raise InputError(
+                f"{depth_source}: has {depth_size} pixels, but its colour image has {colour_size};"
+                f" {self.registration_fix}"
+            )
+        return self._check_size(colour_source, image), depth
+
+    def _check_size(self, source: object, image: Tensor) -> Tensor:
+        """Return the image (C, H, W) read from ``source`` if it has the camera's size."""
+        height, width = image.shape[1:]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise InputError(
+                f"{source}: has {width}x{height} pixels, but the camera has {self.camera.width}x{self.camera.height};"
+                " pass the camera of these images with --camera"
+            )
+        return image
+
+    def _settle_depth_scale(self, source: object, limit: int | None = None) -> None:
+        """Estimate the depth scale if the camera does not state it and depth has whole numbers.
+
+        Args:
+            source: Path of the sequence, for messages.
+            limit: Number of frames at the beginning from which images are sampled; None for all frames.
+
+        Raises:
+            InputError: If the first depth image cannot be read, or the images do not tell the depth scale.
+        """
+        if self.camera.depth_scale is not None:
+            return
+        images = [self._read_depth(0)]
+        if images[0].dtype.kind == "f":
+            return
+        last = len(self) - 1 if limit is None else min(len(self), limit) - 1
+        for index in dict.fromkeys(np.linspace(0, last, _SAMPLES).astype(int).tolist()):
+            with suppress(InputError):  # reported when the frame is processed
+                images += [self._read_depth(index)] if index else []
+        estimate = estimate_depth_scale(images)
+        if estimate.depth_scale is None:
+            raise InputError(f"{source}: {estimate.question}")
+        self.camera = replace(self.camera, depth_scale=estimate.depth_scale)
+        self.depth_scale_note = estimate.note
