@@ -36,7 +36,7 @@ from v3d_torch.datasets.realsense import RealSenseStream
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
-OPEN_LIVE_DEVICE = "v3d_torch.datasets.realsense.realsense_stream.open_live_device"
+OPEN_LIVE_DEVICE = "v3d_torch.datasets.realsense.realsense_camera.open_live_device"
 
 
 def take_frames(stream: RGBDStream, count: int) -> list[Any]:
