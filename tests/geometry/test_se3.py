@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log
+from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
@@ -114,3 +114,9 @@ def test_exp_and_log_gradcheck(angle: float) -> None:
     xi = tangents(angle, 2).requires_grad_()
     assert torch.autograd.gradcheck(se3_exp, xi)
     assert torch.autograd.gradcheck(lambda x: se3_log(se3_exp(x)), xi)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_adjoint_moves_tangent_vectors_to_another_frame(angle: float) -> None:
+    T, xi = se3_exp(tangents(angle)), tangents(0.3)
+    torch.testing.assert_close(T @ se3_exp(xi) @ invert(T), se3_exp((adjoint(T) @ xi[..., None])[..., 0]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Iterator
@@ -78,7 +79,7 @@ def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -
     live(lambda result: (results.append(result), on_result(result)))
     indices = [result.frame.index for result in results]
     assert indices[0] == 0 and indices[-1] == FRAMES - 1 and len(indices) <= 4
-    assert [result.dropped for result in results[1:]] == [b - a - 1 for a, b in zip(indices, indices[1:], strict=False)]
+    assert [result.dropped for result in results[1:]] == [b - a - 1 for a, b in itertools.pairwise(indices)]
     assert live.dropped == FRAMES - len(indices) == sum(result.dropped for result in results)
 
 
