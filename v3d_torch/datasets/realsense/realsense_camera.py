@@ -69,7 +69,7 @@ class RealSenseCamera(RealSenseStream):
                     device_stamp, colour, depth = image
                     now = time.monotonic()
                     if shift is None:
-                        shift = _clock_shift(stamp + now - arrival, device_stamp)
+                        shift = _clock_shift(stamp, stamp + now - arrival, device_stamp)
                     stamp, arrival = device_stamp + shift, now
                     self._captured_at = _capture_time(self.name, device_stamp, colour, now)
                     frame = self._convert_frame(index, stamp, colour, depth, device)
@@ -117,9 +117,16 @@ class RealSenseCamera(RealSenseStream):
         return None
 
 
-def _clock_shift(expected: float, stamp: float) -> float:
-    """Difference to add to the stamps of a camera after an interruption, seconds."""
-    return 0.0 if abs(stamp - expected) <= _MAX_CLOCK_JUMP else expected - stamp
+def _clock_shift(previous: float, expected: float, stamp: float) -> float:
+    """Difference to add to the stamps of a camera after an interruption, seconds.
+
+    Args:
+        previous: Last stamp before the interruption.
+        expected: The same plus the time that has passed on the computer.
+        stamp: First stamp after it.
+    """
+    continues = stamp > previous and abs(stamp - expected) <= _MAX_CLOCK_JUMP
+    return 0.0 if continues else expected - stamp
 
 
 def _capture_time(name: str, stamp: float, colour: Any, arrival: float) -> float:
