@@ -58,9 +58,9 @@ class RealSenseCamera(RealSenseStream):
                 another one.
         """
         self._stopped.clear()
-        device: Device | None = self._open_device()
-        gravity = gravity_direction(device.measure_accelerations(), self.name)
-        serial = device.serial
+        first = self._open_device()
+        gravity = gravity_direction(first.measure_accelerations(), self.name)
+        device: Device | None = first
         index, stamp, arrival = 0, 0.0, 0.0
         while device is not None:
             shift: float | None = None if index else 0.0
@@ -75,7 +75,7 @@ class RealSenseCamera(RealSenseStream):
                     frame = self._convert_frame(index, stamp, colour, depth, device)
                     yield frame if index else replace(frame, gravity=gravity)
                     index += 1
-            device = self._reopen(serial)
+            device = self._reopen(first.serial)
 
     def captured_at(self, frame: RGBDFrame) -> float:
         """Return the time of capture of the newest frame in the clock of the computer, seconds.
