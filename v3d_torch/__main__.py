@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from types import ModuleType
-from typing import Annotated
 
 import typer
 
 from v3d_torch.cli import ablate, batch, evaluate, record, report, reproduce, run
+from v3d_torch.cli.options import Version
 
 COMMANDS: tuple[ModuleType, ...] = (run, batch, evaluate, ablate, reproduce, record, report)
 """Modules that define one command each; the command has the name of its module."""
@@ -19,18 +18,8 @@ for _module in COMMANDS:
     app.command(_module.__name__.rpartition(".")[2], cls=_command.cls)(_command.callback)
 
 
-def _print_version(requested: bool) -> None:
-    if requested:
-        typer.echo(f"v3d-torch {version('v3d-torch')}")
-        raise typer.Exit
-
-
 @app.callback()
-def main(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
+def main(version: Version = False) -> None:
     """V3D-SLAM: RGB-D SLAM for dynamic indoor scenes."""
 
 

@@ -31,6 +31,7 @@ from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.stage_checks import ReplaceableStages
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
@@ -55,12 +56,13 @@ PREFETCHED_FRAMES = 4
 and preprocessing continues meanwhile."""
 
 
-class V3DSLAM:
+class V3DSLAM(ReplaceableStages):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature. `compensate`, `register`, `track_map` and `loop_closer` are also used inside other stages, which keep
-    their own references. `preprocess` uses the stages that need the frame alone, and can run ahead of `track`.
+    signature, whose results are then checked. `compensate`, `register`, `track_map` and `loop_closer` are also used
+    inside other stages, which keep their own references. `preprocess` uses the stages that need the frame alone, and
+    can run ahead of `track`.
 
     Args:
         camera: Camera of all frames.
@@ -89,7 +91,7 @@ class V3DSLAM:
         config: Config | None = None,
         known_map: SparseMap | None = None,
     ) -> None:
-        check_parameters(camera, config)
+        check_parameters(camera, segment, config)
         self.camera = camera
         self.config = config = config or Config()
         self.timer = StageTimer()

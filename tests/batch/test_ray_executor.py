@@ -89,6 +89,8 @@ def test_killed_job_fails_and_stop_ends_running_jobs(nodes: Nodes, moment: Path,
             elif event.frames and None in ends.values():
                 stop.set()
     assert killed is not None and "died unexpectedly" in str(ends[killed])
+    (job,) = (job for job in planned if job.config.seed == killed)
+    assert (job.folder / "run.log").read_text().splitlines()[-1].endswith(f"ERROR {ends[killed]}")
     succeeded = [seed for seed, failure in ends.items() if failure is None]
     stopped = [seed for seed, failure in ends.items() if failure is not None and "interrupted after" in failure]
     assert succeeded and stopped and len(succeeded) + len(stopped) == len(ends) - 1

@@ -24,6 +24,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.cli.reproduce import app
 from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets import PAPER_SEQUENCES, locate, short_name
+from v3d_torch.datasets.tum_extents import EXTENTS
 from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.evaluation.paper_tables import load_paper_scores
 
@@ -46,6 +47,13 @@ def table_in(document: str, heading: str) -> dict[str, dict[str, str]]:
     section = document.partition(f"## {heading}\n")[2].partition("\n## ")[0]
     lines = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("|")]
     return {line[0]: dict(zip(lines[0], line, strict=True)) for line in lines[2:]}
+
+
+def mark(full_name: str) -> str:
+    """Name in the tables; the sequences on the server have the names, but not the frames, of the benchmark."""
+    name = short_name(full_name)
+    frames = EXTENTS[name].frames.number
+    return f"{name} (another recording: 6 frames, not {frames})" if full_name in SERVED else name
 
 
 def plain(cell: str) -> str:
@@ -137,8 +145,9 @@ def test_missing_sequences_are_downloaded_run_and_tabulated(server: str, tmp_pat
         ("rpe_rot", "RPE, deg/s", ("rpe", "rot")),
     ):
         table = table_in(document, heading)
-        assert list(table) == SHORT
-        for full_name, (sequence, cells) in zip(PAPER_SEQUENCES, table.items(), strict=True):
+        assert list(table) == [mark(name) for name in PAPER_SEQUENCES]
+        for full_name, (label, cells) in zip(PAPER_SEQUENCES, table.items(), strict=True):
+            sequence = label.partition(" (")[0]
             score = load_paper_scores()[metric][sequence]["V3D-SLAM"].rmse
             assert plain(cells["V3D-SLAM (paper)"]) == f"{score:.4f}"
             if full_name not in SERVED:
@@ -149,6 +158,12 @@ def test_missing_sequences_are_downloaded_run_and_tabulated(server: str, tmp_pat
                 metrics = metrics[place]
             assert plain(cells["baseline"]) == f"{metrics['rmse']:.4f}"
     assert "not here" in result.stdout and "ORB-SLAM2" in result.stdout
+    runs = pd.read_parquet(out / "runs.parquet").set_index("sequence")["difference"]
+    for name in SERVED:
+        difference = mark(name).partition(" (")[2].removesuffix(")")
+        assert result.stdout.count(f"({difference})") == 4  # the line of the run, and three tables
+        assert difference in (out / "summary.tex").read_text() and difference in (out / "summary.csv").read_text()
+        assert runs[short_name(name)] == difference
     assert not (out / "ablation.md").exists()
 
     before = {path: path.stat().st_mtime_ns for path in out.rglob("metrics.json")}

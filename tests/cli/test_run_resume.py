@@ -20,6 +20,7 @@ import torch
 from helpers.commands import assert_error_line
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
+from helpers.walker_folder import write_walker
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch.job import Job
@@ -38,22 +39,7 @@ RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "tr
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A camera moves along a wall of noise; a person walks in front of the wall, with id images in ``ids``."""
-    folder = tmp_path_factory.mktemp("sequences") / "seq"
-    stamps = [f"{1305031102 + i / 10:.6f}" for i in range(FRAMES)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(base, "STAMPS", stamps)
-        patch.setattr(base, "FRAMES", FRAMES)
-        patch.setattr(base, "camera_position", lambda frame: (frame, 4 + 2 * (frame % 4)))
-        base.write_base(folder)
-    (folder / "ids").mkdir()
-    for i, stamp in enumerate(stamps):
-        depth, ids = base.depth(), np.zeros((base.HEIGHT, base.WIDTH), np.uint8)
-        walker = slice(10 + 2 * i, 26 + 2 * i)
-        depth[20:, walker], ids[20:, walker] = 0.6 * base.SCALE, 1
-        (folder / "depth" / f"{stamp}.png").write_bytes(base.png(depth))
-        (folder / "ids" / f"{stamp}.png").write_bytes(base.png(ids))
-    return folder
+    return write_walker(tmp_path_factory.mktemp("sequences") / "seq", FRAMES)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -233,7 +219,8 @@ def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole
     out = tmp_path / "out"
     with full_from_frame(6):
         done = call(*run_arguments(sequence, out, "--save-masks", "--serial", *CHECKPOINT_EVERY_FRAME))
-    assert_error_line(done, "cannot be written (File too large); free the disk or choose another folder")
+    message = "cannot be written (File too large); free the disk or choose another folder"
+    assert_error_line(done, f"{message}; resume with --resume {out}\n")
     assert len((out / "trajectory.txt").read_text().splitlines()) == 6
     done = call("--resume", out)
     assert done.exit_code == 0 and f"resuming after 6 of {FRAMES} frames" in done.stdout, done.stderr
@@ -318,18 +305,54 @@ def test_same_options_beside_resume_do_not_conflict(sequence: Path, whole_run: P
     assert (out / "trajectory.txt").read_bytes() == (whole_run / "trajectory.txt").read_bytes()
 
 
-def shorten(folder: Path) -> str:
+def remove_row(folder: Path, frame: int) -> None:
     for name in ("rgb.txt", "depth.txt"):
-        path = folder / name
-        path.write_text("".join(path.read_text().splitlines(keepends=True)[:16]))
-    return f"16 frames instead of {FRAMES}"
+        rows = (folder / name).read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(rows[:frame] + rows[frame + 1 :]))
+
+
+def change_file(folder: Path, frame: int) -> Path:
+    """Replace a colour image by another one."""
+    path = sorted((folder / "rgb").iterdir())[frame]
+    image = cv2.imread(str(path))
+    image[:30] //= 2
+    path.write_bytes(base.png(image))
+    return path
+
+
+def remove_row_and_its_file(folder: Path) -> None:
+    remove_row(folder, 12)
+    sorted((folder / "rgb").iterdir())[12].unlink()
 
 
 def shift_timestamps(folder: Path) -> str:
     for name in ("rgb.txt", "depth.txt"):
         path = folder / name
         path.write_text(path.read_text().replace(".300000 ", ".310000 "))
-    return "other timestamps"
+    return "the frame at 1305031102.300000 s is missing"
+
+
+def remove_processed_frame(folder: Path) -> str:
+    remove_row(folder, 2)
+    return "the frame at 1305031102.200000 s is missing"
+
+
+def add_frame(folder: Path) -> str:
+    for name in ("rgb.txt", "depth.txt"):
+        path = folder / name
+        path.write_text(path.read_text() + path.read_text().splitlines()[4].replace(".400000 ", ".150000 ", 1) + "\n")
+    return "the frame at 1305031102.150000 s is new"
+
+
+def cut_before_last_processed_frame(folder: Path) -> str:
+    for name in ("rgb.txt", "depth.txt"):
+        path = folder / name
+        path.write_text("".join(path.read_text().splitlines(keepends=True)[:4]))
+    return "the frame at 1305031102.400000 s is missing"
+
+
+def change_processed_file(folder: Path) -> str:
+    return f"{change_file(folder, 2)} has changed"
 
 
 def change_camera(folder: Path) -> str:
@@ -339,13 +362,22 @@ def change_camera(folder: Path) -> str:
 
 def change_last_image(folder: Path) -> str:
     path = sorted((folder / "rgb").iterdir())[4]
-    image = cv2.imread(str(path))
-    image[0, 0] += 1
+    size, image = path.stat().st_size, cv2.imread(str(path))
+    for change in range(1, 256):  # to an image whose file has the same size
+        image[0, 0] += np.uint8(change)
+        if len(base.png(image)) == size:
+            break
     path.write_bytes(base.png(image))
     return "frame 4 shows another image"
 
 
-@pytest.mark.parametrize("change", [shorten, shift_timestamps, change_camera, change_last_image])
+CHANGES = (
+    *(shift_timestamps, remove_processed_frame, add_frame, cut_before_last_processed_frame),
+    *(change_camera, change_processed_file, change_last_image),
+)
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_changed_sequence_is_rejected(change: Callable[[Path], str], sequence: Path, out: Path, tmp_path: Path) -> None:
     shutil.copytree(sequence, tmp_path / "moved")
     difference = change(tmp_path / "moved")
@@ -355,6 +387,21 @@ def test_changed_sequence_is_rejected(change: Callable[[Path], str], sequence: P
         f"{tmp_path / 'moved'}: has changed since the run in {out} began ({difference}); restore the sequence, or",
     )
     assert len((out / "trajectory.txt").read_text().splitlines()) == 5
+
+
+@pytest.mark.parametrize(
+    "change", [lambda folder: remove_row(folder, 7), lambda folder: change_file(folder, 9), remove_row_and_its_file]
+)
+def test_run_resumes_if_only_frames_that_were_not_processed_have_changed(
+    change: Callable[[Path], object], sequence: Path, out: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(sequence, tmp_path / "seq")
+    change(tmp_path / "seq")
+    expected = call(*run_arguments(tmp_path / "seq", tmp_path / "expected", "--serial"))
+    assert expected.exit_code == 0, expected.stderr
+    done = call("--resume", out, "--seq", tmp_path / "seq")
+    assert done.exit_code == 0, done.stderr
+    assert_same_results(out, tmp_path / "expected")
 
 
 def test_resumed_run_ignores_data_folder_of_the_environment(

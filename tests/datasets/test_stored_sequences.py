@@ -105,6 +105,17 @@ def test_associations_are_read_in_either_order(folder: Path, swapped: bool) -> N
     assert np.array_equal(sequence[1].image.permute(1, 2, 0).numpy(), colour_of(2))
 
 
+@pytest.mark.parametrize("swapped", [False, True], ids=["colour first", "depth first"])
+def test_order_of_associations_is_recognised_if_the_first_file_is_broken(folder: Path, swapped: bool) -> None:
+    (folder / "depth" / "0.png").write_bytes(b"")
+    sides = [[f"{10 + i}.0 rgb/{i}.png", f"{10 + i}.5 depth/{i}.png"] for i in (0, 1)]
+    lines = [" ".join(reversed(pair) if swapped else pair) for pair in sides]
+    (folder / "associations.txt").write_text("\n".join(lines))
+    sequence = load_sequence(str(folder), skip_broken=True)
+    assert sequence.stamps.tolist() == [10.0, 11.0]
+    assert np.array_equal(sequence[1].image.permute(1, 2, 0).numpy(), colour_of(1))
+
+
 def test_duplicate_and_unsorted_stamps_are_sorted_once(folder: Path) -> None:
     (folder / "rgb.txt").write_text("12 rgb/2.png\n10 rgb/0.png\n10 rgb/1.png\n")
     sequence = load_sequence(str(folder))

@@ -50,6 +50,17 @@ def test_variant_whose_runs_all_failed_has_a_dash() -> None:
     assert "| variant | failed |\n| --- | ---: |\n| full | 2 |" in format_markdown(outcomes({"full": [None, None]}))
 
 
+def test_part_of_a_sequence_is_marked() -> None:
+    runs = outcomes({"baseline": [0.5], "full": [0.1]})
+    part = "part: 60 of 827 frames"
+    marked = [Outcome(run.sequence, run.config, run.seed, {**run.metrics, "difference": part}) for run in runs]
+    assert f"## s ({part})" in format_markdown(marked)
+    assert str(make_screen_table(marked).title) == f"Ablation on s ({part})"
+    assert {row["difference"] for row in csv.DictReader(format_csv(marked).splitlines())} == {part}
+    overview = make_overview_table(marked)
+    assert overview is not None and f"s ({part})" in overview.rows
+
+
 def test_mask_metrics_have_no_best() -> None:
     def masks(variant: str, fraction: float) -> Outcome:
         scores = {"moving_masked": fraction, "static_masked": fraction / 10, "id_switches_per_60_frames": fraction}

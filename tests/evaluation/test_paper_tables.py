@@ -76,6 +76,15 @@ def test_paper_table_compares_result_with_paper() -> None:
     assert "deg/s" in text
 
 
+def test_paper_table_marks_a_part_of_the_sequence_and_no_best_value() -> None:
+    groundtruth = random_walk(60, seed=22)
+    evaluation = evaluate(groundtruth, noisy(groundtruth, seed=23, sigma=1e-4))
+    table = make_paper_table("fr3/w/xyz", evaluation, "part: 60 of 827 frames")
+    assert table is not None
+    assert list(table.columns[0].cells)[-1] == "this result (part: 60 of 827 frames)"
+    assert not any("green" in str(cell) for column in table.columns for cell in column.cells)
+
+
 def test_paper_table_omits_rpe_over_other_delta() -> None:
     groundtruth = random_walk(90, seed=24)
     table = make_paper_table("fr3/w/xyz", evaluate(groundtruth, noisy(groundtruth, seed=25), rpe_delta=2.0))

@@ -45,6 +45,14 @@ OUTCOMES = [
 """Outcomes on one of the paper's sequences and on another sequence."""
 
 
+PART = "part: 60 of 827 frames"
+PARTS = [
+    Outcome(run.sequence, run.config, run.seed, {**run.metrics, "difference": PART})
+    for run in runs("fr3/w/xyz", "full", 0.001) + runs("fr3/w/xyz", "paper", 0.5)
+]
+"""Outcomes on a part of a sequence of the paper."""
+
+
 def rows(text: str) -> list[list[str]]:
     """Cells of all table rows of a Markdown document."""
     return [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
@@ -158,3 +166,20 @@ def test_screen_table_fits_and_brackets_are_not_markup() -> None:
     for words in ("my & [own]", "[0.0100-0.0151]", "V3D-SLAM", "1 failed", "RPE, deg/s"):
         assert words in text
     assert "…" not in text and "DynaSLAM" not in text
+
+
+def test_part_of_a_sequence_is_marked_in_all_tables() -> None:
+    outcomes = [*PARTS, *runs("fr3/s/xyz", "full", 0.02)]
+    label = f"fr3/w/xyz ({PART})"
+    markdown = rows(format_markdown(outcomes))
+    assert [row[0] for row in markdown[2:4]] == [label, "fr3/s/xyz"]
+    assert markdown[2][1] == "0.0010" and "**" not in "".join(markdown[2])  # no value is the best of a part
+    assert label in format_latex(outcomes)
+    records = list(csv.DictReader(format_csv(outcomes).splitlines()))
+    assert {row["difference"] for row in records if (row["sequence"], row["method"]) == ("fr3/w/xyz", "full")} == {PART}
+    assert {row["difference"] for row in records if row["sequence"] == "fr3/s/xyz"} == {""}
+    console = Console(width=200, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    for table in make_screen_tables(outcomes):
+        console.print(table)
+    assert console.export_text().count(f"({PART})") == 3
+    assert str(PARTS[0]) == f"fr3/w/xyz, full, seed 0: ATE 0.0010 m ({PART})"

@@ -30,6 +30,7 @@ LAYERS = (
         "segmentation",
     ),
     *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "evaluation", "frame_result"),
+    "stage_checks",
     *("slam", "live", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
 )
 """Folders and modules of the package's root, from low to high: a layer imports only from itself and lower layers."""

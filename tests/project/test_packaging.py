@@ -143,7 +143,8 @@ def test_help_loads_no_heavy_library_and_version_is_printed() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
     assert "--segmenter" in done.stdout and done.stdout.rstrip().endswith("set()")
-    assert CliRunner().invoke(app, ["--version"]).output == f"v3d-torch {version('v3d-torch')}\n"
+    for arguments in (["--version"], ["run", "--version"]):
+        assert CliRunner().invoke(app, arguments).output == f"v3d-torch {version('v3d-torch')}\n"
 
 
 @pytest.mark.parametrize("module", COMMANDS, ids=lambda module: module.__name__.rpartition(".")[2])

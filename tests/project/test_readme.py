@@ -5,13 +5,18 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from typer.main import get_command
 
 import v3d_torch
 from v3d_torch.__main__ import COMMANDS
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import TrackingStatus
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -68,6 +73,29 @@ def test_readme_example_runs(moment: Path, monkeypatch: pytest.MonkeyPatch, caps
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == len(names["trajectory"]) == 6  # type: ignore[arg-type]
     assert re.fullmatch(r"\d\.\d\d s, tracked: camera at \[.*\], moving: \[.*\]", lines[-1])
+
+
+def test_stages_of_the_documentation_run(moment: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The segmenter, the depth stage and the odometry of the page track the demo as the built-in stages do."""
+    sequence = load_sequence(str(moment))
+    monkeypatch.setattr(v3d_torch, "load_sequence", lambda name: sequence)
+    no_boxes = torch.zeros(0, 4), torch.zeros(0, dtype=torch.int64), torch.zeros(0)
+    names: dict[str, Any] = {"my_detector": lambda image: no_boxes}
+    for code in blocks(ROOT / "docs" / "your_stage.md", "python"):
+        exec(compile(code, "your_stage.md", "exec"), names)  # noqa: S102
+    no_network = load_config(overrides=["segmentation.source=masks"])
+    expected = V3DSLAM(sequence.camera, names["Detector"](), no_network)
+    slam = V3DSLAM(sequence.camera, names["Detector"](), no_network)
+    slam.smooth_depth, slam.odometry = names["MedianDepth"](), names["PnPOdometry"](sequence.camera)
+    measured = []
+    for frame in sequence:
+        difference = expected(frame).T_wc[:3, 3] - slam(frame).T_wc[:3, 3]
+        assert difference.norm() < 0.01 and slam.poses.status is TrackingStatus.TRACKED
+        measured.append(slam.poses.has_motion)
+    assert measured == [False, *[True] * 5]
+    depth = sequence[0].depth[None]
+    assert torch.equal(slam.smooth_depth(depth) > 0, depth > 0)
+    assert not torch.equal(slam.smooth_depth(depth), depth)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 from torch import nn
@@ -17,6 +16,7 @@ from v3d_torch.segmentation.networks import LayerGraph, one_to_one, yolo11n_seg,
 from v3d_torch.segmentation.networks.attention import Attention
 from v3d_torch.segmentation.networks.head import DFL, Segment, dense_branch
 from v3d_torch.segmentation.networks.prototypes import Proto
+from v3d_torch.segmentation.onnx_runtime import import_onnxruntime
 
 BUILDERS = [yolov8n_seg, yolo11n_seg, yolo26n_seg]
 
@@ -96,7 +96,7 @@ def test_export_gives_the_outputs_of_the_module(builder: Callable[[], LayerGraph
     path = tmp_path / "network.onnx"
     export(network, 64, 96, path)
     onnx.checker.check_model(onnx.load(path))
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    session = import_onnxruntime().InferenceSession(path, providers=["CPUExecutionProvider"])
     assert [node.name for node in session.get_outputs()] == ["output0", "output1"]
     image = torch.rand(1, 3, 64, 96)
     with torch.inference_mode():

@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 
 import onnx
-import onnxruntime
 import pytest
 import torch
 from helpers.photographs import photograph
@@ -15,6 +14,7 @@ import v3d_torch.segmentation.yolo
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.segmentation import quantise as module
 from v3d_torch.segmentation.export import exported_path
+from v3d_torch.segmentation.onnx_runtime import import_onnxruntime
 from v3d_torch.segmentation.quantise import quantise, quantised_path
 from v3d_torch.segmentation.weights import find_weights
 from v3d_torch.segmentation.yolo import YOLOSegmenter
@@ -37,7 +37,8 @@ def quantised(original: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_quantisation_keeps_inputs_and_outputs(original: Path, quantised: Path) -> None:
     sessions = [
-        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]) for path in (original, quantised)
+        import_onnxruntime().InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        for path in (original, quantised)
     ]
     for getter in ("get_inputs", "get_outputs"):
         before, after = (

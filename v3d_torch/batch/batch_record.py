@@ -17,7 +17,7 @@ from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("frames", "processed", *TrackingStatus, "keyframes", "loops"), pa.int64()),
+    **dict.fromkeys(("frames", "processed", "skipped", *TrackingStatus, "keyframes", "loops"), pa.int64()),
     **dict.fromkeys(("coverage", "ate.rmse", "ate.std"), pa.float64()),
     **dict.fromkeys(("rpe.trans.rmse", "rpe.trans.std", "rpe.rot.rmse", "rpe.rot.std"), pa.float64()),
     **dict.fromkeys(("masks.moving_masked", "masks.static_masked"), pa.float64()),
@@ -35,6 +35,7 @@ _SCHEMA = pa.schema(
         ("config", pa.string()),
         ("seed", pa.int64()),
         *((key.replace(".", "_"), data_type) for key, data_type in METRIC_TYPES.items()),
+        ("difference", pa.string()),
         ("failure", pa.string()),
         ("path", pa.string()),
     ]
@@ -123,6 +124,7 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         "config": outcome.config,
         "seed": outcome.seed,
         **{key.replace(".", "_"): outcome.get_metric(key) for key in METRIC_TYPES},
+        "difference": outcome.difference,
         "failure": outcome.failure,
         "path": job.folder.relative_to(folder).as_posix(),
     }

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from threading import Event
 from typing import Protocol
 
 from v3d_torch.batch.job import Job
+from v3d_torch.errors import OutputError
+from v3d_torch.runs.log import log_to
+
+_LOG = logging.getLogger(__name__)
 
 ONE_THREAD_ENVIRONMENT = dict.fromkeys(
     (*("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "OPENCV_FOR_THREADS_NUM", "RAYON_NUM_THREADS"),
@@ -40,6 +46,21 @@ class JobFinished:
 
     job: Job
     failure: str | None
+
+
+def report_lost_process(job: Job, reason: str) -> JobFinished:
+    """Write to the log of a job that its process died, which the process itself cannot write.
+
+    Args:
+        job: Job that the process ran.
+        reason: Reason in words.
+
+    Returns:
+        The end of the job.
+    """
+    with suppress(OutputError), log_to(job.folder / "run.log", append=True):
+        _LOG.error(reason)
+    return JobFinished(job, reason)
 
 
 class Executor(Protocol):

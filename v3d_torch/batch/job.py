@@ -26,6 +26,7 @@ class Job:
         config_name: Name of the configuration in tables.
         config: Configuration of the run, including its seed.
         folder: Folder of the results.
+        skip_broken: True to pass over broken frames.
     """
 
     sequence: str
@@ -35,6 +36,7 @@ class Job:
     config_name: str
     config: Config
     folder: Path
+    skip_broken: bool = False
 
     def __str__(self) -> str:
         """Return a one-line description for the screen."""
@@ -60,7 +62,9 @@ class Job:
             InputError: If the earlier run had another configuration.
         """
         metrics = self._read_metrics()
-        if metrics is None or metrics.get("failure") is not None or metrics.get("processed") != self.frames:
+        if metrics is None or metrics.get("failure") is not None:
+            return None
+        if metrics.get("processed", 0) + metrics.get("skipped", 0) != self.frames:
             return None
         try:
             config = load_config(self.folder / "config.yaml")

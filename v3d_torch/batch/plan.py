@@ -58,6 +58,7 @@ def plan_jobs(
     seeds: int,
     data_root: Path | None,
     folder: Path,
+    skip_broken: bool = False,
 ) -> list[Job]:
     """Return the jobs of a batch, ordered by sequence, configuration and seed.
 
@@ -67,6 +68,7 @@ def plan_jobs(
         seeds: Number of runs for each sequence and configuration; their seeds count from 0.
         data_root: Folder of named sequences.
         folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
+        skip_broken: True if runs pass over broken frames.
     """
     return [
         Job(
@@ -77,6 +79,7 @@ def plan_jobs(
             config_name=label,
             config=config.model_copy(update={"seed": seed}),
             folder=folder.absolute() / name.replace("/", "_") / label / f"seed{seed}",
+            skip_broken=skip_broken,
         )
         for name, (source, sequence) in sequences.items()
         for label, config in configs.items()

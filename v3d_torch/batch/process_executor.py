@@ -15,7 +15,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event
 
-from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress
+from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 
@@ -80,7 +80,7 @@ def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> Jo
         message: int | tuple[str | None] = connection.recv()
     except (EOFError, OSError):
         process.join()
-        return JobFinished(job, _describe_exit(process))
+        return report_lost_process(job, _describe_exit(process))
     if isinstance(message, int):
         return JobProgress(job, message)
     process.join()

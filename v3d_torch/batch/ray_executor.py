@@ -10,7 +10,7 @@ from itertools import islice
 from threading import Event
 from typing import Any
 
-from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress
+from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.errors import InputError
@@ -95,7 +95,7 @@ class RayExecutor:
                     except ray.exceptions.TaskCancelledError:  # before it started
                         continue
                     except ray.exceptions.RayError as error:
-                        yield JobFinished(job, f"its process or machine failed ({_first_line(error)})")
+                        yield report_lost_process(job, f"its process or machine failed ({_first_line(error)})")
         except ray.exceptions.RayError as error:
             raise InputError(
                 f"connection to the Ray cluster lost ({_first_line(error)}); repeat the command with --resume to"

@@ -174,7 +174,7 @@ def _open_paper_sequences(
             missing.append(full_name)
             continue
         try:
-            opened[name] = open_sequence(name, data_root, None, console)
+            opened[name] = open_sequence(name, data_root, console)
         except DownloadError as error:
             missing.append(full_name)
             reason = reason or str(error.__cause__ or error)

@@ -42,7 +42,7 @@ def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
                 warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run
-                sequence = load_sequence(job.source, data_root=job.data_root)
+                sequence = load_sequence(job.source, data_root=job.data_root, skip_broken=job.skip_broken)
             if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
                 clear_earlier_results(job.folder)
                 checkpoint = None
@@ -55,7 +55,8 @@ def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
 
 
 def _make_request(job: Job) -> RunRequest:
-    return RunRequest(job.source, job.config, data_root=None if job.data_root is None else str(job.data_root))
+    data_root = None if job.data_root is None else str(job.data_root)
+    return RunRequest(job.source, job.config, data_root=data_root, skip_broken=job.skip_broken)
 
 
 def _matching_checkpoint(job: Job) -> Checkpoint | None:
@@ -65,7 +66,7 @@ def _matching_checkpoint(job: Job) -> Checkpoint | None:
     except InputError:
         return None
     request, wanted = checkpoint.request, _make_request(job).absolute()
-    same = replace(request, config=single_threaded(request.config)) == replace(
+    same = replace(request, config=single_threaded(request.config), skip_broken=job.skip_broken) == replace(
         wanted, config=single_threaded(wanted.config)
     )
     return checkpoint if same else None

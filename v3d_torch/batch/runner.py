@@ -36,6 +36,7 @@ def run_batch(
     resume: bool,
     data_root: Path | None,
     ray: str | None,
+    skip_broken: bool,
 ) -> None:
     """Run every sequence with every configuration and seed; arguments as in ``v3d-torch batch --help``.
 
@@ -48,11 +49,11 @@ def run_batch(
     configs = load_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
     names = matching_sequences(patterns, data_root)
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
-    opened = open_sequences(names, data_root, console)
+    opened = open_sequences(names, data_root, console, skip_broken=skip_broken)
     sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
     prepare_networks(configs)
     folder = make_result_folder(out, "batch")
-    jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder)
+    jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder, skip_broken=skip_broken)
     run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume)
 
 
@@ -126,5 +127,5 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                 "interrupted twice: the running jobs were killed; repeat the command with --resume to continue"
             ) from interrupt
     if write_error is not None:
-        raise write_error
+        raise OutputError(f"{write_error}; then repeat the command with --resume to continue") from write_error
     return stop.is_set()

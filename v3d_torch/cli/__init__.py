@@ -1,1 +1,9 @@
 """The commands of the package."""
+
+import os
+
+from v3d_torch.io.download import cache_dir
+
+# matplotlib reads this variable when it is imported. It keeps its list of fonts in the folder, and looks there for a
+# matplotlibrc, which would change the figures.
+os.environ.setdefault("MPLCONFIGDIR", str(cache_dir() / "matplotlib"))

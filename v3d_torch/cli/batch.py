@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, make_app, workers_option
+from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, SkipBroken, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
 
 app = make_app()
@@ -40,6 +40,7 @@ def main(
         ),
     ] = None,
     resume: Resume = False,
+    skip_broken: SkipBroken = False,
     data_root: DataRoot = None,
     ray: Annotated[
         str | None,
@@ -65,4 +66,5 @@ def main(
             resume=resume,
             data_root=data_root,
             ray=ray,
+            skip_broken=skip_broken,
         )

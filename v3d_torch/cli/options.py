@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,11 +26,29 @@ InfoTopic = Annotated[
     str | None, typer.Option(help="Topic of the camera info of the colour images in a bag [detected].")
 ]
 Fps = Annotated[float | None, typer.Option(help="Frame rate in Hz, for a live camera or a source without timestamps.")]
+SkipBroken = Annotated[
+    bool,
+    typer.Option(
+        "--skip-broken",
+        help="Pass over broken frames of a stored sequence with a warning, at most 5 % of the frames or 10.",
+    ),
+]
 Seeds = Annotated[
     int, typer.Option(min=1, help="Number of runs of each sequence and configuration, with seeds from 0.")
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue the batch in --out: run only what is missing or has failed.")
+]
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        typer.echo(f"v3d-torch {version('v3d-torch')}")
+        raise typer.Exit
+
+
+Version = Annotated[
+    bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
 ]
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
+from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, SkipBroken, Version, make_app
 from v3d_torch.io.paths import expand_user_paths
 
 app = make_app()
@@ -45,6 +45,7 @@ def main(
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results [results/<sequence>/<time>].")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the masked pixels of each frame.")] = False,
+    skip_broken: SkipBroken = False,
     viz: Annotated[str | None, typer.Option(help="Show the run live with a viewer: rerun.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="Record the run for rerun in this .rrd file.")] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
@@ -64,6 +65,7 @@ def main(
     resume: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run that wrote its results there.")
     ] = None,
+    version: Version = False,
 ) -> None:
     """Track an RGB-D camera, and map the static part of the scene."""
     from v3d_torch.datasets.locate import check_name
@@ -105,6 +107,7 @@ def main(
             save_map=_text(save_map),
             save_masks=save_masks,
             realtime=realtime,
+            skip_broken=skip_broken,
         )
         if resume is None:
             start_run(request, out, display)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,8 +15,10 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDStream, open_source
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
@@ -23,7 +26,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import ProgressBar, print_assumptions, progress_bars, run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.stage_table import stage_table
@@ -94,7 +97,7 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
 
     Args:
         folder: Folder of its results.
-        given: Options given with ``--resume``. Only the location of the sequence can differ from the run.
+        given: Options given with ``--resume``. Only those in `CHANGEABLE` can differ from those of the run.
         choice: Configuration given with ``--resume``.
         out: The same folder, or None.
         display: Output on the screen.
@@ -113,8 +116,8 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
         raise InputError(f"{option}: conflicts with the run in {folder}; remove this option")
     if (option := choice.conflict(request.config)) is not None:
         raise ConfigError(f"{option}: conflicts with the run in {folder}; remove this option")
-    moved = {name: value for name in ("seq", "data_root") if (value := getattr(given, name))}
-    _run(replace(request, **moved), folder, checkpoint, display)
+    changed = {name: value for name in CHANGEABLE if (value := getattr(given, name))}
+    _run(replace(request, **changed), folder, checkpoint, display)
 
 
 def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, display: Display) -> None:
@@ -139,13 +142,17 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if masks is not None and masks.resolve() == (folder / "masks").resolve():
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if checkpoint is not None:
-        console.print(f"resuming after {checkpoint.frames} of {checkpoint.sequence['frames']} frames", markup=False)
-    pipeline, evaluation = run_with_progress(
-        lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
-        folder,
-        console,
-        checkpoint,
-    )
+        total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
+        console.print(f"resuming after {checkpoint.frames} of {total} frames", markup=False)
+    try:
+        pipeline, evaluation = run_with_progress(
+            lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
+            folder,
+            console,
+            checkpoint,
+        )
+    except OutputError as error:
+        raise OutputError(f"{error}{_way_to_resume(folder)}") from error
     if map_file is not None:
         save_map(map_file, pipeline.slam.map, pipeline.views)
     _print_summary(request, display, folder, pipeline, evaluation, console)
@@ -159,6 +166,7 @@ def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
             camera=request.camera,
             options=request.source_options,
             progress=ProgressBar(progress, "sequence"),
+            skip_broken=request.skip_broken,
         )
     return RealtimePlayback(source) if request.realtime else source
 
@@ -181,9 +189,13 @@ def _print_summary(
         InputError: If the run ended early, or its results are incomplete.
     """
     record = pipeline.record
-    console.print(_summary_table(pipeline, evaluation))
-    if evaluation is not None and (table := make_paper_table(pipeline.sequence.name, evaluation)) is not None:
-        console.print(table)
+    difference = describe_difference(pipeline.sequence)
+    console.print(_summary_table(pipeline, evaluation, difference))
+    if record.failure is not None:
+        difference = difference or f"part: {len(pipeline.slam.poses)} of {pipeline.frame_count} frames"
+    paper = None if evaluation is None else make_paper_table(pipeline.sequence.name, evaluation, difference)
+    if paper is not None:
+        console.print(paper)
     if display.profile and record.times:
         console.print(stage_table(record))
     for note in evaluation.notes if evaluation is not None else ():
@@ -193,8 +205,8 @@ def _print_summary(
     console.print(f"results: {folder}", markup=False)  # the name can contain brackets
     if record.failure is not None:
         frames = len(pipeline.slam.poses)
-        resume = f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
-        raise InputError(f"{record.failure} (the results of the {frames} frames before are in {folder}{resume})")
+        results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"
+        raise InputError(f"{record.failure} ({results})")
     if request.load_map is not None and not pipeline.slam.poses.is_located:
         raise InputError(
             f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
@@ -204,12 +216,19 @@ def _print_summary(
         raise InputError(f"{problem} (the results are in {folder})")
 
 
-def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None) -> Table:
+def _way_to_resume(folder: Path) -> str:
+    """Return the end of a message on a run that ended early: how to resume it; empty if it has no checkpoint."""
+    return f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
+
+
+def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference: str | None) -> Table:
     slam, record = pipeline.slam, pipeline.record
     statuses = Counter(slam.poses.statuses)
     motion_states = record.dynamics.count_motion_states()
-    table = Table(title=f"V3D-SLAM on {escape(pipeline.sequence.name)}", show_header=False)
-    table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}")
+    label = label_sequence(pipeline.sequence.name, difference)
+    table = Table(title=f"V3D-SLAM on {escape(label)}", show_header=False)
+    broken = f", {len(record.broken)} broken ones passed over" if record.broken else ""
+    table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}{broken}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     active = slam.map.active_keyframes
     known = sum(keyframe.is_from_earlier_run for keyframe in active)

@@ -6,12 +6,13 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence
+from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence, max_broken_frames
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
@@ -54,26 +55,45 @@ class ImageSequence(StoredSequence):
         super().__init__(name, stamps, camera, groundtruth, delays)
         self.depth_scale_note: str | None = None
 
-    def check_first_frame(self, source: object) -> None:
-        """Decode the first frame, so that an error common to all frames is reported before anything is computed.
+    def check(self, source: object, *, skip_broken: bool = False) -> None:
+        """Check that all files exist, and decode the first frame, so that errors are reported before a long run.
 
         Args:
             source: Path of the sequence, for messages.
+            skip_broken: True if files can be missing, and if frames at the start can be broken.
 
         Raises:
-            InputError: If the frame cannot be decoded or its median depth is implausible.
+            InputError: If a file is missing, the frame cannot be decoded, or its median depth is implausible.
         """
-        depth = self._read(0)[1]
+        missing = [file for index in range(len(self)) for file in self.files(index) if not file.is_file()]
+        if missing and not skip_broken:
+            raise InputError(
+                f"{missing[0]}: is listed but does not exist ({len(missing)} missing in total);"
+                f" {_explain_missing(missing[0])}"
+            )
+        first, depth = self._read_first(max_broken_frames(len(self)) if skip_broken else 0)
         median = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
         if _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
             return
         found = f"{source}: the median depth of the first frame is {median:.2g} m"
-        if self._read_depth(0).dtype.kind == "f" or self.camera.depth_scale is None:
+        if self._read_depth(first).dtype.kind == "f" or self.camera.depth_scale is None:
             raise InputError(f"{found}, although depth in floating point is in metres; export it in metres")
         raise InputError(
             f"{found} at {self.camera.depth_scale:g} units per metre; correct the camera's depth_scale (1000 if depth"
             " is in millimetres) or the depth images"
         )
+
+    def _read_first(self, broken: int) -> tuple[int, Tensor]:
+        """Return index and depth of the first frame that can be read; at most this number of frames before is broken.
+
+        Raises:
+            InputError: If more frames are broken; the error is that of the last one that was tried.
+        """
+        last = min(broken, len(self) - 1)
+        for index in range(last):
+            with suppress(InputError):
+                return index, self._read(index)[1]
+        return last, self._read(last)[1]
 
     @abstractmethod
     def _sources(self, index: int) -> tuple[object, object]:
@@ -118,19 +138,27 @@ class ImageSequence(StoredSequence):
             limit: Number of frames at the beginning from which images are sampled; None for all frames.
 
         Raises:
-            InputError: If the first depth image cannot be read, or the images do not tell the depth scale.
+            InputError: If no depth image can be read, or the images do not tell the depth scale.
         """
         if self.camera.depth_scale is not None:
             return
-        images = [self._read_depth(0)]
-        if images[0].dtype.kind == "f":
-            return
+        images = []
         last = len(self) - 1 if limit is None else min(len(self), limit) - 1
         for index in dict.fromkeys(np.linspace(0, last, _SAMPLES).astype(int).tolist()):
             with suppress(InputError):  # reported when the frame is processed
-                images += [self._read_depth(index)] if index else []
+                images.append(self._read_depth(index))
+        images = images or [self._read_depth(0)]
+        if images[0].dtype.kind == "f":
+            return
         estimate = estimate_depth_scale(images)
         if estimate.depth_scale is None:
             raise InputError(f"{source}: {estimate.question}")
         self.camera = replace(self.camera, depth_scale=estimate.depth_scale)
         self.depth_scale_note = estimate.note
+
+
+def _explain_missing(file: Path) -> str:
+    """Return what to do about a file in a list that does not exist."""
+    if "\\" in str(file):
+        return "the list has Windows paths; write them relative to its folder, such as rgb/1.png"
+    return "copy the whole sequence again"

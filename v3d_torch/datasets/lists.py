@@ -76,7 +76,8 @@ def read_image_list(path: Path) -> list[tuple[float, str]]:
 def read_associations(path: Path) -> list[ImagePair]:
     """Read a list with lines of ``stamp file stamp file``.
 
-    Both orders are in use, colour first and depth first. The image headers of the first line decide between them.
+    Both orders are in use, colour first and depth first. The image headers of the first line with a colour and a depth
+    image decide between them.
 
     Args:
         path: Path of the list, in the sequence's folder.
@@ -104,7 +105,7 @@ def read_associations(path: Path) -> list[ImagePair]:
         listed = (line[words[1].start() : words[middle - 1].end()], line[words[middle + 1].start() :])
         names = [_find_file(path.parent, name) for name in listed]
         rows.append((_parse_stamp(first, path, number), names[0], _parse_stamp(second, path, number), names[1]))
-    if rows and is_depth_file(path.parent / rows[0][1]) and not is_depth_file(path.parent / rows[0][3]):
+    if _is_depth_first(path.parent, rows):
         rows = [(stamp, colour, depth_stamp, depth) for depth_stamp, depth, stamp, colour in rows]
     ordered = _sort_unique(
         ((stamp, (colour, depth, depth_stamp)) for stamp, colour, depth_stamp, depth in rows),
@@ -158,6 +159,12 @@ def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
             f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps in the"
             " lists to seconds (they are probably in milliseconds or nanoseconds)"
         )
+
+
+def _is_depth_first(folder: Path, rows: Iterable[tuple[float, str, float, str]]) -> bool:
+    """Check whether the first file of each row is the depth image; rows with a missing or damaged file do not tell."""
+    pairs = ((is_depth_file(folder / first), is_depth_file(folder / second)) for _, first, _, second in rows)
+    return next((first for first, second in pairs if first != second), False)
 
 
 def _is_second_stamp(previous: str, word: str) -> bool:

@@ -30,6 +30,7 @@ def open_source(
     options: SourceOptions | None = None,
     download: bool = True,
     progress: Progress | None = None,
+    skip_broken: bool = False,
 ) -> RGBDStream:
     """Open a source of RGB-D frames: a stored sequence, a recording or a live camera.
 
@@ -46,6 +47,8 @@ def open_source(
         options: Options for sources that do not describe themselves completely; None for the defaults.
         download: True if a TUM sequence that is not on disk is downloaded.
         progress: Callback for the number of downloaded bytes, or of rendered frames of the demo; None for no reports.
+        skip_broken: True if missing image files and broken frames at the start are no error; they are one when such a
+            frame is read, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
 
     Returns:
         An `RGBDSequence` if the frames are stored, or else a stream.
@@ -58,7 +61,7 @@ def open_source(
         GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
         DepthScaleWarning: If the depth scale is not stated, and was estimated from the images.
     """
-    source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
+    source = _open(name, data_root, camera, options or SourceOptions(), download, progress, skip_broken)
     _warn(source)
     return source
 
@@ -71,6 +74,7 @@ def load_sequence(
     options: SourceOptions | None = None,
     download: bool = True,
     progress: Progress | None = None,
+    skip_broken: bool = False,
 ) -> RGBDSequence:
     """Open a sequence with a fixed number of frames that can be indexed.
 
@@ -82,7 +86,7 @@ def load_sequence(
     Raises:
         InputError: Also if the source is a stream, such as a live camera.
     """
-    source = _open(name, data_root, camera, options or SourceOptions(), download, progress)
+    source = _open(name, data_root, camera, options or SourceOptions(), download, progress, skip_broken)
     if not isinstance(source, RGBDSequence):
         raise InputError(
             f"{name}: is a stream, whose frames cannot be indexed; record it first with"
@@ -99,13 +103,14 @@ def _open(
     options: SourceOptions,
     download: bool,
     progress: Progress | None,
+    skip_broken: bool,
 ) -> RGBDStream:
     """Check the arguments and open a source; file system errors become `InputError`."""
     if options.fps is not None and not _MIN_FPS <= options.fps <= _MAX_FPS:
         raise InputError(f"--fps {options.fps:g}: is out of range; pass between {_MIN_FPS:g} and {_MAX_FPS:g} Hz")
     try:
         root = None if data_root is None else expand_user(data_root)
-        return _open_by_name(os.fspath(name), root, camera, options, download, progress)
+        return _open_by_name(os.fspath(name), root, camera, options, download, progress, skip_broken)
     except OSError as error:  # such as a folder without permission or a name that is too long
         raise InputError(
             f"{error.filename or name}: cannot be read ({error.strerror}); check its name and permissions"
@@ -119,6 +124,7 @@ def _open_by_name(
     options: SourceOptions,
     download: bool,
     progress: Progress | None,
+    skip_broken: bool,
 ) -> RGBDStream:
     if name == "demo":
         # Imported here because rendering the demo needs libraries that other sources do not need.
@@ -132,7 +138,7 @@ def _open_by_name(
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)
     source = open_path(path, camera, options, progress)
     if isinstance(source, ImageSequence):
-        source.check_first_frame(path)
+        source.check(path, skip_broken=skip_broken)
     return source
 
 

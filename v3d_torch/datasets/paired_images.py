@@ -14,7 +14,6 @@ from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.stored import ReadGroundTruth
-from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
 
@@ -31,8 +30,7 @@ class PairedImages(ImageSequence):
         name: Name used in tables; None for the folder's name.
 
     Raises:
-        InputError: If an image file is missing, there is no camera, or the unit of depth is neither stated nor told by
-            the images.
+        InputError: If there is no camera, or the unit of depth is neither stated nor told by the images.
     """
 
     def __init__(
@@ -53,12 +51,6 @@ class PairedImages(ImageSequence):
             depth_scale=depth_scale,
             image_size=lambda: self._image_size(folder, pairs[0]),
         )
-        missing = [file for pair in pairs for file in (pair.colour, pair.depth) if not (folder / file).is_file()]
-        if missing:
-            raise InputError(
-                f"{folder / missing[0]}: is listed but does not exist ({len(missing)} missing in total);"
-                f" {_explain_missing(missing[0])}"
-            )
         stamps, delays = [pair.stamp for pair in pairs], [pair.depth_delay for pair in pairs]
         super().__init__(name or folder.resolve().name, stamps, chosen, groundtruth, delays)
         self.folder = folder
@@ -70,19 +62,15 @@ class PairedImages(ImageSequence):
         """Width and height of the images of the camera, given the files of a frame."""
         return image_size(folder / pair.colour)
 
+    def files(self, index: int) -> tuple[Path, Path]:
+        """Return the colour and the depth file of frame ``index``."""
+        return self.folder / self._pairs[index].colour, self.folder / self._pairs[index].depth
+
     def _sources(self, index: int) -> tuple[Path, Path]:
-        pair = self._pairs[index]
-        return self.folder / pair.colour, self.folder / pair.depth
+        return self.files(index)
 
     def _read_colour(self, index: int) -> Tensor:
-        return read_colour(self._sources(index)[0])
+        return read_colour(self.files(index)[0])
 
     def _read_depth(self, index: int) -> NDArray[np.generic]:
-        return read_depth_file(self._sources(index)[1])
-
-
-def _explain_missing(name: str) -> str:
-    """Return what to do about a file in a list that does not exist."""
-    if "\\" in name:
-        return "the list has Windows paths; write them relative to its folder, such as rgb/1.png"
-    return "copy the whole sequence again"
+        return read_depth_file(self.files(index)[1])

@@ -6,6 +6,7 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import torch
@@ -19,6 +20,15 @@ _T = TypeVar("_T")
 
 ReadGroundTruth = Callable[[], Trajectory | None]
 """Function that reads the ground truth; it returns None if the sequence has none."""
+
+_MAX_BROKEN_FRACTION, _MIN_BROKEN_LIMIT = 0.05, 10
+"""Broken frames that are passed over on request: at most this fraction of the frames, or this number if it is more. A
+sequence with more of them was probably copied incompletely, or opened with the wrong camera."""
+
+
+def max_broken_frames(frames: int) -> int:
+    """Return how many broken frames can be passed over in a sequence of this length."""
+    return max(int(_MAX_BROKEN_FRACTION * frames), _MIN_BROKEN_LIMIT)
 
 
 class StoredSequence(ABC):
@@ -96,6 +106,10 @@ class StoredSequence(ABC):
             depth_delay=self._depth_delays[index],
             gravity=self.gravity if index == 0 else None,
         )
+
+    def files(self, index: int) -> tuple[Path, ...]:
+        """Return the files that only frame ``index`` is read from; empty if all frames share their files."""
+        return ()
 
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:

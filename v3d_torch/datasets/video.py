@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import cv2
@@ -84,9 +84,13 @@ class VideoSequence(ImageSequence):
         Raises:
             InputError: As `__getitem__`; and after the last frame if a video is truncated.
         """
-        yield from super().frames_from(index)
+        return chain(super().frames_from(index), self._raise_truncation())
+
+    def _raise_truncation(self) -> Iterator[RGBDFrame]:
+        """Iterate over no frames; raise an error if a video is truncated."""
         if self._truncation is not None:
             raise InputError(self._truncation)
+        yield from ()
 
     def _sources(self, index: int) -> tuple[Path, Path]:
         return self._colour_path, self._depth_path

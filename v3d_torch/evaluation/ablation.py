@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from v3d_torch.config.loading import FULL
-from v3d_torch.evaluation.outcome import Outcome, collect_metric
+from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
 from v3d_torch.evaluation.paper_tables import HEADINGS
 from v3d_torch.evaluation.summary import make_error_tables
 from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, format_median_and_range, markdown_row
@@ -88,7 +88,9 @@ COLUMNS: Mapping[str, Column] = {
 def make_screen_table(outcomes: Sequence[Outcome]) -> Table:
     """Return the results on one sequence for the screen, one row per variant, the best of each error in green."""
     headings, rows = _summarise(outcomes)
-    table = Table(title=f"Ablation on {escape(outcomes[0].sequence)}", caption=conclusion(outcomes))
+    sequence = outcomes[0].sequence
+    label = label_sequence(sequence, find_difference(outcomes, sequence))
+    table = Table(title=f"Ablation on {escape(label)}", caption=conclusion(outcomes))
     table.add_column("variant", no_wrap=True)
     for heading in headings:
         table.add_column(heading, justify="right", overflow="fold")
@@ -109,7 +111,8 @@ def format_markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
     for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
         headings, rows = _summarise(runs)
-        lines += ["", f"## {sequence}", f"Seeds: {len({run.seed for run in runs})}. {conclusion(runs)}", ""]
+        label = label_sequence(sequence, find_difference(runs, sequence))
+        lines += ["", f"## {label}", f"Seeds: {len({run.seed for run in runs})}. {conclusion(runs)}", ""]
         lines += [markdown_row(["variant", *headings]), markdown_row(["---", *["---:"] * len(headings)])]
         for variant, cells in rows.items():
             lines.append(markdown_row([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
@@ -156,9 +159,10 @@ def format_csv(outcomes: Sequence[Outcome]) -> str:
     """Return all outcomes as CSV, one line per run."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["sequence", "variant", "seed", *COLUMNS, "failure"])
+    writer.writerow(["sequence", "variant", "seed", *COLUMNS, "difference", "failure"])
     for run in outcomes:
-        writer.writerow([run.sequence, run.config, run.seed, *(run.get_metric(key) for key in COLUMNS), run.failure])
+        metrics = [run.get_metric(key) for key in COLUMNS]
+        writer.writerow([run.sequence, run.config, run.seed, *metrics, run.difference, run.failure])
     return text.getvalue()
 
 

@@ -25,6 +25,12 @@ class Outcome:
     metrics: Mapping[str, Any]
     failure: str | None = None
 
+    @property
+    def difference(self) -> str | None:
+        """Difference between the sequence and that of the benchmark with its name, in words; None if there is none."""
+        difference: str | None = self.metrics.get("difference")
+        return difference
+
     def get_metric(self, key: str) -> float | None:
         """Return a metric by its dotted key, such as ``ate.rmse``; None if it was not measured."""
         value: Any = self.metrics
@@ -35,8 +41,23 @@ class Outcome:
     def __str__(self) -> str:
         ate = self.get_metric("ate.rmse")
         score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth, not scored"
+        if self.difference is not None:
+            score += f" ({self.difference})"
+        if skipped := self.get_metric("skipped"):
+            score += f", {skipped:.0f} broken frame{'s' if skipped > 1 else ''} passed over"
         result = score if self.failure is None else f"failed: {self.failure}"
         return f"{self.sequence}, {self.config}, seed {self.seed}: {result}"
+
+
+def find_difference(outcomes: Iterable[Outcome], sequence: str) -> str | None:
+    """Find how a sequence differs from that of the benchmark with its name; None if it does not, or no run tells."""
+    differences = (outcome.difference for outcome in outcomes if outcome.sequence == sequence)
+    return next((difference for difference in differences if difference is not None), None)
+
+
+def label_sequence(sequence: str, difference: str | None) -> str:
+    """Return the name of a sequence in tables, with its difference from that of the benchmark with its name."""
+    return sequence if difference is None else f"{sequence} ({difference})"
 
 
 def collect_metric(outcomes: Iterable[Outcome], key: str) -> list[float]:

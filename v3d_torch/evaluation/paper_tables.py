@@ -13,6 +13,7 @@ from rich.table import Table
 
 from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, canonical_name, short_name
 from v3d_torch.evaluation.evaluation import Evaluation
+from v3d_torch.evaluation.outcome import label_sequence
 
 
 class Score(NamedTuple):
@@ -60,12 +61,14 @@ def find_paper_sequence(name: str) -> str | None:
     return short_name(found[0]) if len(found) == 1 else None
 
 
-def make_paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
+def make_paper_table(sequence: str, evaluation: Evaluation, difference: str | None = None) -> Table | None:
     """Return a table of the paper's methods and a result on the same sequence, the best RMSE of each column in green.
 
     Args:
         sequence: Name of the sequence, in any notation accepted by `find_paper_sequence`.
         evaluation: Evaluation of the result.
+        difference: Difference between the sequence and that of the paper, which is shown beside the result; no value
+            is then the best. None if there is none.
 
     Returns:
         The table; None if the paper does not evaluate the sequence.
@@ -75,9 +78,11 @@ def make_paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
         return None
     scores = load_paper_scores()
     rows = {method: [scores[metric][name][method] for metric in HEADINGS] for method in scores["ate"][name]}
-    rows[_RESULT] = _scores(evaluation)
+    result = label_sequence(_RESULT, difference)
+    rows[result] = _scores(evaluation)
     best = [
-        min(score.rmse for score in column if score.rmse is not None) for column in zip(*rows.values(), strict=True)
+        min(score.rmse for score in column if score.rmse is not None) if difference is None else None
+        for column in zip(*rows.values(), strict=True)
     ]
 
     table = Table(title=f"{name}: the paper's tables and this result")
@@ -87,7 +92,7 @@ def make_paper_table(sequence: str, evaluation: Evaluation) -> Table | None:
         table.add_column("SD", justify="right")
     for method, row in rows.items():
         cells = [cell for score, lowest in zip(row, best, strict=True) for cell in _cells(score, lowest)]
-        table.add_row(method, *cells, style="bold" if method == _RESULT else None)
+        table.add_row(method, *cells, style="bold" if method == result else None)
     return table
 
 
@@ -98,6 +103,6 @@ def _scores(evaluation: Evaluation) -> list[Score]:
     return [Score(s.rmse, s.std) if s is not None else Score(None, None) for s in measured]
 
 
-def _cells(score: Score, lowest: float) -> tuple[str, str]:
+def _cells(score: Score, lowest: float | None) -> tuple[str, str]:
     rmse, sd = ("-" if value is None else f"{value:.4f}" for value in score)
-    return (f"[green]{rmse}[/]" if score.rmse == lowest else rmse), sd
+    return (f"[green]{rmse}[/]" if score.rmse == lowest and lowest is not None else rmse), sd

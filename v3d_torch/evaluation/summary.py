@@ -10,7 +10,7 @@ from statistics import median
 
 from rich.table import Table
 
-from v3d_torch.evaluation.outcome import Outcome, collect_metric
+from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
 from v3d_torch.evaluation.paper_tables import HEADINGS, find_paper_sequence, load_paper_scores
 from v3d_torch.evaluation.tables import (
     Cell,
@@ -77,18 +77,22 @@ def format_latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str
 def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     """Return all values as CSV, unrounded, one line per metric, sequence and method; see `make_error_tables`.
 
-    The last column is the standard deviation of the errors, as in the paper's tables: the median over the seeds.
+    The column sd is the standard deviation of the errors, as in the paper's tables: the median over the seeds. The last
+    column is the difference between the sequence and that of the benchmark with its name, if there is one.
     """
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["metric", "sequence", "method", "median", "lowest", "highest", "seeds", "failed", "sd"])
+    writer.writerow(
+        ["metric", "sequence", "method", "median", "lowest", "highest", "seeds", "failed", "sd", "difference"]
+    )
     for metric, key in METRIC_KEYS.items():
         for result in _results(outcomes, metric, None, absent):
             values = result.values
             summary = [median(values), min(values), max(values)] if values else [None] * 3
             counts = [result.seeds, result.failed] if result.seeds else [None] * 2
             deviation = median(result.deviations) if result.deviations else None
-            writer.writerow([key, result.sequence, result.method, *summary, *counts, deviation])
+            row = [key, result.sequence, result.method, *summary, *counts, deviation, result.difference]
+            writer.writerow(row)
     return text.getvalue()
 
 
@@ -109,6 +113,7 @@ class _Result:
         failed: Number of runs that failed.
         absent: True if the sequence is not available.
         deviations: Standard deviation of the errors of each run.
+        difference: Difference between the sequence and that of the benchmark with its name; None if there is none.
     """
 
     sequence: str
@@ -118,6 +123,7 @@ class _Result:
     failed: int = 0
     absent: bool = False
     deviations: Sequence[float] = ()
+    difference: str | None = None
 
     @property
     def text(self) -> str:
@@ -135,12 +141,15 @@ def _results(
     results = []
     configs = dict.fromkeys(outcome.config for outcome in outcomes)
     for sequence in _order_sequences([outcome.sequence for outcome in outcomes], absent):
+        difference = find_difference(outcomes, sequence)
         for config in configs:
             runs = [run for run in outcomes if (run.sequence, run.config) == (sequence, config)]
             failed = sum(run.failure is not None for run in runs)
             values = collect_metric(runs, METRIC_KEYS[metric])
             deviations = collect_metric(runs, METRIC_KEYS[metric].replace("rmse", "std"))
-            results.append(_Result(sequence, config, values, len(runs), failed, sequence in absent, deviations))
+            results.append(
+                _Result(sequence, config, values, len(runs), failed, sequence in absent, deviations, difference)
+            )
         if (paper_name := find_paper_sequence(sequence)) is not None:
             for method, score in load_paper_scores()[metric][paper_name].items():
                 if papers is None or method in papers:
@@ -162,8 +171,11 @@ def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:
     for sequence in dict.fromkeys(result.sequence for result in results):
         by_method = {result.method: result for result in results if result.sequence == sequence}
         medians = {method: median(result.values) for method, result in by_method.items() if result.values}
-        lowest = format_lowest(medians.values(), _FORMAT) if len(medians) > 1 else None
-        rows[sequence] = tuple(
+        difference = next((result.difference for result in by_method.values() if result.difference is not None), None)
+        # A part of a sequence, or another recording, is no easier or harder than the whole: no value is the best.
+        is_comparable = len(medians) > 1 and difference is None
+        lowest = format_lowest(medians.values(), _FORMAT) if is_comparable else None
+        rows[label_sequence(sequence, difference)] = tuple(
             Cell(
                 by_method[method].text if method in by_method else "-",
                 best=method in medians and format(medians[method], _FORMAT) == lowest,

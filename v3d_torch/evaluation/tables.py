@@ -99,7 +99,7 @@ def make_screen_table(table: ErrorTable) -> Table:
         # Put the range below the median, and the number of failed runs below the range.
         texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
         marked = [f"[bold green]{t}[/]" if cell.best else t for t, cell in zip(texts, cells, strict=True)]
-        shown.add_row(escape(sequence), *marked)
+        shown.add_row(escape(sequence.replace(" (", "\n(")), *marked)
     return shown
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sized
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
 from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
+from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.frame_result import FrameResult
@@ -90,6 +91,7 @@ class Pipeline:
         viewer: Viewer that is shown each frame.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
+        skip_broken: True to pass over broken frames of a stored sequence, see `ReadableFrames`.
 
     Attributes:
         record: Records of the run.
@@ -108,6 +110,7 @@ class Pipeline:
         views: StaticViews | None = None,
         *,
         evaluate_masks: bool = True,
+        skip_broken: bool = False,
     ) -> None:
         self.sequence = sequence
         self.slam = slam
@@ -118,6 +121,7 @@ class Pipeline:
         self._masks = masks
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
+        self._skip_broken = skip_broken
         self._snapshot_step = 1
 
     @property
@@ -186,14 +190,15 @@ class Pipeline:
 
     def _track_frames(self) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
         """Track the frames of a sequence, and yield each with its result."""
-        with closing(
-            FramePrefetcher(self._remaining_frames(), self.slam, ahead=self.slam.config.prefetch)
-        ) as prefetcher:
+        frames = self._remaining_frames()
+        with closing(FramePrefetcher(frames, self.slam, ahead=self.slam.config.prefetch)) as prefetcher:
             for preprocessed in prefetcher:
+                self._record_broken(frames, before=preprocessed.frame.index)
                 self.between_frames = False
                 yield preprocessed.frame, self.slam.track(preprocessed)
                 if len(self.slam.poses) % _TRIM_INTERVAL == 0:
                     trim_memory()
+        self._record_broken(frames, before=math.inf)
 
     def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
         """Track the frames of a live stream, and yield each with its result."""
@@ -205,10 +210,22 @@ class Pipeline:
                 yield result.frame, result
 
     def _remaining_frames(self) -> Iterator[RGBDFrame]:
-        done = len(self.slam.poses) if isinstance(self.sequence, RGBDSequence) else 0
+        """Iterate over the frames that are later than the last tracked one."""
+        if not isinstance(self.sequence, RGBDSequence):
+            return iter(self.sequence)
+        start, total = int((self.sequence.stamps <= self.slam.poses.stamp).sum()), len(self.sequence)
         if isinstance(self.sequence, StoredSequence):
-            return self.sequence.frames_from(done)
-        return islice(iter(self.sequence), done, None)
+            frames = self.sequence.frames_from(start)
+        else:
+            frames = map(self.sequence.__getitem__, range(start, total))
+        if not self._skip_broken:
+            return frames
+        return ReadableFrames(frames, start, total, len(self.record.broken))
+
+    def _record_broken(self, frames: Iterator[RGBDFrame], before: float) -> None:
+        """Record the broken frames before a frame, given by its index; the reader can be some frames ahead."""
+        while isinstance(frames, ReadableFrames) and frames.broken and frames.broken[0].index < before:
+            self.record.broken.append(frames.broken.popleft())
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.states.append_state(result)

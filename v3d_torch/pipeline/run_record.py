@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from v3d_torch.datasets.readable_frames import BrokenFrame
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.live_slam import LiveResult
@@ -197,6 +198,7 @@ class RunRecord:
         snapshots: Frames for the figure of masks.
         most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
         mask_evaluation: Comparison of the masks with true masks.
+        broken: Broken frames that were passed over.
         seconds: Wall time of all frames, seconds.
         failure: Reason why the run ended before the sequence; None if it did not.
         interrupted: True if the user interrupted the run.
@@ -212,6 +214,7 @@ class RunRecord:
     snapshots: list[Snapshot] = field(default_factory=list)
     most_dynamic_snapshot: Snapshot | None = None
     mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)
+    broken: list[BrokenFrame] = field(default_factory=list)
     seconds: float = 0.0
     failure: str | None = None
     interrupted: bool = False

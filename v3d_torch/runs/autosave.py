@@ -79,5 +79,6 @@ class Autosave:
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)
 
     def _report(self, error: OutputError) -> None:
+        if self._pipeline.record.save_error != str(error):
+            _LOG.warning("no checkpoint: %s", error)
         self._pipeline.record.save_error = str(error)
-        _LOG.warning("no checkpoint: %s", error)

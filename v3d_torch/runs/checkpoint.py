@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import torch
 from pydantic import ValidationError
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream
+from v3d_torch.datasets.readable_frames import BrokenFrame
+from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
@@ -32,6 +34,7 @@ _CLASSES = (
     *STATE_CLASSES,
     *(
         RunRecord,
+        BrokenFrame,
         FrameTimes,
         LiveTable,
         ObjectTable,
@@ -56,7 +59,7 @@ class Checkpoint:
     Attributes:
         folder: Folder of its results.
         request: Request of the run.
-        sequence: Fingerprint of the sequence, see `_fingerprint`.
+        sequence: Fingerprint of the processed part of the sequence, see `_fingerprint`.
         frames: Number of frames processed.
         state: State of the pipeline.
     """
@@ -85,7 +88,8 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> N
     metadata: dict[str, Any] = {"request": request.absolute().to_dict()}
     state: dict[str, Any] = {}
     if isinstance(sequence, RGBDSequence):
-        metadata |= {"sequence": _fingerprint(sequence), "frames": len(pipeline.slam.poses)}
+        done = int(pipeline.record.times.indices[-1]) + 1
+        metadata |= {"sequence": _fingerprint(sequence, done), "frames": len(pipeline.slam.poses)}
         state = pipeline.state_dict()
     write_state(folder / CHECKPOINT, metadata, state)
 
@@ -127,33 +131,44 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
-    """Describe the difference between a sequence and that of a checkpoint; None if they are the same.
+    """Describe what has changed in the part of a sequence that a checkpoint has processed; None if nothing has.
 
-    Of the images, only those of the last processed frame are compared. The ground truth is not compared, because it is
+    Of that part, the timestamps and the sizes of all image files are compared, and the images of the last processed
+    frame. Frames after it can have been removed, added or replaced. The ground truth is not compared, because it is
     used at the end only.
 
     Raises:
-        InputError: If that frame cannot be read.
+        InputError: If the last processed frame cannot be read.
     """
     if not isinstance(sequence, RGBDSequence):
         return "it is a live stream"
-    stored, current = checkpoint.sequence, _fingerprint(sequence)
-    changes = {
-        "frames": f"{current['frames']} frames instead of {stored['frames']}",
-        "timestamps": "other timestamps",
-        "camera": "another camera",
-    }
-    for key, change in changes.items():
-        if stored[key] != current[key]:
-            return change
     last = checkpoint.state["slam"]["previous"].frame
-    current_frame = sequence[last.index]
-    same = torch.equal(current_frame.image, last.image) and torch.equal(current_frame.depth, last.depth)
+    stored, current = checkpoint.sequence, _fingerprint(sequence, last.index + 1)
+    if stored["camera"] != current["camera"]:
+        return "another camera"
+    for before, now in zip_longest(stored["stamps"], current["stamps"]):
+        if before != now:
+            is_added = before in current["stamps"]
+            return f"the frame at {now:.6f} s is new" if is_added else f"the frame at {before:.6f} s is missing"
+    broken = {frame.index for frame in checkpoint.state["record"].broken}
+    for index, (sizes, current_sizes) in enumerate(zip(stored["sizes"], current["sizes"], strict=True)):
+        for file, before, now in zip(_files(sequence, index), sizes, current_sizes, strict=False):
+            if before != now and index not in broken:
+                return f"{file} has changed"
+    frame = sequence[last.index]
+    same = torch.equal(frame.image, last.image) and torch.equal(frame.depth, last.depth)
     return None if same else f"frame {last.index} shows another image"
 
 
-def _fingerprint(sequence: RGBDSequence) -> dict[str, Any]:
-    """Return plain values that distinguish a sequence from others without reading its images."""
-    stamps = hashlib.sha256(sequence.stamps.numpy().tobytes()).hexdigest()
-    fingerprint = {"frames": len(sequence), "timestamps": stamps, "camera": asdict(sequence.camera)}
-    return json.loads(json.dumps(fingerprint))
+def _fingerprint(sequence: RGBDSequence, frames: int) -> dict[str, Any]:
+    """Return plain values that distinguish the first frames of a sequence from others without reading its images."""
+    sizes = [
+        [file.stat().st_size if file.is_file() else None for file in _files(sequence, index)]
+        for index in range(min(frames, len(sequence)))
+    ]
+    camera = json.loads(json.dumps(asdict(sequence.camera)))
+    return {"camera": camera, "stamps": sequence.stamps[:frames].tolist(), "sizes": sizes}
+
+
+def _files(sequence: RGBDSequence, index: int) -> tuple[Path, ...]:
+    return sequence.files(index) if isinstance(sequence, StoredSequence) else ()

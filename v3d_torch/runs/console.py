@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from threading import Event
 from types import FrameType
@@ -25,17 +26,17 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.kernels import compiler
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import Checkpoint
-from v3d_torch.runs.log import log_to
+from v3d_torch.runs.log import log_to, show_warnings
 from v3d_torch.runs.result_folder import clear_earlier_results
 from v3d_torch.runs.run import Run, describe_motion
 from v3d_torch.types import RGBDFrame
 
 
-def open_sequence(name: str, data_root: Path | None, camera: str | None, console: Console) -> RGBDSequence:
+def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
     """Open a sequence as `load_sequence` does, with a progress bar for downloads."""
     with progress_bars(console) as progress:
         bar = ProgressBar(progress, "sequence")
-        sequence = load_sequence(name, data_root=data_root, camera=camera, progress=bar)
+        sequence = load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)
     print_assumptions(sequence, console)
     return sequence
 
@@ -46,8 +47,10 @@ def print_assumptions(source: RGBDStream, console: Console) -> None:
         console.print(f"note: {source.name}: {source.depth_scale_note}", markup=False, highlight=False)
 
 
-def open_sequences(names: Sequence[str], data_root: Path | None, console: Console) -> dict[str, RGBDSequence]:
-    """Open several sequences in the given order, before the first of them is run.
+def open_sequences(
+    names: Sequence[str], data_root: Path | None, console: Console, *, skip_broken: bool = False
+) -> dict[str, RGBDSequence]:
+    """Open several sequences in the given order, before the first of them is run; see `load_sequence`.
 
     Returns:
         Sequences by their name in tables.
@@ -58,7 +61,7 @@ def open_sequences(names: Sequence[str], data_root: Path | None, console: Consol
     """
     sequences: dict[str, RGBDSequence] = {}
     for name in dict.fromkeys(names):
-        sequence = open_sequence(name, data_root, None, console)
+        sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
         if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
             raise sequence.groundtruth_error  # runs are compared by their scores, so all need ground truth
         if sequence.name in sequences:
@@ -93,7 +96,8 @@ def run_with_progress(
         clear_earlier_results(folder)
     compile_kernels(console)
     log = log_to(folder / "run.log", append=checkpoint is not None)
-    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log:
+    warnings = show_warnings(partial(console.print, markup=False))
+    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log, warnings:
         run = make_run()
         sequence = run.pipeline.sequence
         total = len(sequence) if isinstance(sequence, Sized) else None

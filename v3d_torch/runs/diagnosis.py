@@ -44,8 +44,9 @@ def diagnose(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
 def _cause_of_loss(pipeline: Pipeline) -> str:
     sequence, max_depth = pipeline.sequence, pipeline.slam.config.features.max_depth
     if isinstance(sequence, RGBDSequence):
-        indices = np.linspace(0, len(sequence) - 1, min(_SAMPLES, len(sequence))).astype(int)
-        frames = [sequence[int(index)] for index in indices]
+        indices = pipeline.record.times.indices
+        samples = np.linspace(0, len(indices) - 1, min(_SAMPLES, len(indices))).astype(int)
+        frames = [sequence[int(indices[sample])] for sample in samples]
         if all(float(frame.image.float().std()) < _MAX_PLAIN_SIGMA for frame in frames):
             return "the colour images are uniform; record it again, with light and an uncovered lens"
         if all(float((frame.depth > 0).float().mean()) < _MAX_EMPTY_FRACTION for frame in frames):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -43,6 +43,29 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
     finally:
         _LOG.removeHandler(handler)
         handler.close()
+
+
+@contextmanager
+def show_warnings(show: Callable[[str], object]) -> Iterator[None]:
+    """Pass the warnings in the log of the package to a function, such as one that prints them."""
+    handler = _Warnings(show)
+    _LOG.addHandler(handler)
+    try:
+        yield
+    finally:
+        _LOG.removeHandler(handler)
+
+
+class _Warnings(logging.Handler):
+    """Handler that passes each warning, as one line, to a function."""
+
+    def __init__(self, show: Callable[[str], object]) -> None:
+        super().__init__(logging.WARNING)
+        self._show = show
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno == logging.WARNING:  # errors are shown at the end of the run
+            self._show(f"warning: {record.getMessage()}")
 
 
 class _LogFile(logging.FileHandler):

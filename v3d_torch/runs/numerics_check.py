@@ -18,6 +18,7 @@ from torch import Tensor
 
 from v3d_torch.errors import NumericsError
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
+from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
@@ -26,9 +27,6 @@ _NOT_STAGES = frozenset(
     {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions"}
 )
 """Public attributes of `V3DSLAM` that are not stages."""
-
-_STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
-"""Methods whose results are not checked: NaN has a meaning in some of the fields that they return."""
 
 MAY_BE_NAN = frozenset(
     {
@@ -87,42 +85,25 @@ def _check_tensor(name: str, tensor: Tensor, *, nan: bool, infinite: bool) -> No
         raise NumericsError(f"{name} is {kind}: {count} of {tensor.numel()} numbers{position}")
 
 
-class CheckedStage:
+class CheckedStage(StageProxy):
     """Wrapper of a stage that checks what its call and its methods return.
 
     Args:
         stage: Stage.
         name: Name of the stage in messages.
+
+    Raises:
+        NumericsError: When the stage or a method is called, if the result is not finite.
     """
 
-    _OWN = ("_stage", "_name")
-
-    def __init__(self, stage: Any, name: str) -> None:
-        self._stage = stage
-        self._name = name
-
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Call the stage.
-
-        Raises:
-            NumericsError: If the result is not finite.
-        """
-        result = self._stage(*args, **kwargs)
+    def _check(self, result: Any, *args: Any) -> None:
         check_finite(self._name, result)
-        return result
 
     def __getattr__(self, name: str) -> Any:
-        if name in self._OWN:  # read before it is set, for example by copy
-            raise AttributeError(name)
-        value = getattr(self._stage, name)
-        is_checked = callable(value) and name not in _STATE_METHODS
+        value = super().__getattr__(name)
+        # NaN has a meaning in some of the fields of a state.
+        is_checked = callable(value) and name not in STATE_METHODS
         return CheckedStage(value, f"{self._name}.{name}") if is_checked else value
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in self._OWN:
-            super().__setattr__(name, value)
-        else:
-            setattr(self._stage, name, value)
 
 
 class CheckedSLAM(V3DSLAM):

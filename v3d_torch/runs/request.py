@@ -12,6 +12,9 @@ from v3d_torch.datasets import SourceOptions
 from v3d_torch.datasets.cameras import PRESETS
 from v3d_torch.io.paths import expand_user
 
+CHANGEABLE = ("seq", "data_root", "skip_broken")
+"""Names of the options that can change when a run is resumed."""
+
 _PATHS = ("data_root", "masks", "weights", "load_map", "save_map")
 
 
@@ -34,6 +37,7 @@ class RunRequest:
         save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
         realtime: True to play the sequence at its own rate, like a live camera.
+        skip_broken: True to pass over broken frames, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
     """
 
     seq: str
@@ -50,6 +54,7 @@ class RunRequest:
     save_map: str | None = None
     save_masks: bool = False
     realtime: bool = False
+    skip_broken: bool = False
 
     @property
     def source_options(self) -> SourceOptions:
@@ -70,11 +75,12 @@ class RunRequest:
     def conflicting_option(self, other: RunRequest) -> str | None:
         """Return the first option that the other request sets to another value, as it is typed; None if none does.
 
-        Options that name the location of the sequence do not conflict, because the sequence may have been moved.
+        Options that name the location of the sequence do not conflict, because the sequence may have been moved, nor
+        does ``skip_broken``, because a broken frame may have ended the run.
         """
         options = self._options()
         for name, value in other.absolute()._options().items():
-            if name not in ("seq", "data_root") and value not in (None, False) and value != options[name]:
+            if name not in CHANGEABLE and value not in (None, False) and value != options[name]:
                 return f"--{name.replace('_', '-')}"
         return None
 

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 import torch
 
 from v3d_torch.config.loading import dump_config
+from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
@@ -172,8 +173,10 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
+        "difference": describe_difference(pipeline.sequence),
         "frames": pipeline.frame_count,
         "processed": frames,
+        "skipped": len(run.broken),
         **counts,
         "status": [status.value for status in statuses],
         "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),

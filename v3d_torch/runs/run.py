@@ -77,6 +77,7 @@ class Run:
             folder / "masks" if request.save_masks else None,
             viewer,
             None if known_map is None else known_map.views,
+            skip_broken=request.skip_broken,
         )
         if checkpoint is not None:
             remove_unfinished(folder)

@@ -34,11 +34,13 @@ class Metrics(BaseModel):
     sequence: str
     frames: int
     processed: int
+    skipped: int = 0
     status: list[TrackingStatus]
     keyframes: int
     landmarks: int
     loops: int
     failure: str | None
+    difference: str | None = None
     fps: float | None
     seconds: float
     seconds_per_stage: dict[str, float]

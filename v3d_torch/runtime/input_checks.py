@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -15,17 +16,33 @@ from v3d_torch.types import Instances, RGBDFrame
 _MAX_NORM_ERROR = 1e-3
 """Largest difference of the length of a unit vector from 1."""
 
+TensorSpec = tuple[torch.dtype, tuple[int | str, ...]]
+"""Dtype and shape of a tensor; dimensions with the same name have the same size."""
 
-def check_parameters(camera: PinholeCamera, config: Config | None) -> None:
+INSTANCES: Mapping[str, TensorSpec] = {
+    "masks": (torch.bool, ("N", "H", "W")),
+    "labels": (torch.int64, ("N",)),
+    "scores": (torch.float32, ("N",)),
+    "boxes": (torch.float32, ("N", 4)),
+}
+"""Fields of `Instances`."""
+
+
+def check_parameters(camera: object, segment: object, config: object) -> None:
     """Check the types of the parameters of `V3DSLAM`.
 
     Raises:
         ConfigError: If a parameter has the wrong type.
     """
     if not isinstance(camera, PinholeCamera):
-        raise ConfigError(f"V3DSLAM needs a PinholeCamera, got {_kind(camera)}; give one, such as sequence.camera")
+        found = describe_type(camera)
+        raise ConfigError(f"V3DSLAM needs a PinholeCamera, got {found}; give one, such as sequence.camera")
+    if segment is not None and not callable(segment):
+        found = describe_type(segment)
+        raise ConfigError(f"V3DSLAM needs a segmenter, got {found}; give a function that takes a frame, or None")
     if not isinstance(config, Config | None):
-        raise ConfigError(f'V3DSLAM needs a Config, got {_kind(config)}; give one, such as load_config("paper")')
+        found = describe_type(config)
+        raise ConfigError(f'V3DSLAM needs a Config, got {found}; give one, such as load_config("paper")')
 
 
 def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
@@ -35,16 +52,17 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
         InputError: If the frame is not valid or of another camera.
     """
     if not isinstance(frame, RGBDFrame):
-        raise InputError(f"expected an RGBDFrame, got {_kind(frame)}; RGBDFrame.from_arrays makes frames from arrays")
+        raise InputError(
+            f"expected an RGBDFrame, got {describe_type(frame)}; RGBDFrame.from_arrays makes frames from arrays"
+        )
     size = (camera.height, camera.width)
     for name, image, shape, dtype in (
         ("colour", frame.image, (3, *size), torch.uint8),
         ("depth", frame.depth, (1, *size), torch.float32),
     ):
-        if not isinstance(image, Tensor) or image.shape != shape or image.dtype != dtype:
+        if (wrong := describe_wrong_tensor(image, shape, dtype)) is not None:
             raise InputError(
-                f"frame {frame.index}: the {name} image is {_description(image)}, expected a tensor, {dtype} of shape"
-                f" {shape}; RGBDFrame.from_arrays makes frames from arrays"
+                f"frame {frame.index}: the {name} image is {wrong}; RGBDFrame.from_arrays makes frames from arrays"
             )
     for name, seconds in (("stamp", frame.stamp), ("depth delay", frame.depth_delay)):
         if not math.isfinite(seconds):
@@ -81,30 +99,44 @@ def check_instances(instances: Instances, frame: RGBDFrame) -> None:
     """
     if not isinstance(instances, Instances):
         raise ConfigError(
-            f"the segmenter returned {_kind(instances)} for frame {frame.index}; it must return Instances"
+            f"the segmenter returned {describe_type(instances)} for frame {frame.index}; it must return Instances"
         )
-    count, size = len(instances.masks), tuple(frame.image.shape[-2:])
-    for name, shape, dtype in (
-        ("masks", (count, *size), torch.bool),
-        ("labels", (count,), torch.int64),
-        ("scores", (count,), torch.float32),
-        ("boxes", (count, 4), torch.float32),
-    ):
-        value = getattr(instances, name)
-        if not isinstance(value, Tensor) or value.shape != shape or value.dtype != dtype:
-            raise ConfigError(
-                f"the segmenter's {name} for frame {frame.index} are {_description(value)}, expected a tensor, {dtype}"
-                f" of shape {shape}"
-            )
+    sizes = {"N": len(instances.masks), "H": frame.image.shape[-2], "W": frame.image.shape[-1]}
+    for name, (dtype, dimensions) in INSTANCES.items():
+        shape = fill_in(dimensions, sizes)
+        if (wrong := describe_wrong_tensor(getattr(instances, name), shape, dtype)) is not None:
+            raise ConfigError(f"the segmenter's {name} for frame {frame.index} are {wrong}")
 
 
-def _description(value: object) -> str:
-    """Return the type and shape of a value in words."""
-    if isinstance(value, Tensor):
-        return f"{value.dtype} of shape {tuple(value.shape)}"
-    return _kind(value)
+def fill_in(dimensions: Sequence[int | str], sizes: Mapping[str, int]) -> tuple[int | str, ...]:
+    """Return a shape in which the names of dimensions whose sizes are known are replaced by the sizes."""
+    return tuple(sizes.get(each, each) if isinstance(each, str) else each for each in dimensions)
 
 
-def _kind(value: object) -> str:
+def describe_wrong_tensor(value: object, shape: tuple[int | str, ...], dtype: torch.dtype) -> str | None:
+    """Describe how a value differs from a tensor on the CPU.
+
+    Args:
+        value: Value.
+        shape: Expected shape; a dimension with a name can have any size.
+        dtype: Expected dtype.
+
+    Returns:
+        Some words that follow "is" or "are"; None if the value is such a tensor.
+    """
+    if not isinstance(value, Tensor):
+        found = describe_type(value)
+    else:
+        fits = len(shape) == value.ndim and all(
+            isinstance(each, str) or each == size for each, size in zip(shape, value.shape, strict=True)
+        )
+        if fits and (value.dtype, value.device.type) == (dtype, "cpu"):
+            return None
+        device = "" if value.device.type == "cpu" else f" on {value.device}"
+        found = f"{value.dtype} of shape {tuple(value.shape)}{device}"
+    return f"{found}, expected a tensor, {dtype} of shape ({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+
+
+def describe_type(value: object) -> str:
     """Return the class of a value in words."""
     return f"a {type(value).__qualname__}"

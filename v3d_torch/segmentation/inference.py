@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import onnxruntime
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -16,7 +15,11 @@ from v3d_torch.segmentation.coco import COCO_NAMES
 from v3d_torch.segmentation.letterbox import CELL
 from v3d_torch.segmentation.networks.head import STRIDES, boxes_from_distances, cell_grid
 from v3d_torch.segmentation.networks.prototypes import PROTOTYPES
+from v3d_torch.segmentation.onnx_runtime import import_onnxruntime
 from v3d_torch.segmentation.parts import LEVELS, PartPaths
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 _BOX = 4
 """Rows of the raw predictions that hold the box; class scores and mask coefficients follow."""
@@ -210,15 +213,16 @@ def open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
     """Load a network into onnxruntime, deterministic and on the CPU."""
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; check the path given with --weights")
-    options = onnxruntime.SessionOptions()
+    ort = import_onnxruntime()
+    options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
     # Waiting threads that spin would slow down torch, which computes between two calls.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the exceptions of onnxruntime have no common base class
         raise WeightsError(
             f"{path}: is not a network that onnxruntime can load; delete the file or export it again"

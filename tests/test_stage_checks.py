@@ -1,0 +1,187 @@
+"""Stages of the user: what they return is checked, with one sentence; built-in stages are called as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from v3d_torch.config.loading import load_config
+from v3d_torch.errors import ConfigError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_smoother import DepthSmoother
+from v3d_torch.odometry.odometry import Odometry
+from v3d_torch.runs.numerics_check import CheckedSLAM
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.stage_checks import ReplacedStage
+from v3d_torch.types import Instances, RGBDFrame
+
+CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+IMAGE = torch.randint(0, 256, (3, 48, 64), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+FRAMES = [RGBDFrame(index, index / 30, IMAGE, torch.ones(1, 48, 64), camera=CAMERA) for index in range(3)]
+CONFIG = load_config(overrides=["segmentation.source=masks"])
+"""Instances come from `segment`, so that all stages of the objects run."""
+
+
+def segment(frame: RGBDFrame) -> Instances:
+    mask = torch.zeros(2, 48, 64, dtype=torch.bool)
+    mask[0, :, :30], mask[1, :, 35:] = True, True
+    return Instances(mask, torch.tensor([0, 56]), torch.ones(2), torch.zeros(2, 4))
+
+
+def make_slam(system: type[V3DSLAM] = V3DSLAM) -> V3DSLAM:
+    return system(CAMERA, segment, CONFIG)
+
+
+def change(**fields: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Function that changes fields of a dataclass."""
+    return lambda result: replace(result, **{name: edit(getattr(result, name)) for name, edit in fields.items()})
+
+
+WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
+    (
+        "smooth_depth",
+        lambda depth: depth[0],
+        r"smooth_depth is torch.float32 of shape \(1, 48, 64\), expected a",
+    ),
+    ("smooth_depth", lambda depth: depth.double(), "smooth_depth is torch.float64 of shape .* torch.float32 of shape"),
+    ("smooth_depth", lambda depth: depth.numpy(), r"smooth_depth is a ndarray, expected a tensor, torch.float32 of sh"),
+    ("smooth_depth", lambda depth: depth.to("meta"), r"smooth_depth is .* on meta, expected a tensor"),
+    ("smooth_depth", lambda depth: depth[..., ::2], r"of shape \(1, 1, 48, 32\), expected .* \(1, 1, 48, 64\)$"),
+    ("smooth_depth", lambda _: None, "smooth_depth is a NoneType, expected a tensor"),
+    ("detect_features", lambda _: None, "detect_features returned a NoneType; it must return Features"),
+    ("detect_features", change(uv=torch.Tensor.float), r"detect_features\.uv is torch.float32 of shape \(\d+, 2\)"),
+    ("detect_features", change(depth=lambda x: x[:1]), r"detect_features\.depth is .* \(1,\), expected .* \(\d\d+,\)$"),
+    ("detect_features", change(descriptors=lambda x: x[:, :16]), r"detect_features\.descriptors .* shape \(\d+, 32\)"),
+    ("compensate", lambda features: features[:3], r"compensate\.uv is .* \(3, 2\), expected .* shape \(\d\d+, 2\)"),
+    ("odometry", lambda motion: motion.T_cp, "odometry returned a Tensor; it must return CameraMotion"),
+    ("odometry", change(T_cp=lambda x: x[:3]), r"odometry\.T_cp is torch.float64 of shape \(3, 4\), .* \(4, 4\)"),
+    ("odometry", change(velocity=torch.Tensor.float), r"odometry\.velocity is torch.float32 of shape \(6,\), expected"),
+    ("odometry", change(pairs=lambda x: x.T), r"odometry\.pairs is torch.int64 .* expected .* of shape \(K, 2\)"),
+    ("odometry", change(is_measured=torch.tensor), r"odometry\.is_measured is a Tensor, expected a bool"),
+    (
+        "free_space_check",
+        lambda result: result.appeared,
+        "free_space_check returned a Tensor; it must return New",
+    ),
+    ("propose_unlabelled", lambda _: [], "propose_unlabelled returned a list; it must return Instances"),
+    ("propose_unlabelled", change(masks=lambda x: x[..., 1:]), r"propose_unlabelled\.masks .* shape \(N, 48, 64\)"),
+    ("back_project_instances", change(points=torch.Tensor.double), r"instances\.points is torch.float64 of shape \(2,"),
+    ("back_project_instances", change(centroid=lambda x: x[:1]), r"\.centroid is .* \(1, 3\), expected .* \(2, 3\)"),
+    ("classify_motion", lambda _: (), "classify_motion returned a tuple; it must return FrameObjects"),
+    ("classify_motion", change(static_mask=torch.Tensor.byte), r"classify_motion\.static_mask is torch.uint8 of shape"),
+    ("track_camera", change(T_cw=torch.Tensor.float), r"track_camera\.T_cw is torch.float32 of shape \(4, 4\)"),
+    (
+        "track_camera",
+        change(landmarks=lambda _: torch.zeros(9999).long()),
+        r"landmarks is torch.int64 of shape \(9999",
+    ),
+    ("track_camera", change(status=str), r"track_camera\.status is a str, expected a TrackingStatus"),
+]
+
+
+@pytest.mark.parametrize(("stage", "edit", "message"), WRONG)
+def test_wrong_result_of_a_replaced_stage_is_named(stage: str, edit: Callable[[Any], Any], message: str) -> None:
+    slam = make_slam()
+    slam(FRAMES[0])
+    builtin = getattr(slam, stage)
+
+    class Own:
+        def __call__(self, *args: Any, **kwargs: Any) -> Any:
+            return edit(builtin(*args, **kwargs))
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(builtin, name)
+
+    setattr(slam, stage, Own())
+    with pytest.raises(ConfigError, match=message) as caught:
+        slam(FRAMES[1])
+    assert "\n" not in str(caught.value)
+
+
+def test_every_result_has_a_case() -> None:
+    from v3d_torch import stage_checks
+
+    checked = {name for name, result in stage_checks._RESULTS.items() if result is not None}
+    assert {stage for stage, _, _ in WRONG} == checked
+    assert set(stage_checks._RESULTS) <= vars(make_slam()).keys()
+
+
+def test_replaced_stages_that_are_right_give_the_same_results() -> None:
+    slam, replaced = make_slam(), make_slam()
+    for name in ("smooth_depth", "detect_features", "compensate", "odometry", "classify_motion", "track_camera"):
+        setattr(replaced, name, getattr(replaced, name))
+        assert isinstance(getattr(replaced, name), ReplacedStage)
+    for frame in FRAMES:
+        assert torch.equal(slam(frame).T_wc, replaced(frame).T_wc)
+    assert replaced.state_dict().keys() == slam.state_dict().keys()
+
+
+def test_built_in_stages_are_not_wrapped() -> None:
+    slam = make_slam()
+    assert type(slam.smooth_depth) is DepthSmoother and type(slam.odometry) is Odometry
+    assert not any(isinstance(value, ReplacedStage) for value in vars(slam).values())
+
+
+def test_attributes_of_a_replaced_stage_are_those_of_the_stage() -> None:
+    slam = make_slam()
+    module = torch.nn.Identity()
+    module.gain = 2.0
+    slam.smooth_depth = module  # type: ignore[assignment]
+    assert slam.smooth_depth.gain == 2.0 and list(slam.smooth_depth.parameters()) == []  # type: ignore[attr-defined]
+    slam.smooth_depth.gain = 3.0  # type: ignore[attr-defined]
+    assert module.gain == 3.0
+    assert not hasattr(slam.smooth_depth, "other")
+
+
+@pytest.mark.parametrize("stage", [5, None, torch.zeros(2), "smooth"])
+def test_stage_that_cannot_be_called_is_rejected_at_once(stage: Any) -> None:
+    slam = make_slam()
+    with pytest.raises(ConfigError, match=r"^smooth_depth was replaced by a .*, which cannot be called; set a stage$"):
+        slam.smooth_depth = stage
+    assert isinstance(slam.smooth_depth, DepthSmoother)
+
+
+@pytest.mark.parametrize(
+    ("stage", "message"),
+    [
+        (
+            "classify_motion",
+            "^classify_motion was replaced by a stage without tracker; derive it from MotionCla",
+        ),
+        ("free_space_check", "^free_space_check was replaced by a stage without make_view; derive it from FreeSpaceCh"),
+        (
+            "track_camera",
+            "^track_camera was replaced by a stage without reference_keyframe; derive it from",
+        ),
+        ("back_end", "^back_end was replaced by a stage without result; derive it from BackEnd$"),
+    ],
+)
+def test_function_in_place_of_a_stage_with_methods_is_named(stage: str, message: str) -> None:
+    slam = make_slam()
+    setattr(slam, stage, getattr(slam, stage).__call__ if stage != "back_end" else lambda: None)
+    with pytest.raises(ConfigError, match=message):
+        for frame in FRAMES:
+            slam(frame)
+            slam._apply_world_correction(torch.eye(4, dtype=torch.float64))
+
+
+def test_replaced_stage_is_checked_with_numbers_too() -> None:
+    slam = make_slam(CheckedSLAM)
+    slam.smooth_depth = lambda depth: depth[0]  # type: ignore[assignment]
+    with pytest.raises(ConfigError, match=r"smooth_depth is torch.float32 of shape"):
+        slam(FRAMES[0])
+
+
+def test_segmenter_that_cannot_be_called_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="V3DSLAM needs a segmenter, got a str; give a function that takes a frame"):
+        V3DSLAM(CAMERA, "yolo", CONFIG)  # type: ignore[arg-type]
+
+
+def test_segmenter_on_another_device_is_rejected() -> None:
+    slam = V3DSLAM(CAMERA, lambda frame: replace(segment(frame), scores=torch.ones(2, device="meta")), CONFIG)
+    with pytest.raises(ConfigError, match=r"segmenter's scores for frame 0 are torch.float32 of shape \(2,\) on meta"):
+        slam(FRAMES[0])

@@ -1,0 +1,157 @@
+"""Checks of what stages of the user return, before another stage of `V3DSLAM` fails on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from v3d_torch.errors import ConfigError
+from v3d_torch.features.features import Features
+from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
+from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
+from v3d_torch.types import FramePose, Instances, TrackingStatus
+
+_FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
+    Features: {
+        "uv": (torch.float64, ("N", 2)),
+        "pixel": (torch.int64, ("N", 2)),
+        "depth": (torch.float64, ("N",)),
+        "octave": (torch.int64, ("N",)),
+        "descriptors": (torch.uint8, ("N", 32)),
+        "readout_jacobian": (torch.float64, ("N", 2)),
+    },
+    CameraMotion: {
+        "T_cp": (torch.float64, (4, 4)),
+        "velocity": (torch.float64, (6,)),
+        "pairs": (torch.int64, ("K", 2)),
+        "is_measured": bool,
+    },
+    NewlyOccupied: {"appeared": (torch.float64, ("B", "h", "w")), "stride": int},
+    Instances: INSTANCES,
+    InstanceClouds: {
+        "points": (torch.float32, ("N", "P", 3)),
+        "valid": (torch.bool, ("N", "P")),
+        "centroid": (torch.float32, ("N", 3)),
+        "cloud_pixels": (torch.bool, ("N", "H", "W")),
+    },
+    FrameObjects: {
+        "objects": list,
+        "static_mask": (torch.bool, ("H", "W")),
+        "static_without_people": (torch.bool, ("H", "W")),
+        "vote_pairs": list,
+    },
+    FramePose: {"status": TrackingStatus, "T_cw": (torch.float64, (4, 4)), "landmarks": (torch.int64, ("N",))},
+}
+"""Fields of each class that a stage returns: dtype and shape of tensors, else the type."""
+
+
+def _image_size(image: Tensor) -> dict[str, int]:
+    return dict(zip("HW", image.shape[-2:], strict=True))
+
+
+_RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] | None] = {
+    "smooth_depth": ((torch.float32, ("B", 1, "H", "W")), lambda depth: {"B": len(depth), **_image_size(depth)}),
+    "detect_features": (Features, lambda *_: {}),
+    "compensate": (Features, lambda features, *_: {"N": len(features)}),
+    "odometry": (CameraMotion, lambda *_: {}),
+    "free_space_check": (NewlyOccupied, lambda *_: {}),
+    "propose_unlabelled": (Instances, lambda occupied, instances, depth: _image_size(depth)),
+    "back_project_instances": (InstanceClouds, lambda depth, instances: {"N": len(instances), **_image_size(depth)}),
+    "classify_motion": (FrameObjects, lambda instances, clouds, view, *_: _image_size(view.depth)),
+    "track_camera": (FramePose, lambda features, *_: {"N": len(features)}),
+    **dict.fromkeys(("motion_model", "refine_previous", "mapper", "back_end", "loop_closer")),
+}
+"""Result of each stage, and the function that returns the sizes that the arguments determine; None if a result is not
+checked."""
+
+
+class ReplaceableStages:
+    """Base class of `V3DSLAM`. A stage that is set again is one of the user, and what it returns is checked."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute.
+
+        Raises:
+            ConfigError: If a stage that is called is replaced by a value that cannot be called.
+        """
+        if name in _RESULTS and name in vars(self):
+            value = ReplacedStage(value, name, vars(self)[name])
+        super().__setattr__(name, value)
+
+
+class ReplacedStage(StageProxy):
+    """Stage of the user. Types, shapes, dtypes and devices of its results are checked.
+
+    Args:
+        stage: Stage.
+        name: Name of its attribute.
+        replaced: Stage that was there before.
+
+    Raises:
+        ConfigError: If the stage before can be called, and this one cannot.
+    """
+
+    _OWN = StageProxy._OWN | {"_replaced"}
+
+    def __init__(self, stage: Any, name: str, replaced: Any) -> None:
+        super().__init__(stage, name)
+        self._replaced = replaced
+        if callable(replaced) and not callable(stage):
+            raise ConfigError(f"{name} was replaced by {describe_type(stage)}, which cannot be called; set a stage")
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the stage.
+
+        Raises:
+            ConfigError: If the stage lacks a method of the stage before that others use.
+        """
+        try:
+            return super().__getattr__(name)
+        except AttributeError:
+            if name.startswith("_") or name in STATE_METHODS or not hasattr(self._replaced, name):
+                raise
+            raise ConfigError(
+                f"{self._name} was replaced by a stage without {name}; derive it from {type(self._replaced).__name__}"
+            ) from None
+
+    def _check(self, result: Any, *args: Any) -> None:
+        checked = _RESULTS[self._name]
+        if checked is None:
+            return
+        expected, sizes = checked
+        if isinstance(expected, type) and not isinstance(result, expected):
+            raise ConfigError(f"{self._name} returned {describe_type(result)}; it must return {expected.__name__}")
+        _check_value(self._name, result, expected, sizes(*args))
+
+
+def _check_value(name: str, value: object, expected: type | TensorSpec, sizes: dict[str, int]) -> None:
+    """Check a value, and the fields of a dataclass.
+
+    Args:
+        name: Name of the value in messages.
+        value: Value.
+        expected: Its class, or dtype and shape of a tensor.
+        sizes: Known sizes by the name of the dimension; sizes that are first seen in the value are added.
+
+    Raises:
+        ConfigError: If the value is not as expected.
+    """
+    if isinstance(expected, type):
+        if not isinstance(value, expected):
+            raise ConfigError(f"{name} is {describe_type(value)}, expected a {expected.__name__}")
+        for field, kind in _FIELDS.get(expected, {}).items():
+            _check_value(f"{name}.{field}", getattr(value, field), kind, sizes)
+        return
+    dtype, dimensions = expected
+    shape = fill_in(dimensions, sizes)
+    if (wrong := describe_wrong_tensor(value, shape, dtype)) is not None:
+        raise ConfigError(f"{name} is {wrong}")
+    found = cast("Tensor", value).shape
+    sizes |= {name: size for name, size in zip(shape, found, strict=True) if isinstance(name, str)}
