@@ -159,6 +159,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
 
 
 def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
+    if request.realtime and request.skip_broken:
+        raise ConfigError("--realtime: a broken frame ends the playback; remove --skip-broken")
     with progress_bars(console) as progress:
         source = open_source(
             request.seq,
