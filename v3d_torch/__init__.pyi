@@ -1,6 +1,7 @@
 from .config import Config
 from .config.loading import load_config
 from .datasets import SourceOptions, load_sequence, open_source
+from .datasets.realtime_playback import RealtimePlayback
 from .datasets.tum_trajectory import read_trajectory, write_trajectory
 from .errors import ConfigError, DownloadError, GroundTruthWarning, InputError, V3DError
 from .frame_result import FrameResult
@@ -8,6 +9,7 @@ from .geometry.camera import BackProjector, PinholeCamera, back_project
 from .geometry.depth_smoother import DepthSmoother, smooth_depth
 from .geometry.normals import surface_normals
 from .geometry.voxel import VoxelPool, Voxels, voxel_pool
+from .live import LiveResult, LiveSLAM
 from .mapping.map_io import StoredMap, load_map, save_map
 from .mapping.static_views import StaticViews
 from .objects.assignment import match_instances
@@ -22,12 +24,14 @@ from .reconstruction.mesh import Mesh, fuse_mesh
 from .reconstruction.point_map import PointMap, fuse_points
 from .runs.state import load_state, save_state
 from .slam import V3DSLAM
+from .tracking.camera_state import CameraState
 from .types import Instances, RGBDFrame, TrackingStatus, Trajectory
 
 __all__ = [
     "DBSCAN",
     "V3DSLAM",
     "BackProjector",
+    "CameraState",
     "ChamferDistance",
     "Config",
     "ConfigError",
@@ -42,11 +46,14 @@ __all__ = [
     "Instances",
     "IntraObjectMotion",
     "LargestClusters",
+    "LiveResult",
+    "LiveSLAM",
     "Mesh",
     "MotionState",
     "PinholeCamera",
     "PointMap",
     "RGBDFrame",
+    "RealtimePlayback",
     "SourceOptions",
     "StaticViews",
     "StoredMap",
