@@ -73,6 +73,19 @@ MAP_COSTS = {
     "loading": "loading",
 }
 
+OCCUPANCY = {"quantity": "map of the demo", "value": "result"}
+
+OCCUPANCY_COSTS = {
+    "sequence": "sequence",
+    "cpu_ms": "CPU ms per frame",
+    "cpu_ms_95": "95th percentile",
+    "octomap_ms": "OctoMap, CPU ms per frame",
+    "voxels": "voxels occupied / free",
+    "memory_mb": "memory, MB",
+    "files_kb": "npz / bt, kB",
+    "queries_ms": "1000 free balls / search tree / 1000 distances / floor, CPU ms",
+}
+
 PRIMITIVES = {
     "primitive": "primitive",
     "size": "size",
@@ -80,6 +93,15 @@ PRIMITIVES = {
     "competitor": "competitor",
     "ms": "ms",
     "ratio": "ratio",
+}
+
+MODULES = {
+    "function": "function",
+    "batch": "batch",
+    "competitor": "competitor",
+    "ms": "ms",
+    "ratio": "ratio",
+    "error": "error",
 }
 
 DESIGN_CHOICES = {"choice": "choice", "sequence": "sequence", "result": "result", "commit": "commit"}

@@ -181,11 +181,43 @@ def maps_section(measurements: Sequence[Measurement], costs: Sequence[Measuremen
         yield from part(text, flat(rows_of(costs), columns.MAP_COSTS), costs, "sequence")
 
 
+def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the occupancy map."""
+    yield "## Occupancy map"
+    if measurements:
+        text = (
+            "The map of the demo, with estimated poses and masks, against the exact surfaces of the room. A voxel that"
+            " a surface touches with a corner contains it, however little of it is seen; a sample stands for 64 pixels."
+            " Unknown space is excluded from all rows."
+        )
+        yield from part(text, flat(rows_of(measurements), columns.OCCUPANCY), measurements)
+    if costs:
+        text = (
+            "Time of the stage in the system, and of OctoMap (octomap-python) for the insertion of the same views;"
+            " memory of voxels and stored views; size of the files; time of queries."
+        )
+        yield from part(text, flat(rows_of(costs), columns.OCCUPANCY_COSTS), costs, "sequence")
+
+
 def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the primitives of the object stage."""
     yield "## Primitives of the object stage"
     text = "Median time; the ratio is the time of the competitor over ours in the same turn: above 1 ours is faster."
     yield from part(text, flat(rows_of(measurements), columns.PRIMITIVES), measurements)
+
+
+def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the camera modules."""
+    yield "## Camera modules"
+    text = (
+        "Median time of a batch with one thread; the ratio is the time of the competitor over ours in the same turn:"
+        " above 1 ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
+        " GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
+        " millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
+        " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo,"
+        " thousandths."
+    )
+    yield from part(text, flat(rows_of(measurements), columns.MODULES), measurements)
 
 
 def design_section(measurements: Sequence[Measurement]) -> Iterator[str]:
@@ -212,8 +244,10 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("ablation",), objects_section),
     (("segmentation",), segmentation_section),
     (("maps", "map_costs"), maps_section),
+    (("occupancy", "occupancy_costs"), occupancy_section),
     (("ablation",), ablation_section),
     (("primitives",), primitives_section),
+    (("modules",), modules_section),
     (("design_choices",), design_section),
 )
 """Files of each section in ``benchmarks/results``, and the function that writes it."""

@@ -187,6 +187,7 @@ def test_gravity_of_the_first_frame_is_that_of_the_world(demo: RGBDSequence) -> 
         assert torch.equal(slam(frame).T_wc, without(demo[index]).T_wc)
     assert slam.gravity is not None and without.gravity is None
     torch.testing.assert_close(slam.gravity, down)
+    assert slam.occupancy is None or torch.equal(slam.occupancy.accelerometer, -slam.gravity)
     restored = V3DSLAM(demo.camera, config=NO_NETWORK)
     restored.load_state_dict(slam.state_dict())
     assert restored.gravity is not None and torch.equal(restored.gravity, down)

@@ -25,12 +25,14 @@ from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.unlabelled import unlabelled_instances
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stage_checks import ReplaceableStages
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
@@ -76,6 +78,7 @@ class V3DSLAM(ReplaceableStages):
         states: States of the camera in the last seconds.
         gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None if no frame
             has a measured one.
+        occupancy: Free and occupied space, in ``occupancy.map``; None if it is not configured.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -125,6 +128,8 @@ class V3DSLAM(ReplaceableStages):
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
         self.loop_closer.rebuild(self.map.active_keyframes)
+        # Free and occupied space
+        self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
         self.gravity: Tensor | None = None
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
@@ -258,6 +263,12 @@ class V3DSLAM(ReplaceableStages):
             references = None if keyframe is None else self.map.references
             state = self.estimate_state(pose, motion, self.poses, owners, references)
             self.states.append(state)
+        if self.occupancy is not None:
+            with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
+                if self.gravity is not None:
+                    self.occupancy.accelerometer = -self.gravity
+                votes = up_votes(self._segmenter_state)
+                self.occupancy(depth, objects.static_mask, self.poses, votes)
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
@@ -328,6 +339,7 @@ class V3DSLAM(ReplaceableStages):
             "mapper": self.mapper,
             "loop_closer": self.loop_closer,
             "back_end": self.back_end,
+            **({} if self.occupancy is None else {"occupancy": self.occupancy}),
         }
         for name, component in components.items():
             if not is_stateful(component):

@@ -29,9 +29,8 @@ LAYERS = (
         "datasets",
         "segmentation",
     ),
-    *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "evaluation", "frame_result"),
-    "stage_checks",
-    *("slam", "live", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
+    *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "occupancy", "evaluation"),
+    *("frame_result", "stage_checks", "slam", "live", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
 )
 """Folders and modules of the package's root, from low to high: a layer imports only from itself and lower layers."""
 

@@ -18,6 +18,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import evaluate
+from v3d_torch.occupancy.occupancy_io import load_occupancy
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
 
@@ -151,6 +152,19 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
     mesh = plyfile.PlyData.read(tmp_path / "mesh.ply")
     assert np.abs(np.asarray(mesh["vertex"]["z"]) - WALL).max() < 0.02
     assert mesh["face"].count > 1000 and mesh["vertex"]["red"].std() > 10
+
+
+def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:
+    assert not {"occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml"} & {path.name for path in results.iterdir()}
+    run = run_along_wall("occupancy.enabled=true")
+    write_results(tmp_path, run)
+    assert (tmp_path / "trajectory.txt").read_bytes() == (results / "trajectory.txt").read_bytes()
+    stored, wall = load_occupancy(tmp_path / "occupancy.npz"), torch.tensor([[0.0, 0.0, WALL]])
+    assert stored.map.distance(wall - torch.tensor([0.0, 0.0, 0.5])).item() == pytest.approx(0.5, abs=0.05)
+    assert (stored.map.occupied_points[:, 2] - WALL).abs().max() < 0.05
+    assert (tmp_path / "occupancy.bt").read_bytes().startswith(b"# Octomap OcTree binary file\n")
+    assert stored.floor is None and not (tmp_path / "map.yaml").exists()  # a wall is no floor
+    assert cv2.imread(str(tmp_path / "figures" / "occupancy.png")) is not None
 
 
 def test_figures_are_images_with_content(results: Path) -> None:

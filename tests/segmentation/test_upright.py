@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.segmentation.upright import UprightSegmenter
+from v3d_torch.segmentation.upright import UprightSegmenter, up_votes
 from v3d_torch.types import (
     Instances,
     PoseAwareSegmenter,
@@ -215,3 +215,11 @@ def test_methods_forwarded_by_a_proxy_are_used() -> None:
     assert segment_frame(proxy, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
     state = segmenter_state_of(proxy)
     assert state is not None and state["calls"] == 1
+
+
+def test_votes_are_read_from_the_state_of_upright_segmenters_only() -> None:
+    upright = UprightSegmenter(Network())
+    upright.segment_with_pose(make_frame(0, 1), IDENTITY)
+    votes = up_votes(segmenter_state_of(upright))
+    assert votes is not None and votes.norm() > 0.5 and votes[0].abs() > votes[1].abs()
+    assert up_votes(None) is None and up_votes({"up": 3}) is None and up_votes({}) is None

@@ -50,6 +50,9 @@ def main(
     rerun: Annotated[Path | None, typer.Option(help="Record the run for rerun in this .rrd file.")] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the static scene.")] = False,
+    occupancy: Annotated[
+        bool, typer.Option("--occupancy", help="Grow and write an occupancy map, for planning.")
+    ] = False,
     save_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Save the map at the end, for later runs.")
     ] = None,
@@ -85,6 +88,7 @@ def main(
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
+    overrides += ["occupancy.enabled=true"] if occupancy else []
     overrides += ["mapping.enabled=false"] if localise else []
     overrides += ["prefetch=false"] if serial else []
     data_root_source = context.get_parameter_source("data_root")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,9 +13,9 @@ from v3d_torch.config import Config, RollingShutterConfig
 from v3d_torch.features.features import pixel_sigma
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
-from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust, reduced_cost_derivatives
+from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.mapping.readout_calibration import calibrate_readout
+from v3d_torch.mapping.readout_calibration import estimate_readout
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.tensor_table import unique_ids
 from v3d_torch.odometry.rolling_shutter import Readout
@@ -89,31 +90,32 @@ def local_bundle_adjust(
     fixed = ~torch.isin(poses, window) | (poses == 0)
     if not fixed.any():
         fixed[0] = True  # fix the gauge by the oldest keyframe
-    observations = Observations(
-        uv=table["uv"].index_select(0, rows),
-        inverse_depth=table["inverse_depth"][rows],
-        pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
-        inverse_depth_sigma=config.tracking.inverse_depth_sigma,
-        pose=pose,
-        point=point,
-    )
+    observations: dict[str, Any] = {
+        "uv": table["uv"].index_select(0, rows),
+        "pose": pose,
+        "point": point,
+        "K": camera.K,
+        "inverse_depth": table["inverse_depth"][rows],
+        "pixel_sigma": pixel_sigma(table["octave"][rows], config.tracking, config.features),
+        "inverse_depth_sigma": config.tracking.inverse_depth_sigma,
+        "fixed": fixed,
+    }
     result = bundle_adjust(
         T_cw[poses],
         sparse_map.landmarks["point"][landmarks],
-        observations,
-        camera,
-        fixed,
+        **observations,
         iterations=_MAX_ITERATIONS,
         tolerance=_COST_TOLERANCE,
     )
     readout = sparse_map.readout
     if _is_calibration_due(sparse_map, keyframe, config.rolling_shutter):
-        uv_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, rows)
-        readout = calibrate_readout(
-            readout, *reduced_cost_derivatives(result.T_cw, result.points, observations, camera, fixed, uv_jacobian)
+        readout_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, rows)
+        estimate = estimate_readout(
+            *(readout.seconds, readout.information, readout_jacobian, result.T_cw, result.points), **observations
         )
+        readout = Readout(*map(float, estimate))
     T_cw[poses[~fixed]] = orthonormalise(result.T_cw[~fixed])
-    return LocalAdjustment(T_cw, landmarks, result.points, rows[result.chi2 > observations.chi2_threshold], readout)
+    return LocalAdjustment(T_cw, landmarks, result.points, rows[~result.inliers], readout)
 
 
 def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: RollingShutterConfig) -> bool:

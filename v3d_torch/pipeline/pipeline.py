@@ -171,8 +171,10 @@ class Pipeline:
 
     @torch.inference_mode()
     def flush(self) -> None:
-        """Apply the pending result of the back end and show the final state; call this after the last frame."""
+        """Apply the pending results of the back end and show the final state; call this after the last frame."""
         self.slam.flush()
+        if self.slam.occupancy is not None:
+            self.slam.occupancy.correct(self.slam.poses)
         try:
             self._viewer.finish(self.slam)
         except V3DError as error:

@@ -24,9 +24,10 @@ from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
 _NOT_STAGES = frozenset(
-    {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions"}
+    {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions", "occupancy"}
 )
-"""Public attributes of `V3DSLAM` that are not stages."""
+"""Public attributes of `V3DSLAM` that are not stages. The occupancy map is a result of whole numbers, in whose queries
+NaN is unknown space."""
 
 MAY_BE_NAN = frozenset(
     {

@@ -14,15 +14,9 @@ _LOG = "run.log"
 
 _RESULTS = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "report.html"),
-    *(
-        "checkpoint.v3d",
-        "frames.parquet",
-        "states.parquet",
-        "dynamics.parquet",
-        "map.ply",
-        "mesh.ply",
-        "trajectory.ply",
-    ),
+    *("checkpoint.v3d", "frames.parquet", "states.parquet", "dynamics.parquet"),
+    *("map.ply", "mesh.ply", "trajectory.ply"),
+    *("occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml", "figures/occupancy.png"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png", "masks/*.png"),
 )
 """Files that a run, or the report of a run, writes in addition to the log."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import platform
 import re
 import sys
@@ -26,6 +27,11 @@ from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import MotionState
+from v3d_torch.occupancy.map_server import write_map_server_files
+from v3d_torch.occupancy.occupancy_grid import occupancy_grid
+from v3d_torch.occupancy.occupancy_io import save_occupancy
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
@@ -38,6 +44,8 @@ from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
     import resource
+
+_LOG = logging.getLogger(__name__)
 
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
@@ -221,6 +229,8 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    if slam.occupancy is not None:
+        _write_occupancy(folder, slam.occupancy)
     keyframes = slam.map.active_keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
@@ -228,3 +238,14 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     statuses = [status.value for status in slam.poses.statuses]
     path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)
+
+
+def _write_occupancy(folder: Path, mapper: OccupancyMapper) -> None:
+    """Write the occupancy map, and its 2D grid if a floor is visible."""
+    floor = mapper.find_floor()
+    save_occupancy(folder / "occupancy.npz", mapper.map, floor)
+    write_octomap(folder / "occupancy.bt", mapper.map)
+    if floor is None:
+        _LOG.warning("occupancy map: no floor is visible; no 2D grid was written")
+    else:
+        write_map_server_files(folder / "map.yaml", occupancy_grid(mapper.map, floor))

@@ -23,7 +23,6 @@ from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import remove_unfinished
-from v3d_torch.runs.results import write_results
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
@@ -111,6 +110,8 @@ class Run:
         record = self.pipeline(log_and_save)
         self._autosave.end()
         self.pipeline.flush()
+        from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
+
         evaluation = write_results(self._folder, self.pipeline)
         self._autosave.discard()
         if record.failure:

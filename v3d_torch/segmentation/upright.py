@@ -121,6 +121,19 @@ def _turns(up: Tensor) -> int:
     return round(math.atan2(x, -y) / (math.pi / 2)) % 4
 
 
+def up_votes(state: Mapping[str, Any] | None) -> Tensor | None:
+    """Sum of the votes for the up direction in the state of a segmenter.
+
+    Args:
+        state: State of a segmenter; None if it has none.
+
+    Returns:
+        Sum of the votes, in detections of score 1, world frame, float64, shape :math:`(3,)`; None if the segmenter is
+        no `UprightSegmenter`.
+    """
+    return state["up"] if state is not None and state.keys() == {"calls", "up"} else None
+
+
 def _up_in_camera(turns: int) -> Tensor:
     """Up direction, camera frame, if counterclockwise quarter turns bring the image upright, float64, shape (3,)."""
     angle = turns * math.pi / 2

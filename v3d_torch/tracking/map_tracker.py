@@ -121,9 +121,8 @@ class MapTracker:
         config = self._config
         if len(features) < config.min_inliers:
             return None
-        refined = refine_pose(
-            T_cw, points, to_measurements(features, config, self._pyramid), self._camera, rounds=rounds
-        )
+        measured = to_measurements(features, config, self._pyramid)
+        refined = refine_pose(T_cw, points, K=self._camera.K, **vars(measured), rounds=rounds)
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
     def _is_occluded(self, projected: ProjectedLandmarks, depth: Tensor) -> Tensor:

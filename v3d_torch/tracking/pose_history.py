@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,6 +77,11 @@ class PoseHistory:
         return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
 
     @property
+    def keyframe(self) -> Keyframe | None:
+        """Keyframe that the pose of the last frame is relative to; None if there is none."""
+        return self._entries[-1].keyframe if self._entries else None
+
+    @property
     def has_motion(self) -> bool:
         """True if the motion between the last frame and the one before it was measured."""
         return bool(self._entries) and self._entries[-1].has_motion
@@ -134,6 +139,20 @@ class PoseHistory:
         """Replace the pose of the last frame by a refined one, world to camera, float64, shape :math:`(4, 4)`."""
         last = self._entries[-1]
         self._entries[-1] = replace(last, T_ck=_relative(T_cw, last.keyframe))
+
+    def poses_of(self, frames: Sequence[int]) -> Tensor:
+        """World-to-camera poses of some frames in the current map.
+
+        Args:
+            frames: Positions of the frames in the history, from 0.
+
+        Returns:
+            Poses, float64, shape :math:`(N, 4, 4)`.
+        """
+        entries = [self._entries[frame] for frame in frames]
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)
+        T_ck, T_kw = [entry.T_ck[None] for entry in entries], [_pose(entry.keyframe)[None] for entry in entries]
+        return torch.cat([none, *T_ck]) @ torch.cat([none, *T_kw])
 
     def trajectory(self) -> Trajectory:
         """Poses of all frames in the current map; lost frames are interpolated between the nearest found ones."""

@@ -24,6 +24,7 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 from v3d_torch.viz.rerun.layout import layout
 from v3d_torch.viz.rerun.objects import format_objects, log_objects, motion_state_classes, rgba
+from v3d_torch.viz.rerun.occupancy import log_floor, log_voxels
 
 _LOG = logging.getLogger("v3d_torch")
 
@@ -45,6 +46,7 @@ class RerunViewer:
     ``world/objects``, ``world/centroids``    clouds and centroids of the objects; their class is the motion state
     ``world/votes``                           lines of votes for dynamic objects; other votes: ``without_effect``
     ``world/map``                             ``landmarks`` and ``keyframes``, logged again after each new keyframe
+    ``world/occupancy``                       occupied voxels, logged with the map; ``floor``: free cells, at the end
     ``world/trajectory``                      all poses, logged again after each new keyframe; ``newest``: poses since
     ``world/groundtruth``                     ground truth, aligned at the first pose that has one
     ``seconds``, ``votes``, ``chamfer``       curves, by stage and by object id
@@ -113,6 +115,8 @@ class RerunViewer:
             OutputError: If the file could not be written completely.
         """
         self._log_map(slam)
+        if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
+            log_floor(self._stream, grid)
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT)
         except RuntimeError as error:
@@ -143,6 +147,8 @@ class RerunViewer:
         self._stream.log("world/map/landmarks", grey)
         frustums = _frustums(self._camera, invert(stack_poses(slam.map.active_keyframes)))
         self._stream.log("world/map/keyframes", _lines(frustums, "tab:cyan", width=0.7))
+        if slam.occupancy is not None:
+            log_voxels(self._stream, slam.occupancy.map)
         positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
         self._stream.log("world/trajectory", _lines([positions], "tab:blue"))
         self._newest = list(positions[-1:])
