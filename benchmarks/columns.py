@@ -21,6 +21,16 @@ KEYFRAMES = {
     "error_after": "error after, m",
 }
 
+CONSISTENCY = {
+    "sequence": "sequence",
+    "poses": "poses",
+    "nees": "NEES, expected 6",
+    "median": "median, expected 5.3",
+    "within": "below the 95% bound",
+    "position": "position, expected 3",
+    "rotation": "rotation, expected 3",
+}
+
 LOST = {
     "sequence": "sequence",
     "interruption": "interruption",

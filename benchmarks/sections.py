@@ -108,6 +108,17 @@ def lost_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield from part(text, flat(rows_of(measurements), columns.LOST), measurements, "sequence")
 
 
+def consistency_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the covariance of poses."""
+    yield "## Covariance of poses"
+    text = (
+        "Normalised estimation error squared (NEES) of the poses as they were known at each frame. Below its"
+        " expectation, the covariance is too large; above it, too small. World, mounting on the camera and clock of the"
+        " ground truth are calibrated, 13 numbers for all poses; its noise is not subtracted."
+    )
+    yield from part(text, flat(rows_of(measurements), columns.CONSISTENCY), measurements, "sequence")
+
+
 def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on masks and ids of objects."""
     yield "## Objects: masks and ids"
@@ -255,6 +266,7 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("speed", "stages"), speed_section),
     (("growth", "keyframes"), growth_section),
     (("lost",), lost_section),
+    (("consistency",), consistency_section),
     (("ablation",), objects_section),
     (("tracks",), tracks_section),
     (("segmentation",), segmentation_section),

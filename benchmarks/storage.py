@@ -21,6 +21,7 @@ RESULTS = Path(__file__).with_name("results")
 KEYS: Mapping[str, tuple[str, ...]] = {
     "ablation": ("sequence", "variant"),
     "accuracy": ("sequence", "system"),
+    "consistency": ("sequence", "configuration"),
     "design_choices": ("choice", "sequence"),
     "growth": ("sequence", "frames"),
     "keyframes": ("keyframes",),

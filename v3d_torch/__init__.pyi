@@ -2,6 +2,7 @@ from .backend.pose_graph import PoseGraphOptimiser, PoseGraphResult, optimise_po
 from .config import Config
 from .config.loading import load_config
 from .datasets import SourceOptions, load_sequence, open_source
+from .datasets.realtime_playback import RealtimePlayback
 from .datasets.tum_trajectory import read_trajectory, write_trajectory
 from .errors import ConfigError, DownloadError, GroundTruthWarning, InputError, V3DError
 from .evaluation.ate import ate
@@ -16,6 +17,7 @@ from .geometry.depth_smoother import DepthSmoother, smooth_depth
 from .geometry.normals import surface_normals
 from .geometry.se3 import se3_exp, se3_log
 from .geometry.voxel import VoxelPool, Voxels, voxel_pool
+from .live import LiveResult, LiveSLAM
 from .mapping.bundle_adjustment import BundleAdjuster, BundleAdjustment, bundle_adjust
 from .mapping.map_io import StoredMap, load_map, save_map
 from .mapping.readout_calibration import ReadoutEstimator, estimate_readout
@@ -43,6 +45,7 @@ from .reconstruction.mesh import Mesh, fuse_mesh
 from .reconstruction.point_map import PointMap, fuse_points
 from .runs.state import load_state, save_state
 from .slam import V3DSLAM
+from .tracking.camera_state import CameraState
 from .types import Instances, RGBDFrame, TrackingStatus, Trajectory
 
 __all__ = [
@@ -51,6 +54,7 @@ __all__ = [
     "BackProjector",
     "BundleAdjuster",
     "BundleAdjustment",
+    "CameraState",
     "ChamferDistance",
     "Config",
     "ConfigError",
@@ -71,6 +75,8 @@ __all__ = [
     "Instances",
     "IntraObjectMotion",
     "LargestClusters",
+    "LiveResult",
+    "LiveSLAM",
     "Mesh",
     "MotionState",
     "OccupancyGrid",
@@ -86,6 +92,7 @@ __all__ = [
     "PoseRefiner",
     "RGBDFrame",
     "ReadoutEstimator",
+    "RealtimePlayback",
     "RelativePoseError",
     "RollingShutterCompensation",
     "SourceOptions",

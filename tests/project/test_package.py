@@ -30,7 +30,20 @@ LAYERS = (
         "segmentation",
     ),
     *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "occupancy", "evaluation"),
-    *("frame_result", "stage_checks", "slam", "pipeline", "viz", "export", "runs", "batch", "cli", "run", "__main__"),
+    *(
+        "frame_result",
+        "stage_checks",
+        "slam",
+        "live",
+        "pipeline",
+        "viz",
+        "export",
+        "runs",
+        "batch",
+        "cli",
+        "run",
+        "__main__",
+    ),
 )
 """Folders and modules of the package's root, from low to high: a layer imports only from itself and lower layers."""
 

@@ -40,7 +40,7 @@ def test_all_documented_files_are_written(results: Path) -> None:
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
     assert names == {
         *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json"),
-        *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+        *("frames.parquet", "states.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
         *("figures/trajectory.png", "figures/masks.png", "figures/clusters.png"),  # a single object has no votes
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -128,6 +129,22 @@ def test_frame_without_a_pose_keeps_its_orientation_and_gives_no_vote() -> None:
     assert network.sizes == [(HEIGHT, WIDTH)] * 2
     assert upright.state_dict()["calls"] == before["calls"] == 0
     assert torch.equal(upright.state_dict()["up"], before["up"])
+
+
+@pytest.mark.parametrize("start", range(4))
+def test_measured_gravity_gives_the_up_direction_from_the_first_frame_on(start: int) -> None:
+    """No frame needs a search, also if the network never detects anything upright, and if the camera rolls later."""
+    network = Network(confident=0.9, doubtful=0.9)
+    upright = UprightSegmenter(network)
+    angle = math.radians(90 * start + 20)  # 20 degrees off a quarter turn
+    gravity = -torch.tensor([math.sin(angle), -math.cos(angle), 0.0], dtype=torch.float64)
+    first = replace(make_frame(0, start), gravity=gravity)
+    assert upright(first).labels.tolist() == [0]  # without a pose
+    assert upright.segment_with_pose(first, IDENTITY).labels.tolist() == [0]
+    for index, degrees in enumerate((0, 90, 180), start=1):
+        frame = make_frame(index, (start - round(degrees / 90)) % 4)
+        assert upright.segment_with_pose(frame, rolled(degrees)).labels.tolist() == [0]
+    assert len(network.sizes) == 5
 
 
 def test_segmenter_that_loads_a_state_continues_with_the_same_results() -> None:

@@ -63,6 +63,10 @@ def main(
     load_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Localise the camera in this map and extend it.")
     ] = None,
+    realtime: Annotated[
+        bool,
+        typer.Option("--realtime", help="Play the sequence at its own rate, and leave out frames as on a live camera."),
+    ] = False,
     serial: Annotated[bool, typer.Option("--serial", help="Use one thread; the results are the same.")] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: do not change the map.")] = False,
     resume: Annotated[
@@ -110,6 +114,7 @@ def main(
             load_map=_text(load_map),
             save_map=_text(save_map),
             save_masks=save_masks,
+            realtime=realtime,
             skip_broken=skip_broken,
         )
         if resume is None:

@@ -14,6 +14,7 @@ from rich.table import Table
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDStream, open_source
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
@@ -175,8 +176,10 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
 
 
 def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
+    if request.realtime and request.skip_broken:
+        raise ConfigError("--realtime: a broken frame ends the playback; remove --skip-broken")
     with progress_bars(console) as progress:
-        return open_source(
+        source = open_source(
             request.seq,
             data_root=_path(request.data_root),
             camera=request.camera,
@@ -184,6 +187,7 @@ def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
             progress=ProgressBar(progress, "sequence"),
             skip_broken=request.skip_broken,
         )
+    return RealtimePlayback(source) if request.realtime else source
 
 
 def _path(text: str | None) -> Path | None:
@@ -251,6 +255,11 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
     if known:
         table.add_row("loaded map", f"{known} keyframes")
     table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
+    if (latency := record.live.latency_statistics()) is not None:
+        text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
+        table.add_row("latency", text)
+        rejected = f", {record.rejected} late or out of order" if record.rejected else ""
+        table.add_row("left out", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")

@@ -5,19 +5,20 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence, Sized
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
-from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
+from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
+from v3d_torch.live.live_slam import LiveSLAM
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
@@ -132,6 +133,9 @@ class Pipeline:
     Attributes:
         record: Records of the run.
         between_frames: False while a frame is processed, and if the processing of a frame failed.
+
+    Raises:
+        ConfigError: If the sequence is live, and the configuration allows no threads.
     """
 
     def __init__(
@@ -152,6 +156,7 @@ class Pipeline:
         self.record = RunRecord()
         self.between_frames = True
         self._mask_folders = masks, map_masks
+        self._live = LiveSLAM(sequence, slam) if isinstance(sequence, LiveStream) else None
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
         self._skip_broken = skip_broken
@@ -159,8 +164,9 @@ class Pipeline:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames of the sequence; of a live stream, the number processed so far."""
-        return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses)
+        """Number of frames of the sequence; of a stream, the number so far, with those that were left out."""
+        so_far = len(self.slam.poses) + self.record.live.dropped
+        return len(self.sequence) if isinstance(self.sequence, Sized) else so_far
 
     def __call__(self, on_frame: FrameCallback | None = None) -> RunRecord:
         """Process all frames. If a frame cannot be read or the user interrupts, the results so far are kept.
@@ -176,14 +182,10 @@ class Pipeline:
         record = self.record
         record.failure, record.interrupted = None, False
         previous_seconds, start = record.seconds, time.perf_counter()
-        frames = self._remaining_frames()
         try:
-            prefetcher = FramePrefetcher(frames, self.slam, ahead=self.slam.config.prefetch)
-            with torch.inference_mode(), closing(prefetcher):
-                for preprocessed in prefetcher:
-                    self._record_broken(frames, before=preprocessed.frame.index)
-                    self.between_frames = False
-                    frame, result = preprocessed.frame, self.slam.track(preprocessed)
+            tracked = self._track_frames() if self._live is None else self._track_live(self._live)
+            with torch.inference_mode(), closing(tracked):
+                for frame, result in tracked:
                     times = self.slam.timer.lap()
                     record.times.append(frame, times)
                     self._record_frame(frame, result)
@@ -191,9 +193,6 @@ class Pipeline:
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
-                    if len(record.times) % _TRIM_INTERVAL == 0:
-                        trim_memory()
-            self._record_broken(frames, before=math.inf)
         except V3DError as error:
             record.failure = str(error)
         except Exception as error:  # an error of the program must not cost the results so far
@@ -235,6 +234,27 @@ class Pipeline:
         self.record = state["record"]
         self.views.load_state_dict(state["views"])
 
+    def _track_frames(self) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
+        """Track the frames of a sequence, and yield each with its result."""
+        frames = self._remaining_frames()
+        with closing(FramePrefetcher(frames, self.slam, ahead=self.slam.config.prefetch)) as prefetcher:
+            for preprocessed in prefetcher:
+                self._record_broken(frames, before=preprocessed.frame.index)
+                self.between_frames = False
+                yield preprocessed.frame, self.slam.track(preprocessed)
+                if len(self.slam.poses) % _TRIM_INTERVAL == 0:
+                    trim_memory()
+        self._record_broken(frames, before=math.inf)
+
+    def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
+        """Track the frames of a live stream, and yield each with its result."""
+        with closing(iter(live)) as results:
+            for result in results:
+                self.between_frames = False
+                self.record.live.append_result(result)
+                self.record.rejected = live.rejected
+                yield result.frame, result
+
     def _remaining_frames(self) -> Iterator[RGBDFrame]:
         """Iterate over the frames that are later than the last tracked one."""
         if not isinstance(self.sequence, RGBDSequence):
@@ -254,6 +274,7 @@ class Pipeline:
             self.record.broken.append(frames.broken.popleft())
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
+        self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result.objects)
         self._evaluate_masks(frame, result)
         for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):

@@ -47,6 +47,7 @@ class RunRequest:
         load_map: Map file in which the camera is localised; None to start a new map.
         save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
+        realtime: True to play the sequence at its own rate, like a live camera.
         skip_broken: True to pass over broken frames, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
     """
 
@@ -63,6 +64,7 @@ class RunRequest:
     load_map: str | None = None
     save_map: str | None = None
     save_masks: bool = False
+    realtime: bool = False
     skip_broken: bool = False
 
     @property

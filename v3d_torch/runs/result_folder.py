@@ -14,7 +14,8 @@ _LOG = "run.log"
 
 _RESULTS = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json"),
-    *("report.html", "checkpoint.v3d", "frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
+    *("report.html", "checkpoint.v3d", "frames.parquet", "states.parquet", "dynamics.parquet"),
+    *("map.ply", "mesh.ply", "trajectory.ply"),
     *("occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml", "figures/occupancy.png"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png"),
     *("masks/*.png", "map_masks/*.png"),

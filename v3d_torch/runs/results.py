@@ -36,6 +36,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
+from v3d_torch.runs.state_table import make_state_table
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -117,6 +118,7 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
         with suppress(InputError):  # too few poses for scores
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frame_count)
     _write_table(folder / "frames.parquet", _frame_table(pipeline))
+    _write_table(folder / "states.parquet", make_state_table(pipeline.record))
     _write_table(folder / "dynamics.parquet", _object_table(pipeline.record.dynamics))
     return trajectory, evaluation
 
@@ -191,7 +193,11 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
+        "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "failure": failure,
+        "latency": run.live.latency_statistics(),
+        "dropped": run.live.dropped,
+        "rejected": run.rejected,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,
         "seconds_per_stage": dict(slam.timer.seconds),

@@ -23,12 +23,13 @@ from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.tracking.pose_history import PoseEntry
 from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus),
+    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus, CameraState),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
     *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView),
 )

@@ -43,11 +43,13 @@ class PoseHistory:
     """Poses of all frames in the order of time.
 
     Attributes:
+        last_found: Time of the last frame that was found, seconds; minus infinity if there is none.
         observed_landmarks: IDs of the landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
     """
 
     def __init__(self) -> None:
         self._entries: list[PoseEntry] = []
+        self.last_found = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
 
     def __len__(self) -> int:
@@ -89,12 +91,6 @@ class PoseHistory:
         """True if any frame was found so far."""
         return self.last_found > -torch.inf
 
-    @property
-    def last_found(self) -> float:
-        """Time of the last frame that was found, seconds; minus infinity if there is none."""
-        found = (entry.stamp for entry in reversed(self._entries) if entry.status is not TrackingStatus.LOST)
-        return next(found, -torch.inf)
-
     def append(
         self, stamp: float, pose: FramePose, motion: CameraMotion, reference: Keyframe | None, new: Keyframe | None
     ) -> Tensor | None:
@@ -135,6 +131,8 @@ class PoseHistory:
             entry = PoseEntry(stamp, status, new, torch.eye(4, dtype=torch.float64), motion.is_measured)
             self.observed_landmarks = new.observed_landmarks
         self._entries.append(entry)
+        if status is not TrackingStatus.LOST:
+            self.last_found = stamp
         return T_new_old
 
     def replace_last(self, T_cw: Tensor) -> None:
@@ -165,11 +163,16 @@ class PoseHistory:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the poses of all frames."""
-        return {"entries": self._entries, "observed_landmarks": self.observed_landmarks}
+        return {
+            "entries": self._entries,
+            "last_found": self.last_found,
+            "observed_landmarks": self.observed_landmarks,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
-        self._entries, self.observed_landmarks = list(state["entries"]), state["observed_landmarks"]
+        self._entries, self.last_found = list(state["entries"]), state["last_found"]
+        self.observed_landmarks = state["observed_landmarks"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end: those linked to the new frame by measured motions, or all of them."""
