@@ -29,6 +29,11 @@ _MIN_PIXELS = 10
 """Minimum number of counted pixels: with fewer the appearance is unknown."""
 
 
+_BRIGHTNESS = np.arange(256) * _BINS // 256
+_CHROMA = np.clip((np.arange(256) - 128) // _COLOUR_STEP + _BINS // 2, 0, _BINS - 1)
+"""Bin of each 8-bit value of the brightness and of a colour axis."""
+
+
 def _smoothing_matrix() -> Tensor:
     """Return the matrix that spreads each bin over its neighbours, float32, shape (D, D)."""
     distance = np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS)))
@@ -51,13 +56,12 @@ def colour_histograms(image: Tensor, masks: Tensor) -> Tensor:
         Histograms that sum to 1, float32, shape :math:`(N, D)`; NaN for an instance with too few pixels.
     """
     colours = image.numpy()[:, ::_STRIDE, ::_STRIDE].transpose(1, 2, 0)
-    lab = cv2.cvtColor(np.ascontiguousarray(colours), cv2.COLOR_RGB2LAB).astype(np.int64)
-    brightness = lab[..., 0] * _BINS // 256
-    chroma = np.clip((lab[..., 1:] - 128) // _COLOUR_STEP + _BINS // 2, 0, _BINS - 1)
-    bins = (brightness * _BINS + chroma[..., 0]) * _BINS + chroma[..., 1]
-    selected = masks.numpy()[:, ::_STRIDE, ::_STRIDE]
-    counts = [np.bincount(bins[mask], minlength=HISTOGRAM_SIZE) for mask in selected]
-    counted = torch.from_numpy(np.array(counts, np.float32).reshape(len(selected), HISTOGRAM_SIZE))
+    lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(colours), cv2.COLOR_RGB2LAB), np.uint8)
+    brightness, a, b = (bins.take(lab[..., axis]) for axis, bins in enumerate((_BRIGHTNESS, _CHROMA, _CHROMA)))
+    bins = ((brightness * _BINS + a) * _BINS + b).reshape(-1)
+    instance, pixel = masks.numpy()[:, ::_STRIDE, ::_STRIDE].reshape(len(masks), bins.size).nonzero()
+    counts = np.bincount(instance * HISTOGRAM_SIZE + bins[pixel], minlength=len(masks) * HISTOGRAM_SIZE)
+    counted = torch.from_numpy(counts.astype(np.float32)).view(len(masks), HISTOGRAM_SIZE)
     total = counted.sum(dim=1, keepdim=True)
     return (counted @ _SMOOTHING / total).masked_fill(total < _MIN_PIXELS, torch.nan)
 

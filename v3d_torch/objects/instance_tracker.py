@@ -209,21 +209,21 @@ class InstanceTracker(torch.nn.Module):
         """Predict the masks of missed tracks, except those that have gone or are lost, and return them."""
         missed, lost = [], []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
-        coarse_depth = pack_masks(has_depth, self._stride)
+        covered = self._covered(predicted.tracks, predicted.masks & pack_masks(has_depth, self._stride), updated)
         for i, track in enumerate(predicted.tracks):
             if track in updated:
                 continue
-            coarse_mask = predicted.masks[i]
-            if predicted.free_fractions[i] > _MIN_FREE_FRACTION:
+            seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
+            if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
                 track.vacant_time += stamp - self._last_stamp
             if track.vacant_time > _MAX_VACANT_TIME:
                 continue
             is_late = stamp - track.newest.stamp > self._config.max_missed_time
-            if is_late or self._is_covered(track, coarse_mask & coarse_depth, updated):
+            if is_late or covered[i]:
                 lost.append(track)
                 continue
             mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
-            track.set_masks(mask, mask & has_depth, coarse_mask, missed=True)
+            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
             track.visible = bool(predicted.visible[i])
             missed.append(track)
         for track in lost:
@@ -233,14 +233,22 @@ class InstanceTracker(torch.nn.Module):
         self.lost = [track for track in candidates if stamp - track.newest.stamp <= remembered]
         return missed
 
-    def _is_covered(self, track: Track, coarse_mask: Tensor, updated: Sequence[Track]) -> bool:
-        """Check whether the predicted mask of a missed track belongs to a detected track of the same class."""
-        minimum = self._config.min_overlap * int(count_pixels(coarse_mask))
-        return any(
-            int(count_pixels(coarse_mask & other.coarse_mask)) > minimum
-            for other in updated
-            if other.label == track.label and other.newest.is_located
-        )
+    def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
+        """Check for each track whether its predicted mask belongs to a detected track of the same class.
+
+        Args:
+            tracks: T tracks.
+            coarse_masks: Their predicted coarse masks where there is depth, packed, shape (T, B).
+            updated: Tracks that were detected.
+        """
+        located = [track for track in updated if track.newest.is_located]
+        if not located or not tracks:
+            return [False] * len(tracks)
+        common = count_common_pixels(coarse_masks, torch.stack([other.coarse_mask for other in located]))
+        is_over = common > self._config.min_overlap * count_pixels(coarse_masks)[:, None]
+        same_class = torch.tensor([[track.label == other.label for other in located] for track in tracks])
+        covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
+        return covered
 
 
 def _compare(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from math import isnan
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
@@ -103,11 +105,12 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
+        detected_masks = _UnionOfMasks(detected)
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=_visible_mask(track, detected),
+                mask=_visible_mask(track, detected_masks),
                 centroid=track.predict_centroid(stamp),
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
@@ -200,14 +203,30 @@ class MotionClassifier:
         return deforming or motion_state is MotionState.STATIC
 
 
-def _visible_mask(track: Track, detected: Sequence[Track]) -> Tensor:
+class _UnionOfMasks:
+    """Union of the masks of the tracks of each class, made when it is first asked for.
+
+    Args:
+        tracks: Tracks.
+    """
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self._tracks = tracks
+        self._unions: dict[int, NDArray[np.bool_]] = {}
+
+    def __getitem__(self, label: int) -> NDArray[np.bool_] | None:
+        """Return the union of a class, shape (H, W); None if there is no track of it."""
+        masks = [track.mask.numpy() for track in self._tracks if track.label == label]
+        if label not in self._unions and masks:
+            self._unions[label] = np.logical_or.reduce(masks)
+        return self._unions.get(label)
+
+
+def _visible_mask(track: Track, detected: _UnionOfMasks) -> Tensor:
     """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
     if not track.missed:
         return track.mask
     if not track.visible:
         return torch.zeros_like(track.mask)
-    mask = track.mask.numpy().copy()
-    for other in detected:
-        if other.label == track.label:
-            mask &= ~other.mask.numpy()
-    return torch.from_numpy(mask)
+    others = detected[track.label]
+    return track.mask if others is None else torch.from_numpy(track.mask.numpy() & ~others)

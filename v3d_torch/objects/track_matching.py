@@ -69,14 +69,12 @@ class PredictedTracks:
         masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`.
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
             :math:`(T,)`.
-        free_fractions: Fraction of the predicted points behind which the depth image shows a surface, by track.
     """
 
     tracks: Sequence[Track]
     silhouettes: Sequence[Silhouette]
     masks: Tensor
     visible_fractions: Tensor
-    free_fractions: Sequence[float]
 
     @property
     def visible(self) -> Tensor:
@@ -140,16 +138,11 @@ def predict_tracks(
     projected = silhouettes(clouds, camera, spacing)
     coarse_depth = depth[:, ::stride, ::stride].contiguous()
     masks = [each.mask(coarse_depth, 0, DEPTH_TOLERANCE, step=stride, include_missing=True) for each in projected]
-    free_fractions = [
-        each.count_seen_through(depth, DEPTH_TOLERANCE) / max(len(cloud), 1)
-        for each, cloud in zip(projected, clouds, strict=True)
-    ]
     return PredictedTracks(
-        tracks,
+        tuple(tracks),
         projected,
         pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
         torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
-        free_fractions,
     )
 
 
