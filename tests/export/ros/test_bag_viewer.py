@@ -33,6 +33,7 @@ from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame
 
 CONFIG = load_config(overrides=["mapping.max_keyframe_interval=5"])
@@ -46,6 +47,7 @@ class Recorded:
         self.path = path
         self.T_wc: list[torch.Tensor] = []
         self.keyframes = 0
+        self.states: list[CameraState] = []
         slam = V3DSLAM(CAMERA, squares, CONFIG)
         self.pipeline = Pipeline(sequence or Wall(), slam, viewer=BagViewer(path, CAMERA))
         self.pipeline(self._on_frame)
@@ -53,6 +55,7 @@ class Recorded:
 
     def _on_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.T_wc.append(result.T_wc)
+        self.states.append(self.pipeline.slam.states.at(frame.stamp))
         self.keyframes = len(self.pipeline.slam.map.keyframes)
 
 
@@ -117,6 +120,22 @@ def test_odometry_agrees_with_tf_and_moves_to_the_right(messages: Messages) -> N
     linear = [odom.twist.twist.linear for _, odom in messages["/odom"]]
     assert linear[0].y == 0
     assert np.median([velocity.y for velocity in linear]) == pytest.approx(-speed, rel=0.05)
+
+
+def test_convention_covariances_of_pose_and_twist_are_along_the_axes_of_ros(
+    messages: Messages, recorded: Recorded
+) -> None:
+    for (_, odom), (_, tf), state in zip(messages["/odom"], messages["/tf"], recorded.states, strict=True):
+        # An error along one axis of the optical frame has its variance along the same direction in odom.
+        R = lookup(tf, "odom", "camera_color_optical_frame")[:3, :3]
+        pose, twist = (np.reshape(each.covariance, (6, 6)) for each in (odom.pose, odom.twist))
+        for rows in (slice(0, 3), slice(3, 6)):
+            along_axes = R.T @ pose[rows, rows] @ R
+            np.testing.assert_allclose(along_axes, state.covariance[rows, rows], atol=1e-12)
+        x, y, z = twist.diagonal()[:3]  # x forward, y left, z up
+        np.testing.assert_allclose([y, z, x], state.twist_covariance.diagonal()[:3])
+        linear = odom.twist.twist.linear
+        np.testing.assert_allclose([-linear.y, -linear.z, linear.x], state.twist[:3], atol=1e-12)
 
 
 def test_path_has_all_frames_at_the_end(messages: Messages, recorded: Recorded) -> None:

@@ -44,8 +44,7 @@ def test_point_is_the_same_by_camera_and_by_world(T_wc: Tensor) -> None:
 def test_odometry_in_uncorrected_map_is_motion_since_the_first_frame(cameras: list[Tensor]) -> None:
     odometry = OdometryFrame()
     for previous, current in zip([cameras[0], *cameras], cameras, strict=False):
-        T_pl = odometry.update(previous, current)
-        torch.testing.assert_close(T_pl, invert(previous) @ current)
+        odometry.update(previous, current)
         torch.testing.assert_close(odometry.T_ol, invert(cameras[0]) @ current)
         torch.testing.assert_close(odometry.T_mo, cameras[0])
 

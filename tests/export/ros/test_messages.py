@@ -82,13 +82,13 @@ def test_occupancy_grid_has_its_cells_row_by_row_and_the_pose_of_the_corner_of_t
 def test_odometry_has_pose_twist_and_covariance_row_by_row() -> None:
     covariance = torch.arange(36.0).reshape(6, 6)
     twist = torch.arange(1.0, 7.0, dtype=torch.float64)
-    message = round_trip(odometry(2.5, ("odom", "camera_link"), T[0], twist, covariance))
+    message = round_trip(odometry(2.5, ("odom", "camera_link"), T[0], twist, covariance, covariance.T))
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "camera_link")
     np.testing.assert_allclose(matrix_of(message.pose.pose), T[0], atol=1e-12)
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     assert [linear.x, linear.y, linear.z, angular.x, angular.y, angular.z] == [1, 2, 3, 4, 5, 6]
     assert message.pose.covariance.tolist() == list(range(36))
-    assert message.twist.covariance.tolist() == [0] * 36  # unknown
+    assert np.reshape(message.twist.covariance, (6, 6)).T.flatten().tolist() == list(range(36))
 
 
 def test_convention_camera_info_has_opencv_matrix_and_distortion() -> None:

@@ -75,18 +75,13 @@ class OdometryFrame:
         self.T_ol = torch.eye(4, dtype=torch.float64)
         self.T_mo = torch.eye(4, dtype=torch.float64)
 
-    def update(self, T_mp: Tensor, T_ml: Tensor) -> Tensor:
+    def update(self, T_mp: Tensor, T_ml: Tensor) -> None:
         """Move the camera to the next frame.
 
         Args:
             T_mp: Pose of ``camera_link`` at the previous frame, in the current map, float64, shape :math:`(4, 4)`; at
                 the first frame the pose of this frame.
             T_ml: Pose of ``camera_link`` at this frame, in the current map, float64, shape :math:`(4, 4)`.
-
-        Returns:
-            Motion ``T_pl``: pose of the camera in that of the previous frame, float64, shape :math:`(4, 4)`.
         """
-        T_pl = invert(T_mp) @ T_ml
-        self.T_ol = orthonormalise(self.T_ol @ T_pl)
+        self.T_ol = orthonormalise(self.T_ol @ invert(T_mp) @ T_ml)
         self.T_mo = T_ml @ invert(self.T_ol)
-        return T_pl

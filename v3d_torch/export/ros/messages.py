@@ -28,9 +28,6 @@ _MAX_SECONDS = 2**31
 _OCCUPANCY = {VoxelState.UNKNOWN: -1, VoxelState.FREE: 0, VoxelState.OCCUPIED: 100}
 """Values of cells, as `nav_msgs/OccupancyGrid` defines them: the probability in per cent, or unknown."""
 
-_UNKNOWN = torch.zeros(6, 6)
-"""Covariance that is not known, as the definitions of ROS mark it."""
-
 
 def nanoseconds(stamp: float) -> int:
     """Convert a timestamp to whole nanoseconds.
@@ -99,8 +96,8 @@ def odometry(
     frames: tuple[str, str],
     T_pc: Tensor,
     twist: Tensor,
-    pose_covariance: Tensor = _UNKNOWN,
-    twist_covariance: Tensor = _UNKNOWN,
+    pose_covariance: Tensor,
+    twist_covariance: Tensor,
 ) -> ros.nav_msgs__msg__Odometry:
     """Make an odometry message.
 
@@ -111,8 +108,8 @@ def odometry(
         twist: Velocity of the child frame, in the child frame: linear (m/s) and angular (rad/s), float64, shape
             :math:`(6,)`.
         pose_covariance: Covariance of position and of rotation about the axes of the parent frame, in this order,
-            metres and radians, shape :math:`(6, 6)`. All zeros, the default, means unknown.
-        twist_covariance: Covariance of the twist, shape :math:`(6, 6)`. All zeros, the default, means unknown.
+            metres and radians, shape :math:`(6, 6)`.
+        twist_covariance: Covariance of the twist, shape :math:`(6, 6)`.
     """
     velocity = ros.geometry_msgs__msg__Twist(vector(twist[:3]), vector(twist[3:]))
     return ros.nav_msgs__msg__Odometry(

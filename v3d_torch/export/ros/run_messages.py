@@ -3,7 +3,7 @@
 ================================  ==========================================  =====================================
 ``/tf``                           ``tf2_msgs/TFMessage``, every frame         ``map``, ``odom``, ``camera_link``,
                                                                               ``camera_color_optical_frame``
-``/odom``                         ``nav_msgs/Odometry``, every frame          pose in ``odom``, velocity
+``/odom``                         ``nav_msgs/Odometry``, every frame          pose in ``odom``, velocity, covariances
 ``/camera/color/camera_info``     ``sensor_msgs/CameraInfo``, every frame
 ``/objects``                      ``visualization_msgs/MarkerArray``,         box, name and velocity of each object
                                   every frame
@@ -29,7 +29,7 @@ from v3d_torch.export.ros.markers import object_markers
 from v3d_torch.export.ros.messages import camera_info, occupancy_grid, odometry, path, transforms
 from v3d_torch.export.ros.point_cloud import point_cloud
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.reconstruction.point_map import PointMap
@@ -60,7 +60,7 @@ class RunMessages:
     def __init__(self, camera: PinholeCamera) -> None:
         self._camera = camera
         self._odometry_frame = frames.OdometryFrame()
-        self._previous: tuple[int, float] | None = None  # position in the pose history, and stamp
+        self._previous: int | None = None  # position in the pose history
 
     def of_frame(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM) -> Iterator[TopicMessage]:
         """Yield the messages of a frame.
@@ -102,24 +102,38 @@ class RunMessages:
             yield "/map", occupancy_grid(stamp, frames.MAP, grid, frames.T_MAP_WORLD)
 
     def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
-        odometry_frame, twist = self._odometry_frame, torch.zeros(6, dtype=torch.float64)
+        odometry_frame, state = self._odometry_frame, slam.states.at(stamp)
         newest = len(slam.poses) - 1
-        previous, previous_stamp = self._previous or (newest, stamp)
-        T_mp, T_ml = frames.camera_in_map(invert(slam.poses.poses_of([previous, newest])))
-        T_pl = odometry_frame.update(T_mp, T_ml)
-        if stamp > previous_stamp:
-            twist = se3_log(T_pl) / (stamp - previous_stamp)
-        self._previous = newest, stamp
+        previous = newest if self._previous is None else self._previous
+        odometry_frame.update(*frames.camera_in_map(invert(slam.poses.poses_of([previous, newest]))))
+        self._previous = newest
         tree = {
             (frames.MAP, frames.ODOM): odometry_frame.T_mo,
             (frames.ODOM, frames.CAMERA): odometry_frame.T_ol,
             (frames.CAMERA, frames.OPTICAL): frames.T_LINK_OPTICAL,  # not static: it is there wherever a replay begins
         }
         yield "/tf", transforms(stamp, tree)
-        yield "/odom", odometry(stamp, (frames.ODOM, frames.CAMERA), odometry_frame.T_ol, twist)
+        to_link = _rotate_both_halves(frames.T_LINK_OPTICAL)
+        to_odom = _rotate_both_halves(odometry_frame.T_ol @ frames.T_LINK_OPTICAL)
+        yield (
+            "/odom",
+            odometry(
+                stamp,
+                (frames.ODOM, frames.CAMERA),
+                odometry_frame.T_ol,
+                to_link @ state.twist,
+                pose_covariance=to_odom @ state.covariance @ to_odom.T,
+                twist_covariance=to_link @ state.twist_covariance @ to_link.T,
+            ),
+        )
 
     def _cloud(self, frame: RGBDFrame, static: Tensor) -> Message:
         step = slice(None, None, _CLOUD_STRIDE)
         keep = static[step, step] & (frame.depth[0, step, step] > 0)
         points = self._camera.rays[step, step][keep] * frame.depth[0, step, step][keep][:, None]
         return point_cloud(frame.stamp, frames.OPTICAL, points, frame.image[:, step, step].permute(1, 2, 0)[keep])
+
+
+def _rotate_both_halves(T: Tensor) -> Tensor:
+    """Matrix that rotates translation and rotation of a twist or an error by a transform, float64, shape (6, 6)."""
+    return torch.block_diag(T[:3, :3], T[:3, :3])
