@@ -21,6 +21,16 @@ KEYFRAMES = {
     "error_after": "error after, m",
 }
 
+CONSISTENCY = {
+    "sequence": "sequence",
+    "poses": "poses",
+    "nees": "NEES, expected 6",
+    "median": "median, expected 5.3",
+    "within": "below the 95% bound",
+    "position": "position, expected 3",
+    "rotation": "rotation, expected 3",
+}
+
 LOST = {
     "sequence": "sequence",
     "interruption": "interruption",
@@ -73,6 +83,19 @@ MAP_COSTS = {
     "loading": "loading",
 }
 
+OCCUPANCY = {"quantity": "map of the demo", "value": "result"}
+
+OCCUPANCY_COSTS = {
+    "sequence": "sequence",
+    "cpu_ms": "CPU ms per frame",
+    "cpu_ms_95": "95th percentile",
+    "octomap_ms": "OctoMap, CPU ms per frame",
+    "voxels": "voxels occupied / free",
+    "memory_mb": "memory, MB",
+    "files_kb": "npz / bt, kB",
+    "queries_ms": "1000 free balls / search tree / 1000 distances / floor, CPU ms",
+}
+
 PRIMITIVES = {
     "primitive": "primitive",
     "size": "size",
@@ -82,4 +105,26 @@ PRIMITIVES = {
     "ratio": "ratio",
 }
 
+MODULES = {
+    "function": "function",
+    "batch": "batch",
+    "competitor": "competitor",
+    "ms": "ms",
+    "ratio": "ratio",
+    "error": "error",
+}
+
 DESIGN_CHOICES = {"choice": "choice", "sequence": "sequence", "result": "result", "commit": "commit"}
+
+TRACKS = {
+    "sequence": "sequence",
+    "tracker": "tracker",
+    "hota": "HOTA",
+    "deta": "DetA",
+    "assa": "AssA",
+    "idf1": "IDF1",
+    "mota": "MOTA",
+    "id_switches": "ID switches in 60 frames (all)",
+    "pixels_right": "people's pixels in the right track",
+    "tracks": "tracks (people)",
+}

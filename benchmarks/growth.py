@@ -176,7 +176,7 @@ def close_ring(count: int, generator: torch.Generator) -> Row:
     before, after = ((T - T_true)[:, :3, 3].norm(dim=1).mean() for T in (T_wc, solution.T_wc))
     return {
         "pose_graph_s": f"{seconds:.2f}",
-        "iterations": str(solution.iterations),
+        "iterations": str(int(solution.iterations)),
         "error_before": f"{before:.3f}",
         "error_after": f"{after:.3f}",
     }

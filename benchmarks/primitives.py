@@ -10,10 +10,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from statistics import median
-from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -28,6 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from storage import Measurement, Row
 from storage import save as store
+from timing import OURS, Competitors, take_turns
 
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.voxel import voxel_pool
@@ -36,13 +35,10 @@ from v3d_torch.objects.dbscan import dbscan
 from v3d_torch.objects.largest_clusters import largest_clusters
 from v3d_torch.objects.voting import hough_vote
 
-OURS = "v3d_torch"
 SIZES = [(5, 500), (5, 5000), (50, 500), (50, 5000)]
 """Number of instances (of one frame, and of ten) and number of points of each after pooling."""
 VOXEL, EPS, MIN_SAMPLES = 0.02, 0.08, 5
 """Edge of a voxel and radius of DBSCAN in metres, and neighbours of a core point: the defaults of the package."""
-
-Competitors = dict[str, Callable[[], Any]]
 
 
 def surfaces(batch: int, count: int, spacing: float, seed: int = 0) -> np.ndarray:
@@ -155,19 +151,6 @@ def contests() -> Iterator[tuple[str, str, Competitors]]:
         yield "largest_clusters", size, selecting(batch, count)
         yield "chamfer_distance", size, comparing(batch, count)
     yield "hough_vote", "10 objects", voting()
-
-
-def take_turns(competitors: Competitors, turns: int) -> dict[str, list[float]]:
-    """Measure the milliseconds of each competitor in each turn; turns are added until one second has passed."""
-    times: dict[str, list[float]] = {name: [] for name in competitors}
-    shuffler = np.random.default_rng(0)  # random order: the one after the slowest has a cold cache
-    end = time.perf_counter() + 1
-    while len(times[OURS]) <= turns or time.perf_counter() < end:
-        for name in shuffler.permutation(list(competitors)):
-            start = time.perf_counter()
-            competitors[name]()
-            times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: values[1:] for name, values in times.items()}  # without the first, which warms up
 
 
 def main(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import columns
 from descriptions import PEERS, kind, sequence_notes
 from storage import Measurement, Row
-from tables import accuracy_table, bullets, flat, notes, pivot, provenance, rows_of, speed_table, unique
+from tables import accuracy_table, bullets, flat, mark_highest, notes, pivot, provenance, rows_of, speed_table, unique
 
 VARIANTS = {
     "baseline": "no masks",
@@ -120,6 +120,17 @@ def calibration_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield from part(text, flat(rows_of(measurements), columns.CALIBRATION), measurements, "sequence")
 
 
+def consistency_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the covariance of poses."""
+    yield "## Covariance of poses"
+    text = (
+        "Normalised estimation error squared (NEES) of the poses as they were known at each frame. Below its"
+        " expectation, the covariance is too large; above it, too small. World, mounting on the camera and clock of the"
+        " ground truth are calibrated, 13 numbers for all poses; its noise is not subtracted."
+    )
+    yield from part(text, flat(rows_of(measurements), columns.CONSISTENCY), measurements, "sequence")
+
+
 def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on masks and ids of objects."""
     yield "## Objects: masks and ids"
@@ -135,6 +146,32 @@ def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     ]
     # The notes on these measurements are in the section on the ablation.
     yield from part(text, pivot(rows, "variant", "sequence", "objects", VARIANTS), measurements, remarks=())
+
+
+def tracks_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on people's tracks beside other trackers."""
+    yield "## Tracks of people"
+    text = (
+        "HOTA with its detection and association accuracy, IDF1 and MOTA by TrackEval, on masks: higher is better. ID"
+        " switches in 60 frames in which a person is in view, lower is better. People's pixels in the right track:"
+        " fraction of the true pixels of people that lie in the one track of this person. ByteTrack, OC-SORT and"
+        " BoT-SORT are those of the package `trackers`, fed with the same detections; of two settings the better one is"
+        " shown. The best HOTA and IDF1 of a sequence are bold."
+    )
+    yield from part(text, tracks_table(rows_of(measurements)), measurements, "sequence")
+
+
+def tracks_table(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield the table of tracks, a line per sequence and tracker, with the highest values of a sequence in bold."""
+    marked = []
+    for sequence in unique(cells["sequence"] for cells in rows):
+        of_sequence = [cells for cells in rows if cells["sequence"] == sequence]
+        bold = {name: mark_highest([cells[name] for cells in of_sequence]) for name in ("hota", "idf1")}
+        marked += [
+            cells | {"hota": hota, "idf1": idf1}
+            for cells, hota, idf1 in zip(of_sequence, bold["hota"], bold["idf1"], strict=True)
+        ]
+    yield from flat(marked, columns.TRACKS)
 
 
 def ablation_section(measurements: Sequence[Measurement]) -> Iterator[str]:
@@ -182,11 +219,43 @@ def maps_section(measurements: Sequence[Measurement], costs: Sequence[Measuremen
         yield from part(text, flat(rows_of(costs), columns.MAP_COSTS), costs, "sequence")
 
 
+def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the occupancy map."""
+    yield "## Occupancy map"
+    if measurements:
+        text = (
+            "The map of the demo, with estimated poses and masks, against the exact surfaces of the room. A voxel that"
+            " a surface touches with a corner contains it, however little of it is seen; a sample stands for 64 pixels."
+            " Unknown space is excluded from all rows."
+        )
+        yield from part(text, flat(rows_of(measurements), columns.OCCUPANCY), measurements)
+    if costs:
+        text = (
+            "Time of the stage in the system, and of OctoMap (octomap-python) for the insertion of the same views;"
+            " memory of voxels and stored views; size of the files; time of queries."
+        )
+        yield from part(text, flat(rows_of(costs), columns.OCCUPANCY_COSTS), costs, "sequence")
+
+
 def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the primitives of the object stage."""
     yield "## Primitives of the object stage"
     text = "Median time; the ratio is the time of the competitor over ours in the same turn: above 1 ours is faster."
     yield from part(text, flat(rows_of(measurements), columns.PRIMITIVES), measurements)
+
+
+def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the camera modules."""
+    yield "## Camera modules"
+    text = (
+        "Median time of a batch with one thread; the ratio is the time of the competitor over ours in the same turn:"
+        " above 1 ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
+        " GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
+        " millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
+        " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo,"
+        " thousandths."
+    )
+    yield from part(text, flat(rows_of(measurements), columns.MODULES), measurements)
 
 
 def design_section(measurements: Sequence[Measurement]) -> Iterator[str]:
@@ -210,11 +279,15 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("growth", "keyframes"), growth_section),
     (("lost",), lost_section),
     (("calibration",), calibration_section),
+    (("consistency",), consistency_section),
     (("ablation",), objects_section),
+    (("tracks",), tracks_section),
     (("segmentation",), segmentation_section),
     (("maps", "map_costs"), maps_section),
+    (("occupancy", "occupancy_costs"), occupancy_section),
     (("ablation",), ablation_section),
     (("primitives",), primitives_section),
+    (("modules",), modules_section),
     (("design_choices",), design_section),
 )
 """Files of each section in ``benchmarks/results``, and the function that writes it."""

@@ -22,16 +22,21 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "ablation": ("sequence", "variant"),
     "accuracy": ("sequence", "system"),
     "calibration": ("sequence", "change", "parameter"),
+    "consistency": ("sequence", "configuration"),
     "design_choices": ("choice", "sequence"),
     "growth": ("sequence", "frames"),
     "keyframes": ("keyframes",),
     "lost": ("sequence", "interruption"),
     "map_costs": ("sequence",),
     "maps": ("sequence", "pixels"),
+    "modules": ("function", "batch", "competitor"),
+    "occupancy": ("quantity",),
+    "occupancy_costs": ("sequence",),
     "primitives": ("primitive", "size", "threads", "competitor"),
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "contender"),
     "stages": ("sequence", "stage"),
+    "tracks": ("sequence", "tracker"),
 }
 """Cells that identify a row, by the name of the file."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TypeVar
 
 from descriptions import describe, kind, published
@@ -102,10 +102,21 @@ def flat(rows: Sequence[Row], columns: Mapping[str, str]) -> Iterator[str]:
 
 def mark_lowest(texts: Sequence[str]) -> list[str]:
     """Return cells with the lowest leading number in bold, as often as it is shown."""
+    return _mark(texts, min)
+
+
+def mark_highest(texts: Sequence[str]) -> list[str]:
+    """Return cells with the highest leading number in bold, as often as it is shown."""
+    return _mark(texts, max)
+
+
+def _mark(texts: Sequence[str], select: Callable[[Iterable[float]], float]) -> list[str]:
+    """Return cells with the selected leading number in bold."""
     numbers = [float(match[0]) if (match := re.match(r"[\d.]+", text)) else None for text in texts]
-    lowest = min((number for number in numbers if number is not None), default=None)
+    known = [number for number in numbers if number is not None]
+    marked = select(known) if known else None
     return [
-        re.sub(r"^[\d.]+", lambda match: f"**{match[0]}**", text) if number is not None and number == lowest else text
+        re.sub(r"^[\d.]+", lambda match: f"**{match[0]}**", text) if number is not None and number == marked else text
         for text, number in zip(texts, numbers, strict=True)
     ]
 

@@ -7,6 +7,7 @@ and worlds whose origin is a kilometre away, where float32 resolves a tenth of a
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log
 from v3d_torch.geometry.voxel import voxel_pool
-from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
+from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.chamfer import chamfer_distance
 from v3d_torch.objects.dbscan import dbscan
@@ -33,7 +34,6 @@ from v3d_torch.objects.intra_object_motion import intra_object_motion
 from v3d_torch.objects.voting import hough_vote
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.optim.pose_refinement import refine_pose
-from v3d_torch.optim.reprojection import Measurements
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.types import Trajectory
 
@@ -202,14 +202,13 @@ def test_refined_pose_of_degenerate_points(shape: str, offset: float, depth: boo
     T_cw = se3_exp(TURN + STEP)
     T_cw[:3, 3] -= T_cw[:3, :3] @ (offset * KILOMETRE)
     in_camera = (cloud + offset * KILOMETRE) @ T_cw[:3, :3].T + T_cw[:3, 3]
-    measured = Measurements(
-        uv=CAMERA.project(in_camera),
-        inverse_depth=(1 / in_camera[:, 2]) * depth,
-        pixel_sigma=torch.ones(len(cloud)).double(),
-        inverse_depth_sigma=0.0025,
-    )
+    measured = {
+        "uv": CAMERA.project(in_camera),
+        "inverse_depth": (1 / in_camera[:, 2]) * depth,
+        "inverse_depth_sigma": 0.0025,
+    }
     start = se3_exp(torch.tensor([0.01, 0.01, -0.01, 0.005, 0.005, -0.005], dtype=torch.float64)) @ T_cw
-    found = refine_pose(start, cloud + offset * KILOMETRE, measured, CAMERA, iterations=20)
+    found = refine_pose(start, cloud + offset * KILOMETRE, K=CAMERA.K, **measured, iterations=20)
     assert found.T_cw.dtype == torch.float64 and found.T_cw.isfinite().all()
     assert found.inliers.all() and found.chi2.max() < 1e-3
     if shape in ("plane", "slope", "room") or (shape == "three" and depth):
@@ -219,19 +218,19 @@ def test_refined_pose_of_degenerate_points(shape: str, offset: float, depth: boo
 # ---- the map -------------------------------------------------------------------------------------------------------
 
 
-def observe_all(cloud: Tensor, T_cw: Tensor) -> Observations:
+def observe_all(cloud: Tensor, T_cw: Tensor) -> dict[str, Any]:
     """Exact observations of every point by every camera, with depth."""
     pose = torch.arange(len(T_cw)).repeat_interleave(len(cloud))
     in_camera = (T_cw[:, None, :3, :3] @ cloud[..., None])[..., 0] + T_cw[:, None, :3, 3]
     in_camera = in_camera.reshape(-1, 3)
-    return Observations(
-        pose=pose,
-        point=torch.arange(len(cloud)).repeat(len(T_cw)),
-        uv=CAMERA.project(in_camera),
-        inverse_depth=1 / in_camera[:, 2],
-        pixel_sigma=torch.ones(len(in_camera), dtype=torch.float64),
-        inverse_depth_sigma=0.0025,
-    )
+    return {
+        "uv": CAMERA.project(in_camera),
+        "pose": pose,
+        "point": torch.arange(len(cloud)).repeat(len(T_cw)),
+        "K": CAMERA.K,
+        "inverse_depth": 1 / in_camera[:, 2],
+        "inverse_depth_sigma": 0.0025,
+    }
 
 
 @pytest.mark.parametrize("cameras", ["stand", "turn", "line"])
@@ -247,7 +246,7 @@ def test_bundle_adjustment_of_degenerate_maps(shape: str, offset: float, cameras
     wrong = 0.005 * (random(4, 6, seed=5) - 0.5) * ~fixed[:, None]
     observations = observe_all(cloud, T_cw)
     start = cloud + 0.01 * (random(len(cloud), 3, seed=6) - 0.5)
-    found = bundle_adjust(se3_exp(wrong) @ T_cw, start, observations, CAMERA, fixed, iterations=30)
+    found = bundle_adjust(se3_exp(wrong) @ T_cw, start, **observations, fixed=fixed, iterations=30)
     assert found.T_cw.dtype == found.points.dtype == torch.float64
     assert found.T_cw.isfinite().all() and found.points.isfinite().all()
     assert torch.equal(found.T_cw[0], T_cw[0])

@@ -177,3 +177,28 @@ def test_compaction_of_the_map_leaves_poses_and_landmarks_identical(
         assert torch.equal(column[compacted.landmarks["active"]], full.landmarks[name][full.landmarks["active"]])
     observed_points = [each.landmarks["point"][each.observations["landmark"]] for each in (compacted, full)]
     assert torch.equal(*observed_points)
+
+
+def test_gravity_of_the_first_frame_is_that_of_the_world(demo: RGBDSequence) -> None:
+    down = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
+    slam, without = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, config=NO_NETWORK)
+    for index in range(3):
+        frame = replace(demo[index], gravity=down if index == 0 else -down)  # later ones are not needed
+        assert torch.equal(slam(frame).T_wc, without(demo[index]).T_wc)
+    assert slam.gravity is not None and without.gravity is None
+    torch.testing.assert_close(slam.gravity, down)
+    assert slam.occupancy is None or torch.equal(slam.occupancy.accelerometer, -slam.gravity)
+    restored = V3DSLAM(demo.camera, config=NO_NETWORK)
+    restored.load_state_dict(slam.state_dict())
+    assert restored.gravity is not None and torch.equal(restored.gravity, down)
+
+
+def test_gravity_from_arrays_is_normalised_and_checked(demo: RGBDSequence) -> None:
+    image, depth = np.zeros((480, 640, 3), np.uint8), np.ones((480, 640))
+    frame = RGBDFrame.from_arrays(0, 0.0, image, depth, gravity=np.array([0, 9.8, 0]))
+    assert frame.gravity is not None and frame.gravity.tolist() == [0, 1, 0]
+    for wrong in (np.zeros(3), np.ones(2), np.array([np.nan, 0, 1])):
+        with pytest.raises(InputError, match=r"frame 0: the gravity is .*; give a vector of 3 numbers, not zero"):
+            RGBDFrame.from_arrays(0, 0.0, image, depth, gravity=wrong)
+    with pytest.raises(InputError, match=r"frame 0: the gravity is .*; give a unit vector in the camera frame"):
+        V3DSLAM(demo.camera, config=NO_NETWORK)(replace(demo[0], gravity=torch.ones(3, dtype=torch.float64)))

@@ -6,10 +6,10 @@ from types import ModuleType
 
 import typer
 
-from v3d_torch.cli import ablate, batch, calibrate, evaluate, record, report, reproduce, run
+from v3d_torch.cli import ablate, batch, calibrate, evaluate, export, record, report, reproduce, run
 from v3d_torch.cli.options import Version
 
-COMMANDS: tuple[ModuleType, ...] = (run, batch, calibrate, evaluate, ablate, reproduce, record, report)
+COMMANDS: tuple[ModuleType, ...] = (run, batch, calibrate, evaluate, ablate, reproduce, record, report, export)
 """Modules that define one command each; the command has the name of its module."""
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, no_args_is_help=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,8 @@ from torch import Tensor
 from v3d_torch.features.features import Features
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.runtime.stage_timer import StageTime
-from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.types import Instances, RGBDFrame
 
 
 @dataclass(frozen=True)
@@ -49,32 +51,24 @@ class PreprocessedFrame:
 
     Attributes:
         frame: Frame.
-        segmentation: Instances of the frame.
         extraction: Depth and features of the frame.
         read_times: Time that reading the frame took, by stage; empty if it was not measured.
     """
 
     frame: RGBDFrame
-    segmentation: Segmentation
     extraction: Extraction
+    _segmentation: Callable[[], Segmentation]
     read_times: dict[str, StageTime] = field(default_factory=dict)
 
     @property
-    def times(self) -> dict[str, StageTime]:
-        """Time that each stage took."""
-        return {**self.read_times, **self.segmentation.times, **self.extraction.times}
+    def segmentation(self) -> Segmentation:
+        """Instances of the frame. Waits for the segmentation if it is not complete yet."""
+        return self._segmentation()
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameResult(FrameObjects):
-    """Result of `V3DSLAM.track`. Later corrections of the pose are in `V3DSLAM.poses`.
+class FrameResult(FrameObjects, CameraState):
+    """Result of `V3DSLAM.track`: the objects of a frame, and the state of the camera as it was known then.
 
-    Attributes:
-        stamp: Timestamp, seconds.
-        T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`; the world frame is that of the first camera.
-        status: Source of the pose.
+    Later corrections of the pose are in `V3DSLAM.poses`.
     """
-
-    stamp: float
-    T_wc: Tensor
-    status: TrackingStatus

@@ -17,26 +17,32 @@ from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
-from v3d_torch.geometry.se3 import invert, orthonormalise
+from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.unlabelled import unlabelled_instances
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stage_checks import ReplaceableStages
+from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.motion_model import MotionModel, PosePrediction
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
+from v3d_torch.tracking.state_estimator import StateEstimator
+from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import (
     RGBDFrame,
     Segmenter,
@@ -70,6 +76,10 @@ class V3DSLAM(ReplaceableStages):
     Attributes:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
+        states: States of the camera in the last seconds.
+        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None if no frame
+            has a measured one.
+        occupancy: Free and occupied space, in ``occupancy.map``; None if it is not configured.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -105,6 +115,7 @@ class V3DSLAM(ReplaceableStages):
         self.free_space_check = FreeSpaceCheck(free_space, camera)
         self.propose_unlabelled = partial(unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area)
         self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
+        self.describe_appearance = colour_histograms
         self.classify_motion = MotionClassifier(config.objects, camera)
         # Camera pose and map
         local_keyframes = config.tracking.local_keyframes
@@ -114,9 +125,14 @@ class V3DSLAM(ReplaceableStages):
         self.refine_previous = PreviousFrameRefinement(
             self.compensate, self.track_map, self.map, refine_pose=config.rolling_shutter.enabled
         )
+        self.estimate_state = StateEstimator()
+        self.states = StateHistory()
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
         self.loop_closer.rebuild(self.map.active_keyframes)
+        # Free and occupied space
+        self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
+        self.gravity: Tensor | None = None
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
@@ -146,7 +162,8 @@ class V3DSLAM(ReplaceableStages):
             ConfigError: If the segmenter returned something else than instances.
         """
         self.check(frame)
-        return PreprocessedFrame(frame, self.segment_instances(frame, prediction), self.extract_features(frame))
+        segmentation = self.segment_instances(frame, prediction)
+        return PreprocessedFrame(frame, self.extract_features(frame), lambda: segmentation)
 
     def check(self, frame: RGBDFrame) -> None:
         """Check a frame before it is preprocessed.
@@ -156,21 +173,26 @@ class V3DSLAM(ReplaceableStages):
         """
         check_frame(frame, self.camera)
 
-    def segment_instances(self, frame: RGBDFrame, prediction: PosePrediction | None) -> Segmentation:
+    def segment_instances(
+        self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
+    ) -> Segmentation:
         """Find the instances of a frame (III-A); people are masked until they are classified.
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
             prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
                 the camera; None if the pose is not known.
+            is_due: False to leave the frame out; None to leave out all but every ``segmentation.interval``-th frame.
 
         Raises:
             ConfigError: If the segmenter returned something else than instances.
         """
+        if is_due is None:
+            is_due = frame.index % self.config.segmentation.interval == 0
         timer = StageTimer()
         with timer("segmentation"):
             instances = None
-            if frame.index % self.config.segmentation.interval == 0:
+            if is_due:
                 T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
                 instances = segment_frame(self.segment, frame, T_cw)
                 check_instances(instances, frame)
@@ -191,11 +213,9 @@ class V3DSLAM(ReplaceableStages):
         Raises:
             InputError: If the frame is not later than the previous one.
         """
-        frame, instances = preprocessed.frame, preprocessed.segmentation.instances
-        depth, all_features = preprocessed.extraction.depth, preprocessed.extraction.features
+        frame, depth, all_features = preprocessed.frame, preprocessed.extraction.depth, preprocessed.extraction.features
         check_order(frame, self.poses.stamp)
-        self._segmenter_state = preprocessed.segmentation.segmenter_state
-        self.timer.add(preprocessed.times)
+        self.timer.add({**preprocessed.read_times, **preprocessed.extraction.times})
         with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
             velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
@@ -204,15 +224,21 @@ class V3DSLAM(ReplaceableStages):
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
             view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)
+        segmentation = preprocessed.segmentation  # III-A: waits for the network if it runs beside the stages before
+        self._segmenter_state = segmentation.segmenter_state
+        self.timer.add(segmentation.times)
+        with self.timer("free_space"):
+            instances = segmentation.instances
             if instances is None:
                 instances = self.classify_motion.propagate_instances(view)
             if self.config.segmentation.source != "none":
                 instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
+            appearance = self.describe_appearance(frame.image, clouds.cloud_pixels)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))
-            objects = self.classify_motion(instances, clouds, view, occupied, support)
+            objects = self.classify_motion(instances, clouds, view, occupied, support, appearance)
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
@@ -221,6 +247,7 @@ class V3DSLAM(ReplaceableStages):
             static = self.compensate(static, depth, frame.depth_delay, motion.velocity, self.map.readout)
             T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
             pose = self.track_camera(static, depth, T_cw, landmarks, motion, self.poses)
+            owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
             self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
@@ -228,14 +255,24 @@ class V3DSLAM(ReplaceableStages):
             keyframe = self.mapper(frame, static, pose, reference)
             T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
             self._apply_world_correction(T_new_old)
+            self._update_gravity(frame, T_new_old)
             if pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
             if keyframe is not None:
                 self.back_end.submit(keyframe)
-        T_wc = invert(self.poses.T_cw)
-        return FrameResult(**vars(objects), stamp=frame.stamp, T_wc=T_wc, status=self.poses.status or pose.status)
+        with self.timer("tracking"):  # covariance of the pose, velocity of the camera
+            references = None if keyframe is None else self.map.references
+            state = self.estimate_state(pose, motion, self.poses, owners, references)
+            self.states.append(state)
+        if self.occupancy is not None:
+            with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
+                if self.gravity is not None:
+                    self.occupancy.accelerometer = -self.gravity
+                votes = up_votes(self._segmenter_state)
+                self.occupancy(depth, objects.static_mask, self.poses, votes)
+        return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
         """Apply the pending result of the back end. `track` does this; call it once after the last frame."""
@@ -259,6 +296,19 @@ class V3DSLAM(ReplaceableStages):
         self.predictions.append(self._predict())
         return self.predictions[-1]
 
+    def pose_at(self, stamp: float) -> CameraState:
+        """Return the camera at a time: interpolated between frames, predicted after the last one, with covariance.
+
+        It can be called from another thread while frames are tracked.
+
+        Args:
+            stamp: Time in the clock of the frames, seconds; in the last 10 s, or later than the last frame.
+
+        Raises:
+            InputError: If the time is earlier, or before the first frame.
+        """
+        return self.states.at(stamp)
+
     def state_dict(self) -> dict[str, Any]:
         """Return everything that changes from frame to frame, between two frames.
 
@@ -267,14 +317,14 @@ class V3DSLAM(ReplaceableStages):
         """
         state = {name: component.state_dict() for name, component in self._stateful_components().items()}
         own = {"previous": self._previous, "predictions": list(self.predictions), "segmenter": self._segmenter_state}
-        return {**state, **own}
+        return {**state, **own, "gravity": self.gravity}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`; the next frames give the same results as without the interruption."""
         for name, component in self._stateful_components().items():
             component.load_state_dict(state[name])
         self.loop_closer.rebuild(each for each in self.map.active_keyframes if each is not self.back_end.keyframe)
-        self._previous = state["previous"]
+        self._previous, self.gravity = state["previous"], state["gravity"]
         self.predictions = deque(state["predictions"])
         self._segmenter_state = state["segmenter"]
         restore_segmenter(self.segment, self._segmenter_state)
@@ -284,12 +334,15 @@ class V3DSLAM(ReplaceableStages):
             "timer": self.timer,
             "map": self.map,
             "poses": self.poses,
+            "estimate_state": self.estimate_state,
+            "states": self.states,
             "motion_model": self.motion_model,
             "free_space_check": self.free_space_check,
             "classify_motion": self.classify_motion,
             "mapper": self.mapper,
             "loop_closer": self.loop_closer,
             "back_end": self.back_end,
+            **({} if self.occupancy is None else {"occupancy": self.occupancy}),
         }
         for name, component in components.items():
             if not is_stateful(component):
@@ -301,8 +354,17 @@ class V3DSLAM(ReplaceableStages):
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_located else None
 
+    def _update_gravity(self, frame: RGBDFrame, T_new_old: Tensor | None) -> None:
+        """Take over the first measured gravity; move it with a guessed world frame when the camera is first found."""
+        if frame.gravity is not None and self.gravity is None:
+            self.gravity = self.poses.T_cw[:3, :3].T @ frame.gravity
+        elif T_new_old is not None and self.gravity is not None:
+            self.gravity = T_new_old[:3, :3] @ self.gravity
+
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
         """Move everything outside the map that is stored in the world frame, after a correction of the map."""
         if T_new_old is not None:
             self.classify_motion.tracker.apply_world_correction(T_new_old)
             self.free_space_check.apply_world_correction(T_new_old)
+            self.estimate_state.apply_world_correction(T_new_old)
+            self.states.apply_world_correction(T_new_old)

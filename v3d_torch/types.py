@@ -46,6 +46,8 @@ class RGBDFrame:
         depth: Depth registered to the colour image, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
         camera: Camera of both images; optional, because `V3DSLAM` gets the camera separately.
         depth_delay: Time of the depth image minus time of the colour image, seconds.
+        gravity: Direction of gravity, a unit vector in the camera frame, float64, shape :math:`(3,)`; None if it was
+            not measured. The first frame of a sequence suffices.
     """
 
     index: int
@@ -54,6 +56,7 @@ class RGBDFrame:
     depth: Tensor
     camera: PinholeCamera | None = None
     depth_delay: float = 0.0
+    gravity: Tensor | None = None
 
     @staticmethod
     def from_arrays(
@@ -63,6 +66,7 @@ class RGBDFrame:
         depth: NDArray[np.generic] | Tensor,
         camera: PinholeCamera | None = None,
         depth_delay: float = 0.0,
+        gravity: NDArray[np.float64] | Tensor | None = None,
     ) -> RGBDFrame:
         """Make a frame from images as cameras, simulators and image libraries return them.
 
@@ -75,10 +79,12 @@ class RGBDFrame:
                 units of the camera; 0 or NaN = no measurement.
             camera: Camera of both images, which gives the unit and the correction of depth in whole numbers.
             depth_delay: Time of the depth image minus time of the colour image, seconds.
+            gravity: Direction of gravity in the camera frame, of any length, shape :math:`(3,)`; None if it was not
+                measured. An accelerometer at rest measures the opposite direction.
 
         Raises:
-            InputError: If an image has the wrong shape, type or size, if depth has whole numbers and the camera no
-                depth scale, or if a time is not a finite number.
+            InputError: If an image or the gravity has the wrong shape, type or size, if depth has whole numbers and the
+                camera no depth scale, or if a time is not a finite number.
         """
         colour, measured = _array(image), _array(depth)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
@@ -113,7 +119,15 @@ class RGBDFrame:
         if measured.dtype.kind != "f" and camera is not None:
             metres = camera.correct_depth(metres)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
-        return RGBDFrame(index, to_float(stamp), channels, metres, camera=camera, depth_delay=to_float(depth_delay))
+        return RGBDFrame(
+            index,
+            to_float(stamp),
+            channels,
+            metres,
+            camera=camera,
+            depth_delay=to_float(depth_delay),
+            gravity=None if gravity is None else _unit_vector(_array(gravity), index),
+        )
 
 
 def _array(image: object) -> NDArray[Any]:
@@ -122,6 +136,13 @@ def _array(image: object) -> NDArray[Any]:
         image = image.detach()
         return (image.to(torch.float32) if image.is_floating_point() else image).numpy()
     return np.asarray(image)
+
+
+def _unit_vector(vector: NDArray[Any], index: int) -> Tensor:
+    """Return the gravity of a frame with length 1."""
+    if vector.shape != (3,) or vector.dtype.kind not in "fiu" or not 0 < np.linalg.norm(vector) < np.inf:
+        raise InputError(f"frame {index}: the gravity is {vector.tolist()!r}; give a vector of 3 numbers, not zero")
+    return torch.from_numpy(vector / np.linalg.norm(vector.astype(np.float64)))
 
 
 @dataclass(frozen=True)
@@ -247,11 +268,14 @@ class FramePose:
         status: Source of the pose.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
+        information: Information matrix of the left perturbation of ``T_cw`` if the errors of all features were
+            independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
     """
 
     status: TrackingStatus
     T_cw: Tensor
     landmarks: Tensor
+    information: Tensor | None = None
 
     @property
     def observed_landmarks(self) -> Tensor:

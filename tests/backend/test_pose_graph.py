@@ -1,4 +1,4 @@
-"""Pose-graph optimisation against GTSAM, autograd, and graphs with known solutions."""
+"""Pose-graph optimisation against GTSAM, autograd, and graphs with known solutions; gradients, PyPose's types."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import gtsam
 import pypose as pp
 import pytest
 import torch
+from helpers import camera_inputs
+from helpers.gradients import check_gradients, count_graph_nodes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -111,7 +113,7 @@ def test_jacobians_equal_autograd() -> None:
     zeros = torch.zeros(count, 6, dtype=torch.float64)
     expected_i, expected_j = torch.autograd.functional.jacobian(errors, (zeros, zeros))
     each = torch.arange(count)
-    error, J_i, J_j = edge_errors(*(pp.mat2SE3(T, check=False) for T in (T_wi, T_wj, T_ji)))
+    error, J_i, J_j = edge_errors(T_wi, T_wj, T_ji)
     torch.testing.assert_close(error, errors(zeros, zeros), rtol=0, atol=1e-10)
     torch.testing.assert_close(J_i, expected_i[each, :, each], rtol=0, atol=1e-9)
     torch.testing.assert_close(J_j, expected_j[each, :, each], rtol=0, atol=1e-9)
@@ -205,3 +207,83 @@ def test_optimisation_is_deterministic() -> None:
     graph = Graph(50, 10)
     first, second = (optimise_pose_graph(graph.start, graph.edges, graph.T_ij).T_wc for _ in range(2))
     assert torch.equal(first, second)
+
+
+# ---------------------------------------------------------------- batches, padding
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.booleans(), min_size=15, max_size=15))
+def test_padding_between_edges_has_no_effect(present: list[bool]) -> None:
+    inputs, valid = camera_inputs.graph(1, 15, torch.float64), torch.tensor(present)
+    per_edge = [name for name, each in inputs.items() if each.shape[1:2] == (15,)]
+    alone = {name: each[:, valid] if name in per_edge else each for name, each in inputs.items()}
+    padded = dict(inputs)
+    for name in per_edge:
+        padded[name] = inputs[name].clone()
+        padded[name][:, ~valid] = torch.nan if inputs[name].is_floating_point() else 1000
+    found = optimise_pose_graph(**padded | {"valid": valid[None]})
+    expected = optimise_pose_graph(**alone | {"valid": None})
+    torch.testing.assert_close(found.T_wc, expected.T_wc, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.cost_after, expected.cost_after, rtol=1e-6, atol=1e-9)
+
+
+# ---------------------------------------------------------------- gradients
+
+CONVERGED = {"iterations": 200, "tolerance": 1e-15, "robust": 1.2}
+
+
+def noisy_graph(batch: int) -> dict[str, Tensor]:
+    """Graphs with errors on both sides of the threshold of Huber's kernel, but not at it; one edge is padding."""
+    inputs = camera_inputs.graph(batch, 11, torch.float64)
+    inputs["T_ij"][:, ::4] = inputs["T_ij"][:, ::4] @ se3_exp(torch.full((6,), 0.1, dtype=torch.float64))
+    return inputs | {"valid": torch.arange(11).expand(batch, 11) != 7}
+
+
+def test_gradients_equal_finite_differences() -> None:
+    """With respect to measured poses, information, weights, and the fixed pose."""
+    inputs = noisy_graph(2)
+
+    def optimised(error: Tensor, scale: Tensor, weights: Tensor, xi: Tensor) -> Tensor:
+        given = {
+            "T_wc": torch.cat([inputs["T_wc"][:, :1] @ se3_exp(xi), inputs["T_wc"][:, 1:]], dim=1),
+            "T_ij": inputs["T_ij"] @ se3_exp(error),
+            "information": inputs["information"] * scale.exp()[..., None, None],
+            "weights": weights,
+        }
+        found = optimise_pose_graph(**inputs | given, **CONVERGED)
+        return torch.cat([found.T_wc.flatten(1), 0.01 * found.cost_after[:, None]], dim=1)
+
+    error, xi = torch.zeros(2, 11, 6, dtype=torch.float64), torch.zeros(2, 1, 6, dtype=torch.float64)
+    scale = torch.zeros(2, 11, dtype=torch.float64)
+    assert check_gradients(optimised, error, scale, inputs["weights"], xi, step=1e-4)
+
+
+def test_memory_of_the_gradient_does_not_grow_with_the_iterations() -> None:
+    inputs = noisy_graph(1)
+    weights = inputs.pop("weights").requires_grad_()
+    few, many = (optimise_pose_graph(**inputs, weights=weights, iterations=k, tolerance=0.0) for k in (1, 30))
+    assert count_graph_nodes(few.T_wc) == count_graph_nodes(many.T_wc) < 300
+
+
+def test_gradients_at_exact_measurements_are_finite() -> None:
+    graph = Graph(10, 5, noise=0.0)
+    T_ij = graph.T_ij.clone().requires_grad_()
+    found = optimise_pose_graph(graph.T_wc, graph.edges, T_ij, graph.information)
+    (gradient,) = torch.autograd.grad(found.T_wc.square().sum(), T_ij)
+    assert gradient.isfinite().all() and gradient.any()
+
+
+def test_pypose_types_give_the_same_result_and_gradient() -> None:
+    inputs = noisy_graph(2)
+    T_wc, T_ij = (pp.mat2SE3(inputs.pop(name), check=False) for name in ("T_wc", "T_ij"))
+    by_pypose = pp.se3(torch.zeros(2, 11, 6, dtype=torch.float64)).requires_grad_()
+    found = optimise_pose_graph(T_wc, T_ij=T_ij @ by_pypose.Exp(), **inputs, **CONVERGED)
+    assert isinstance(found.T_wc, pp.LieTensor) and found.T_wc.ltype is pp.SE3_type
+    assert torch.equal(found.T_wc[:, 0].tensor(), T_wc[:, 0].tensor())
+    found.T_wc.Log().tensor().square().sum().backward()
+    xi = torch.zeros(2, 11, 6, dtype=torch.float64, requires_grad=True)
+    expected = optimise_pose_graph(T_wc.matrix(), T_ij=T_ij.matrix() @ se3_exp(xi), **inputs, **CONVERGED)
+    torch.testing.assert_close(found.T_wc.matrix(), expected.T_wc, rtol=0, atol=1e-9)
+    se3_log(expected.T_wc).square().sum().backward()
+    torch.testing.assert_close(by_pypose.grad.as_subclass(Tensor), xi.grad, rtol=1e-6, atol=1e-9)

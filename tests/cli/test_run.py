@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import plyfile
 import pytest
+from helpers.bag_messages import read_with_mcap
 from helpers.commands import RUN_FILES, assert_error_line, call, command, environment, files_in
 from typer.testing import CliRunner, Result
 
@@ -90,7 +91,9 @@ def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
 
 
 def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
-    assert {name for name in files_in(first_out) if not name.startswith("masks/")} == RUN_FILES | OBJECT_FILES
+    assert {
+        name for name in files_in(first_out) if not name.startswith(("masks/", "map_masks/"))
+    } == RUN_FILES | OBJECT_FILES
     trajectory = read_trajectory(first_out / "trajectory.txt")
     listed = [float(line.split()[0]) for line in (sequence / "associations.txt").read_text().splitlines()]
     assert trajectory.stamps.tolist() == listed
@@ -99,6 +102,20 @@ def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
     assert metrics["tracked"] == metrics["frames"] == 30
     log = (first_out / "run.log").read_text().splitlines()
     assert sum("frame" in line and "tracked" in line for line in log) == 30
+
+
+def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Path, tmp_path: Path) -> None:
+    arguments = ("--seq", sequence, "--segmenter", "masks", "--masks", sequence / "masks", "--bag", "run.mcap")
+    done = call_here(*arguments, "--out", "out", "--save-masks", cwd=tmp_path)
+    assert (done.exit_code, done.stderr) == (0, "")
+    messages = read_with_mcap(tmp_path / "run.mcap")
+    assert len(messages["/odom"]) == 30 and len(messages["/path"][-1][1].poses) == 30
+    same = [name for name in files_in(first_out) if not name.endswith(("run.log", "metrics.json", "frames.parquet"))]
+    assert len(same) > 35
+    assert [name for name in same if (tmp_path / "out" / name).read_bytes() != (first_out / name).read_bytes()] == []
+    done = call_here(*arguments, "--out", "again", cwd=tmp_path)
+    assert_error_line(done, "run.mcap: exists already; delete it, or choose another file")
+    assert not (tmp_path / "again").exists()
 
 
 def test_run_prints_scores_and_result_folder(
@@ -294,7 +311,9 @@ def test_ctrl_c_keeps_partial_results(sequence: Path, tmp_path: Path) -> None:
     metrics = json.loads((out / "metrics.json").read_text())
     assert 3 <= metrics["processed"] < 30
     assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
-    assert {name for name in files_in(out) if not name.startswith("masks/")} == RUN_FILES | {"checkpoint.v3d"}
+    assert {name for name in files_in(out) if not name.startswith(("masks/", "map_masks/"))} == RUN_FILES | {
+        "checkpoint.v3d"
+    }
 
 
 def test_help_is_fast_and_names_every_option() -> None:

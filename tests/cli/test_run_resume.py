@@ -34,7 +34,8 @@ from v3d_torch.runs.stored_run import read_run
 
 FRAMES = 20
 CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_fraction=1")
-RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply", "mesh.ply")
+DEFAULT_RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply")
+RESULTS = (*DEFAULT_RESULTS, "mesh.ply", "occupancy.npz", "occupancy.bt")
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def no_figures() -> Iterator[None]:
 
 
 def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:
-    return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", *more]
+    return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", "--occupancy", *more]
 
 
 def call(*arguments: str | Path) -> Result:
@@ -440,7 +441,7 @@ def test_interrupted_run_of_a_batch_resumes(sequence: Path, tmp_path: Path) -> N
     frames: list[int] = []
     assert run_job(job("b"), frames.append) is None
     assert frames == list(range(7, FRAMES + 1))
-    assert_same_results(tmp_path / "b", tmp_path / "a", RESULTS[:-1])
+    assert_same_results(tmp_path / "b", tmp_path / "a", DEFAULT_RESULTS)
     # With another configuration, the run starts again with the first frame.
     assert run_job(job("c"), stop) is not None
     frames.clear()

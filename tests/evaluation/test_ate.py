@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, scale_error, spans_plane
+from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, ate, scale_error, spans_plane
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.types import Trajectory
 
@@ -92,7 +91,7 @@ def test_convention_positions_span_plane_from_one_millimetre(count: int) -> None
     corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64)
     corners = corners.repeat(count // 4, 1) + 5
     for spread, plane in (([1, 1.01e-3, 0], True), ([1, 0.99e-3, 0.99e-3], False), ([0, 1.01e-3, 1.01e-3], True)):
-        assert spans_plane(corners * torch.tensor(spread, dtype=torch.float64)) is plane
+        assert bool(spans_plane(corners * torch.tensor(spread, dtype=torch.float64))) is plane
 
 
 @pytest.mark.parametrize(("size", "is_error"), [(1.49, False), (1.51, True), (1 / 1.49, False), (1 / 1.51, True)])
@@ -112,7 +111,7 @@ def test_scale_error_requires_three_quarters_of_variance_explained() -> None:
         estimate = truth.clone()
         estimate[:, 1, 3] = noise * torch.tensor([1.0, 1, -1, -1])
         estimate[:, :3, 3] /= 3
-        alignment = replace(align(truth, truth), T_ge=torch.eye(4, dtype=torch.float64))
+        alignment = align(truth, truth)._replace(T_ge=torch.eye(4, dtype=torch.float64))
         assert (scale_error(truth, estimate, alignment) is not None) is is_error
 
 
@@ -134,3 +133,31 @@ def test_absolute_errors_have_gradients() -> None:
         return absolute_errors(groundtruth, T_ec, align(groundtruth, T_ec))
 
     assert torch.autograd.gradcheck(errors, torch.zeros(6, 6, dtype=torch.float64, requires_grad=True))
+
+
+def test_ate_of_a_padded_batch_equals_evaluate() -> None:
+    """Trajectories of different lengths, one of a camera that only turns."""
+    truths = [random_walk(60, seed=30), random_walk(40, seed=31), random_walk(50, seed=32)]
+    truths[1].T_wc[:, :3, 3] = 0
+    estimates = [noisy(truth, seed=33 + k) for k, truth in enumerate(truths)]
+    valid = torch.arange(60) < torch.tensor([[60], [40], [50]])
+    T_gc, T_ec = (torch.full((3, 60, 4, 4), torch.nan, dtype=torch.float64) for _ in range(2))
+    for k, (truth, estimate) in enumerate(zip(truths, estimates, strict=True)):
+        T_gc[k, : len(truth)], T_ec[k, : len(truth)] = truth.T_wc, estimate.T_wc
+    expected = [evaluate(truth, estimate).ate.rmse for truth, estimate in zip(truths, estimates, strict=True)]
+    np.testing.assert_allclose(ate(T_gc, T_ec, valid), expected, rtol=1e-9)
+    assert ate(T_gc[0].float(), T_ec[0].float()).dtype == torch.float32
+    assert ate(T_gc[:0], T_ec[:0]).shape == (0,) and ate(T_gc[:, :0], T_ec[:, :0]).isnan().all()
+
+
+def test_ate_has_gradients_that_are_finite_for_a_perfect_estimate() -> None:
+    truth = torch.stack([random_walk(6, seed=40, step=0.3).T_wc, random_walk(6, seed=41, step=0.3).T_wc])
+    start = truth @ se3_exp(0.1 * torch.sin(torch.arange(72.0, dtype=torch.float64)).reshape(2, 6, 6))
+
+    def errors(xi: Tensor) -> Tensor:
+        return ate(truth, start @ se3_exp(xi))
+
+    assert torch.autograd.gradcheck(errors, torch.zeros(2, 6, 6, dtype=torch.float64, requires_grad=True))
+    perfect = truth.clone().requires_grad_()
+    ate(truth, perfect).sum().backward()
+    assert perfect.grad is not None and perfect.grad.isfinite().all()

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.association import associate_trajectories
-from v3d_torch.evaluation.rpe import motion_errors, pairs_apart, relative_errors, relative_pose_error
+from v3d_torch.evaluation.rpe import motion_errors, pairs_apart, relative_errors, relative_pose_error, rpe
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
@@ -104,3 +104,37 @@ def test_relative_errors_have_gradients() -> None:
         return torch.cat(relative_errors(groundtruth[:-1], groundtruth[1:], T_ec[:-1], T_ec[1:]))
 
     assert torch.autograd.gradcheck(errors, torch.zeros(6, 6, dtype=torch.float64, requires_grad=True))
+
+
+def test_rpe_of_a_padded_batch_equals_evaluate() -> None:
+    """Trajectories of different lengths; poses without ground truth lie between the others."""
+    truths = [random_walk(90, seed=30), random_walk(70, seed=31)]
+    estimates = [noisy(truth, seed=33 + k) for k, truth in enumerate(truths)]
+    valid = (torch.arange(90) < torch.tensor([[90], [70]])) & (torch.arange(90) % 7 != 3)
+    T_gc, T_ec = (torch.full((2, 90, 4, 4), torch.nan, dtype=torch.float64) for _ in range(2))
+    stamps = torch.full((2, 90), torch.nan, dtype=torch.float64)
+    expected = []
+    for k, (truth, estimate) in enumerate(zip(truths, estimates, strict=True)):
+        kept, count = valid[k, : len(truth)], len(truth)
+        T_gc[k, :count], T_ec[k, :count], stamps[k, :count] = truth.T_wc, estimate.T_wc, truth.stamps
+        scores = evaluate(
+            Trajectory(truth.stamps[kept], truth.T_wc[kept]), Trajectory(truth.stamps[kept], estimate.T_wc[kept])
+        ).rpe
+        assert scores is not None
+        expected.append((scores.trans.rmse, scores.rot.rmse))
+    trans, rot = rpe(T_gc, T_ec, stamps, valid)
+    np.testing.assert_allclose(torch.stack([trans, rot], dim=1), expected, rtol=1e-9)
+    assert all(each.isnan().all() for each in rpe(T_gc, T_ec, stamps, valid, delta=10.0))
+
+
+def test_rpe_has_gradients_that_are_finite_for_a_perfect_estimate() -> None:
+    truth = random_walk(8, seed=40, step=0.3)
+    start = truth.T_wc @ se3_exp(0.1 * torch.sin(torch.arange(48.0, dtype=torch.float64)).reshape(8, 6))
+
+    def errors(xi: Tensor) -> tuple[Tensor, ...]:
+        return rpe(truth.T_wc, start @ se3_exp(xi), truth.stamps, delta=2 / 30)
+
+    assert torch.autograd.gradcheck(errors, torch.zeros(8, 6, dtype=torch.float64, requires_grad=True))
+    perfect = truth.T_wc.clone().requires_grad_()
+    sum(rpe(truth.T_wc, perfect, truth.stamps, delta=2 / 30)).backward()
+    assert perfect.grad is not None and perfect.grad.isfinite().all()

@@ -6,7 +6,7 @@ import torch
 from helpers.rolling_camera import CAMERA, KINECT, VELOCITY, observe_rolling, points_in_view
 
 from v3d_torch.features.features import sample_depth, select_evenly
-from v3d_torch.odometry.rolling_shutter import RollingShutterCompensation
+from v3d_torch.odometry.rolling_shutter import compensate_features
 
 
 def test_sampled_depth_outside_the_image_is_zero() -> None:
@@ -30,7 +30,7 @@ def test_select_evenly_prefers_sparse_cells() -> None:
 
 def test_selected_features_keep_their_readout_jacobian() -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
-    compensated = RollingShutterCompensation(CAMERA)(observed, VELOCITY, KINECT)
+    compensated = compensate_features(observed, VELOCITY, KINECT, CAMERA)
     assert torch.equal(compensated[torch.tensor([3, 1])].readout_jacobian, compensated.readout_jacobian[[3, 1]])
 
 

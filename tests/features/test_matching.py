@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from v3d_torch.features.matching import hamming_distance, match_by_projection, match_descriptors
+from v3d_torch.kernels.compiler import ENABLED, TWINS
 
 
 def _descriptors(count: int, seed: int) -> torch.Tensor:
@@ -24,6 +25,12 @@ def _flip(descriptors: torch.Tensor, bits: int) -> torch.Tensor:
     return torch.from_numpy(np.packbits(unpacked, axis=1))
 
 
+def _pairs(matches: torch.Tensor) -> torch.Tensor:
+    """Pairs (row of a, row of b) of the rows of b that the rows of a match."""
+    rows = torch.nonzero(matches >= 0)[:, 0]
+    return torch.stack([rows, matches[rows]], dim=1)
+
+
 def test_hamming_distance_equals_opencv() -> None:
     a, b = _descriptors(50, 0), _descriptors(50, 1)
     expected = [int(cv2.norm(x, y, cv2.NORM_HAMMING)) for x, y in zip(a.numpy(), b.numpy(), strict=True)]
@@ -33,7 +40,7 @@ def test_hamming_distance_equals_opencv() -> None:
 def test_mutual_matches_equal_opencv_cross_check() -> None:
     a, b = _descriptors(200, 0), _descriptors(200, 1)
     b[:120] = _flip(a[:120], 20)
-    pairs = match_descriptors(a, b, max_hamming=64, max_ratio=1.0)
+    pairs = _pairs(match_descriptors(a, b, max_hamming=64, max_ratio=1.0))
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     expected = {(m.queryIdx, m.trainIdx) for m in matcher.match(a.numpy(), b.numpy()) if m.distance <= 64}
     assert {tuple(pair) for pair in pairs.tolist()} == expected
@@ -48,11 +55,37 @@ def test_matches_with_ratio_test_equal_kornia_rs(max_ratio: float) -> None:
     limits = {"max_distance": 64, "max_ratio": max_ratio, "cross_check": True}
     expected = kornia_rs.features.match_descriptors(a.numpy(), b.numpy(), **limits)
     assert 60 < len(expected) <= 120
-    assert torch.equal(match_descriptors(a, b, max_hamming=64, max_ratio=max_ratio), torch.from_numpy(expected))
+    pairs = _pairs(match_descriptors(a, b, max_hamming=64, max_ratio=max_ratio))
+    assert torch.equal(pairs, torch.from_numpy(expected))
 
 
 def test_too_few_descriptors_have_no_matches() -> None:
-    assert match_descriptors(_descriptors(1, 0), _descriptors(5, 1), max_hamming=64, max_ratio=0.8).shape == (0, 2)
+    for count in ((1, 5), (5, 1)):
+        a, b = map(_descriptors, count, (0, 0))
+        assert match_descriptors(a, b, max_hamming=64, max_ratio=1.0).tolist() == [-1] * count[0]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 99), st.integers(0, 30), st.integers(0, 30))
+def test_matches_with_padding_are_those_without_it(seed: int, rows: int, columns: int) -> None:
+    """Both implementations; many descriptors are equal, so that the first of several nearest ones counts."""
+    generator = torch.Generator().manual_seed(seed)
+    a, b = (
+        torch.randint(0, 4, (2, count, 32), generator=generator, dtype=torch.uint8) // 3 for count in (rows, columns)
+    )
+    a_valid, b_valid = (torch.rand(each.shape[:2], generator=generator) < 0.7 for each in (a, b))
+    limits = {"max_hamming": 40, "max_ratio": 1.0}
+    found = match_descriptors(a, b, a_valid, b_valid, **limits)
+    twin = TWINS["v3d_torch.features.matching.match_descriptors"]
+    if ENABLED:
+        assert torch.equal(
+            twin.compiled(a, b, a_valid, b_valid, **limits), twin.torch(a, b, a_valid, b_valid, **limits)
+        )
+    for k in range(2):
+        expected = torch.full((rows,), -1)
+        pairs = _pairs(match_descriptors(a[k, a_valid[k]], b[k, b_valid[k]], **limits))
+        expected[a_valid[k].nonzero()[pairs[:, 0], 0]] = b_valid[k].nonzero()[pairs[:, 1], 0]
+        assert torch.equal(found[k], expected)
 
 
 def _match(projected: torch.Tensor, uv: torch.Tensor, a: torch.Tensor, b: torch.Tensor, **kwargs) -> list[list[int]]:

@@ -24,7 +24,7 @@ def random_points() -> torch.Tensor:
 def test_motion_field_is_the_time_derivative_of_the_projection() -> None:
     points, dt = random_points(), 1e-6
     earlier, later = (points @ T[:3, :3].T + T[:3, 3] for T in (se3_exp(-dt * VELOCITY), se3_exp(dt * VELOCITY)))
-    pixel_velocity, rate = motion_field(CAMERA.project(points), 1 / points[:, 2], VELOCITY, CAMERA)
+    pixel_velocity, rate = motion_field(CAMERA.project(points), 1 / points[:, 2], VELOCITY, CAMERA.K)
     torch.testing.assert_close(
         pixel_velocity, (CAMERA.project(later) - CAMERA.project(earlier)) / (2 * dt), rtol=1e-6, atol=1e-6
     )
@@ -36,7 +36,7 @@ def test_motion_field_equals_the_perspective_jacobian_times_the_velocity() -> No
     uv, inverse_depth = CAMERA.project(points), 1 / points[:, 2]
     projected = torch.cat([CAMERA.normalise(uv).T, inverse_depth[None]])
     linear = torch.tensordot(VELOCITY, perspective_jacobian(projected), dims=1)
-    pixel_velocity, rate = motion_field(uv, inverse_depth, VELOCITY, CAMERA)
+    pixel_velocity, rate = motion_field(uv, inverse_depth, VELOCITY, CAMERA.K)
     torch.testing.assert_close(pixel_velocity, linear[:2].T * CAMERA.focal_lengths)
     torch.testing.assert_close(rate, linear[2])
 
@@ -45,8 +45,8 @@ def test_infinitely_far_points_move_by_the_rotation_alone() -> None:
     uv, inverse_depth = CAMERA.project(random_points()), torch.zeros(100, dtype=torch.float64)
     rotation = torch.cat([torch.zeros(3, dtype=torch.float64), VELOCITY[3:]])
     for moved, rotated in zip(
-        motion_field(uv, inverse_depth, VELOCITY, CAMERA),
-        motion_field(uv, inverse_depth, rotation, CAMERA),
+        motion_field(uv, inverse_depth, VELOCITY, CAMERA.K),
+        motion_field(uv, inverse_depth, rotation, CAMERA.K),
         strict=True,
     ):
         torch.testing.assert_close(moved, rotated)

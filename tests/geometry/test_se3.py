@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log
+from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, orthonormalise, se3_exp, se3_log
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
@@ -36,6 +36,33 @@ def test_exp_equals_pypose(angle: float) -> None:
 def test_log_equals_pypose(angle: float) -> None:
     T = se3_exp(tangents(angle))
     torch.testing.assert_close(se3_log(T), pp.mat2SE3(T, check=False).Log().tensor(), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, 9.9e-3, 1.01e-2])
+def test_left_jacobian_inverse_is_the_derivative_of_the_logarithm(angle: float) -> None:
+    xi = tangents(angle, 8)
+    T = se3_exp(xi)
+
+    def perturbed(epsilon: Tensor) -> Tensor:
+        return se3_log(se3_exp(epsilon) @ T)
+
+    expected = torch.autograd.functional.jacobian(perturbed, torch.zeros(8, 6, dtype=torch.float64))
+    each = torch.arange(8)
+    torch.testing.assert_close(
+        left_jacobian_inverse(xi), expected[each, :, each], rtol=0, atol=1e-7 if angle > 3 else 1e-11
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 9e-3, 1.0])
+def test_left_jacobian_inverse_has_gradients(angle: float) -> None:
+    assert torch.autograd.gradcheck(left_jacobian_inverse, tangents(angle, 2).requires_grad_())
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_convention_adjoint_moves_a_perturbation_from_right_to_left(angle: float) -> None:
+    T, xi = se3_exp(tangents(angle)), 0.3 * tangents(1.0).flip(0)
+    left = (adjoint(T) @ xi[..., None])[..., 0]
+    torch.testing.assert_close(se3_exp(left) @ T, T @ se3_exp(xi), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", ANGLES)

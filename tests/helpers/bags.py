@@ -14,7 +14,8 @@ from PIL import Image
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
 
 Kind = Literal["bag", "db3", "mcap"]
 KINDS: tuple[Kind, ...] = ("bag", "db3", "mcap")
@@ -30,6 +31,9 @@ class MessageFactory:
     def __init__(self, kind: Kind) -> None:
         self.kind = kind
         self.store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+        if kind == "bag":  # the message of transforms is missing
+            definition = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(definition, "tf2_msgs/msg/TFMessage"))
 
     def header(self, stamp: float, frame: str) -> Any:
         nanoseconds = round(stamp * 1e9)
@@ -69,6 +73,31 @@ class MessageFactory:
         arrays = [np.array(values, np.float64) for values in (d, k, np.eye(3).reshape(-1), p)]
         message_type = self.store.types["sensor_msgs/msg/CameraInfo"]
         return message_type(self.header(0, "optical"), height, width, model, *arrays, 0, 0, roi)
+
+    def imu(self, stamp: float, acceleration: NDArray[np.float64], frame: str = "optical") -> Any:
+        """Make a message of an accelerometer without gyroscope."""
+        types = self.store.types
+        zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        unknown = np.zeros(9)
+        return types["sensor_msgs/msg/Imu"](
+            self.header(stamp, frame),
+            types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            unknown,
+            zero,
+            unknown,
+            types["geometry_msgs/msg/Vector3"](*acceleration.tolist()),
+            unknown,
+        )
+
+    def transform(self, parent: str, child: str, rotation: Rotation) -> Any:
+        """Make a message with one transform."""
+        types = self.store.types
+        transform = types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](0.1, 0.2, 0.3),
+            types["geometry_msgs/msg/Quaternion"](*rotation.as_quat().tolist()),
+        )
+        stamped = types["geometry_msgs/msg/TransformStamped"](self.header(0, parent), child, transform)
+        return types["tf2_msgs/msg/TFMessage"]([stamped])
 
     def write(self, path: Path, messages: Iterable[Message]) -> Path:
         """Write a ``.bag`` file or the folder of a ROS 2 bag, and return its path."""

@@ -10,8 +10,8 @@ from pathlib import Path
 from typer.testing import Result
 
 RUN_FILES = {
-    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "run.log"),
-    *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json", "run.log"),
+    *("frames.parquet", "states.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png"),
 }
 """Files that every run with ground truth writes."""

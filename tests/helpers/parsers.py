@@ -27,8 +27,11 @@ from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.io.extract import extract_tar
+from v3d_torch.io.ply import read_ply_points
 from v3d_torch.mapping.map_io import load_map
-from v3d_torch.runs import stored_run
+from v3d_torch.occupancy.occupancy_io import load_occupancy
+from v3d_torch.runs import metrics_file, stored_run
+from v3d_torch.runs.request import read_request
 from v3d_torch.types import Trajectory
 
 Parser = Callable[[bytes, Path], object]
@@ -124,7 +127,10 @@ PARSERS: dict[str, Parser] = {
     "mcap": from_file("take.mcap", read_bag),
     "archive": from_file("archive.tgz", extract_archive),
     "map": from_file("room.map", lambda path: load_map(path, CAMERA, Config())),
-    "metrics.json": from_file("metrics.json", stored_run.read_metrics),
+    "occupancy": from_file("occupancy.npz", load_occupancy),
+    "metrics.json": from_file("metrics.json", metrics_file.read_metrics),
+    "point map": from_file("map.ply", read_ply_points),
+    "request.yaml": from_file("request.yaml", lambda path: read_request(path.parent)),
     "table": from_file("frames.parquet", lambda path: stored_run._read_table(path, ("frame", "status"))),
 }
 

@@ -77,7 +77,7 @@ def align(
     static: tuple[Tensor, Tensor] = (ALL_PIXELS, ALL_PIXELS),
 ) -> DenseAlignment | None:
     aligner = DenseAligner(DenseOdometryConfig(), camera)
-    return aligner(aligner.view(*a, static[0]), aligner.view(*b, static[1]), T_ba)
+    return aligner.align_views(aligner.view(*a, static[0]), aligner.view(*b, static[1]), T_ba)
 
 
 def motion_error(alignment: DenseAlignment | None, T_ba: Tensor) -> tuple[float, float]:

@@ -18,13 +18,18 @@ from PIL import Image
 from helpers.bags import DEPTH, INFO, RGB, Kind, MessageFactory
 from helpers.camera_files import FILES
 from helpers.parsers import CAMERA
-from v3d_torch.config import Config
+from v3d_torch.config import Config, OccupancyConfig
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.map_io import save_map
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.occupancy.floor import Floor
+from v3d_torch.occupancy.occupancy_io import save_occupancy
+from v3d_torch.occupancy.occupancy_map import OccupancyMap
+from v3d_torch.runs.request import RunRequest, write_request
 
 
 def _map() -> bytes:
@@ -44,6 +49,30 @@ def _map() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         save_map(Path(folder) / "map", sparse_map, views)
         return (Path(folder) / "map").read_bytes()
+
+
+def _occupancy() -> bytes:
+    """Occupancy map of a wall that a camera of 8x6 pixels observes."""
+    occupancy = OccupancyMap(OccupancyConfig())
+    depth, static = torch.ones(6, 8), torch.ones(6, 8, dtype=torch.bool)
+    occupancy.integrate(depth, static, CAMERA.rays, torch.eye(4, dtype=torch.float64))
+    with tempfile.TemporaryDirectory() as folder:
+        floor = Floor(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), -1.0, 0.5)
+        save_occupancy(Path(folder) / "occupancy.npz", occupancy, floor)
+        return (Path(folder) / "occupancy.npz").read_bytes()
+
+
+def _point_map() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.ply"
+        write_ply(path, torch.ones(2, 3), torch.ones(2, 3, dtype=torch.uint8), normals=torch.ones(2, 3))
+        return path.read_bytes()
+
+
+def _request() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write_request(Path(folder), RunRequest("demo", Config(), fps=30.0, save_masks=True))
+        return (Path(folder) / "request.yaml").read_bytes()
 
 
 def _table() -> bytes:
@@ -164,6 +193,9 @@ SEEDS: dict[str, list[bytes]] = {
     "ROS 2 bag": [_bag("db3")],
     "mcap": [_bag("mcap")],
     "map": [_map()],
+    "occupancy": [_occupancy()],
+    "point map": [_point_map()],
+    "request.yaml": [_request()],
     "metrics.json": [json.dumps(_METRICS).encode()],
     "table": [_table()],
     "archive": [_tar(mode) for mode in ("w", "w:gz", "w:bz2", "w:xz")],

@@ -30,12 +30,21 @@ class SimulatedDevice:
         record_to: File to record to; None for no recording.
         scale: Integer factor by which the small images are enlarged.
         still: True to send frame 0 again and again.
+        accelerations: Measurements of the accelerometer, m/s^2, shape (N, 3); None if there is none.
     """
 
-    depth_unit = 0.001
+    depth_unit, serial = 0.001, "1"
 
-    def __init__(self, record_to: Path | None = None, *, scale: int = 1, still: bool = False) -> None:
+    def __init__(
+        self,
+        record_to: Path | None = None,
+        *,
+        scale: int = 1,
+        still: bool = False,
+        accelerations: NDArray[np.float64] | None = None,
+    ) -> None:
         self._scale, self._still = scale, still
+        self.accelerations = np.zeros((0, 3)) if accelerations is None else accelerations
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "Simulated")
         self.device.register_info(rs.camera_info.serial_number, "1")
@@ -51,6 +60,7 @@ class SimulatedDevice:
         self.first_stamp = time.time() * 1000  # milliseconds; the syncer expects current stamps
         self.sent_count = 0
         self.stopped = threading.Event()
+        self.unplugged = threading.Event()
         self._recorder = rs.recorder(str(record_to), self.device) if record_to is not None else None
 
     def _profile(self, sensor: str, uid: int, kind: Any, stream_format: Any, K: tuple[float, ...]) -> Any:
@@ -79,6 +89,12 @@ class SimulatedDevice:
     def is_over(self) -> bool:
         return False
 
+    def is_connected(self) -> bool:
+        return not self.unplugged.is_set()
+
+    def measure_accelerations(self) -> NDArray[np.float64]:
+        return self.accelerations
+
     def stop(self) -> None:
         self.stopped.set()
         self._thread.join()
@@ -88,6 +104,8 @@ class SimulatedDevice:
 
     def _send_frames(self) -> None:
         while not self.stopped.wait(1 / FPS):
+            if self.unplugged.is_set():
+                continue
             number = 0 if self._still else self.sent_count
             factors = {"fx": self._scale, "fy": self._scale}
             depth, colour = depth_image(number), colour_of(number, WIDTH, HEIGHT)

@@ -76,8 +76,8 @@ def make_pipeline(sequence: Wall | None = None, masks: Path | None = None, confi
     return Pipeline(sequence or Wall(), V3DSLAM(CAMERA, square, config), masks)
 
 
-def run_along_wall() -> Pipeline:
+def run_along_wall(*overrides: str) -> Pipeline:
     """Run along the whole wall, with a keyframe every 5 frames."""
-    pipeline = make_pipeline(config=load_config(overrides=["mapping.max_keyframe_interval=5"]))
+    pipeline = make_pipeline(config=load_config(overrides=["mapping.max_keyframe_interval=5", *overrides]))
     pipeline()
     return pipeline

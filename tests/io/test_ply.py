@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import plyfile
 import pytest
 import torch
 
-from v3d_torch.errors import OutputError
-from v3d_torch.io.ply import write_ply
+from v3d_torch.errors import InputError, OutputError
+from v3d_torch.io.ply import read_ply_points, write_ply
 
 
 def columns(element: plyfile.PlyElement, *names: str) -> np.ndarray:
@@ -40,6 +41,32 @@ def test_optional_elements_are_omitted(tmp_path: Path) -> None:
     ply = plyfile.PlyData.read(tmp_path / "points.ply")
     assert [element.name for element in ply] == ["vertex"] and ply["vertex"].count == 0
     assert [field.name for field in ply["vertex"].properties] == ["x", "y", "z", "red", "green", "blue"]
+
+
+@pytest.mark.parametrize("count", [0, 7])
+def test_points_are_read_from_a_written_file(count: int, tmp_path: Path) -> None:
+    points, normals = torch.randn(count, 3), torch.randn(count, 3)
+    colours = torch.randint(0, 256, (count, 3), dtype=torch.uint8)
+    write_ply(tmp_path / "map.ply", points, colours, normals=normals)
+    read = read_ply_points(tmp_path / "map.ply")
+    assert torch.equal(read[0], points) and torch.equal(read[1], colours)
+
+
+def test_points_are_read_from_a_file_with_faces(tmp_path: Path) -> None:
+    points, colours = torch.randn(3, 3), torch.zeros(3, 3, dtype=torch.uint8)
+    write_ply(tmp_path / "mesh.ply", points, colours, faces=torch.tensor([[0, 1, 2]]))
+    assert torch.equal(read_ply_points(tmp_path / "mesh.ply")[0], points)
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-1], lambda b: b[:40], lambda b: b.replace(b" x", b" w"), lambda b: b""]
+)
+def test_damaged_point_map_is_error(damage: Callable[[bytes], bytes], tmp_path: Path) -> None:
+    path = tmp_path / "map.ply"
+    write_ply(path, torch.randn(3, 3), torch.zeros(3, 3, dtype=torch.uint8))
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(InputError, match=r"map\.ply: is damaged or not a point map of a run; run the sequence again"):
+        read_ply_points(path)
 
 
 def test_output_error_names_the_file(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,15 +13,17 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
-from v3d_torch.mapping.bundle_adjustment import BundleResult, Observations
+from v3d_torch.mapping import readout_calibration  # noqa: F401 - registers a kernel
+from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
 
 pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
 
-BUNDLE_ADJUST = TWINS["v3d_torch.mapping.bundle_adjustment.bundle_adjust"]
-DERIVATIVES = TWINS["v3d_torch.mapping.reduced_cost.readout_cost_derivatives"]
+BUNDLE_ADJUST = TWINS["v3d_torch.mapping.bundle_adjustment._minimise"]
+DERIVATIVES = TWINS["v3d_torch.mapping.readout_calibration.reduced_cost_derivatives"]
 CAMERA = PinholeCamera(fx=500.0, fy=510.0, cx=320.0, cy=240.0)
 
-Problem = tuple[Tensor, Tensor, Observations, PinholeCamera, Tensor]
+Problem = tuple[Tensor, Tensor, BundleProblem]
+"""Poses, points, and observations."""
 
 
 def make_problem(poses: int, points: int, observations: int, fixed: list[int], seed: int = 0) -> Problem:
@@ -40,16 +43,14 @@ def make_problem(poses: int, points: int, observations: int, fixed: list[int], s
     uv[::17] += 50.0
     inverse_depth = 1 / in_camera[:, 2] + 0.003 * normal(observations)
     inverse_depth[::3] = 0.0
-    measured = Observations(
-        uv=uv,
-        inverse_depth=inverse_depth,
-        pixel_sigma=1.2 ** (torch.arange(observations) % 5).double(),
-        inverse_depth_sigma=0.003,
-        pose=pose,
-        point=point,
-    )
+    sigma = 1.2 ** (torch.arange(observations) % 5).double()
+    weights = torch.rand(observations, generator=generator, dtype=torch.float64)
+    weights[::5] = 0.0
     is_fixed = torch.isin(torch.arange(poses), torch.tensor(fixed, dtype=torch.int64))
-    return se3_exp(0.01 * normal(poses, 6)) @ T_cw, positions + 0.02 * normal(points, 3), measured, CAMERA, is_fixed
+    start = se3_exp(0.01 * normal(poses, 6)) @ T_cw, positions + 0.02 * normal(points, 3)
+    measured = uv, pose, point, CAMERA.K, inverse_depth, sigma, 0.003
+    problem, state = prepare_bundle(*start, *measured, is_fixed, weights, None)
+    return *state, problem
 
 
 PROBLEMS = {
@@ -66,15 +67,13 @@ PROBLEMS = {
 }
 
 
-def adjust(problem: Problem, compiled: bool, iterations: int = 5) -> BundleResult:
-    result = BUNDLE_ADJUST[compiled](*problem, iterations=iterations, tolerance=1e-8)
-    assert isinstance(result, BundleResult)
-    return result
+def adjust(T_cw: Tensor, points: Tensor, problem: BundleProblem, *, compiled: bool, iterations: int = 5) -> Any:
+    return BUNDLE_ADJUST[compiled](T_cw, points, *problem, iterations=iterations, tolerance=1e-8)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_kernel_of_bundle_adjustment_equals_its_twin(name: str) -> None:
-    expected, found = (adjust(PROBLEMS[name], compiled) for compiled in (False, True))
+    expected, found = (adjust(*PROBLEMS[name], compiled=compiled) for compiled in (False, True))
     assert found.iterations == expected.iterations
     assert math.isclose(found.cost_before, expected.cost_before, rel_tol=1e-12)
     assert math.isclose(found.cost_after, expected.cost_after, rel_tol=1e-9, abs_tol=1e-12)
@@ -83,34 +82,40 @@ def test_kernel_of_bundle_adjustment_equals_its_twin(name: str) -> None:
 
 
 def test_points_behind_the_camera_have_infinite_error_in_both() -> None:
-    T_cw, points, *rest = PROBLEMS["usual"]
+    T_cw, points, problem = PROBLEMS["usual"]
     points = points.clone()
     points[:5, 2] = -3.0
-    expected, found = (adjust((T_cw, points, *rest), compiled, iterations=0) for compiled in (False, True))
+    expected, found = (adjust(T_cw, points, problem, compiled=each, iterations=0) for each in (False, True))
     assert found.chi2.isinf().any()
     torch.testing.assert_close(found.chi2, expected.chi2, rtol=1e-10, atol=1e-10)
     assert torch.equal(found.T_cw, expected.T_cw)
 
 
 def test_kernel_leaves_its_arguments_and_fixed_poses_unchanged() -> None:
-    T_cw, points, *rest = PROBLEMS["many poses"]
+    T_cw, points, problem = PROBLEMS["many poses"]
     before = T_cw.clone(), points.clone()
-    found = adjust((T_cw, points, *rest), compiled=True)
+    found = adjust(T_cw, points, problem, compiled=True)
     assert torch.equal(T_cw, before[0]) and torch.equal(points, before[1])
     assert torch.equal(found.T_cw[[0, 5, 6]], T_cw[[0, 5, 6]])
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_kernel_of_the_derivatives_equals_its_twin(name: str) -> None:
-    observations, camera, fixed = PROBLEMS[name][2:]
-    uv_jacobian = torch.randn(len(observations.uv), 2, generator=torch.Generator().manual_seed(1)).double()
-    at_minimum = adjust(PROBLEMS[name], compiled=False, iterations=20)
-    arguments = at_minimum.T_cw, at_minimum.points, observations, camera, fixed, uv_jacobian
-    expected, found = (DERIVATIVES[compiled](*arguments) for compiled in (False, True))
-    scale = max(1.0, abs(expected[1]))
-    assert found == pytest.approx(expected, rel=1e-6, abs=1e-6 * scale)
+    problem = PROBLEMS[name][2]
+    derivative = torch.randn(problem.scale.shape, generator=torch.Generator().manual_seed(1)).double()
+    at_minimum = adjust(*PROBLEMS[name], compiled=False, iterations=20)
+    arguments = at_minimum.T_cw, at_minimum.points, *problem, derivative
+    expected, found = (torch.stack(DERIVATIVES[compiled](*arguments)) for compiled in (False, True))
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6 * max(1.0, abs(float(expected[1]))))
 
 
-def test_other_dtypes_are_left_to_the_torch_function() -> None:
-    T_cw, points, *rest = PROBLEMS["usual"]
-    assert BUNDLE_ADJUST.compiled(T_cw.float(), points, *rest) is NotImplemented
+@pytest.mark.parametrize("compiled", [False, True])
+def test_problems_of_a_batch_are_solved_as_alone(compiled: bool) -> None:
+    """Padded to the same sizes; both implementations treat each problem of a batch as if it were alone."""
+    problems = [make_problem(6, 60, 300, [0], seed=seed) for seed in range(3)]
+    batch = [torch.stack(columns) for columns in zip(*((T, X, *rest) for T, X, rest in problems), strict=True)]
+    together = BUNDLE_ADJUST[compiled](*batch, iterations=5, tolerance=1e-8)
+    for k, problem in enumerate(problems):
+        alone = adjust(*problem, compiled=compiled)
+        for one, other in zip(alone, together, strict=True):
+            torch.testing.assert_close(one, other[k], rtol=1e-8, atol=1e-9)

@@ -65,7 +65,7 @@ def test_kernel_runs_for_plain_tensors_only(double: list[str]) -> None:
 
 def test_both_implementations_are_registered() -> None:
     assert all(isinstance(twin, Twin) and twin.torch is not twin.compiled for twin in TWINS.values())
-    assert "v3d_torch.optim.pose_refinement.refine_pose" in TWINS
+    assert "v3d_torch.optim.pose_refinement._minimise" in TWINS
 
 
 def test_variable_turns_kernels_off() -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config import SegmentationConfig
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
@@ -54,10 +55,13 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         write_sequence(folder, FRAMES)
         sequence = load_sequence(str(folder))
         camera = replace(sequence.camera, readout=None)  # so that the map calibrates the readout
-        slam = V3DSLAM(camera, MaskFolder(folder / "masks"))
+        config = load_config(overrides=["occupancy.enabled=true"])
+        slam = V3DSLAM(camera, MaskFolder(folder / "masks"), config)
         for frame in sequence:
             slam(replace(frame, camera=camera))
         slam.flush()
+        assert slam.occupancy is not None
+        slam.occupancy.map.is_free(slam.occupancy.map.free_points[::1000], radius=0.1)
         segmenter = YOLOSegmenter(SegmentationConfig())
         for frame in list(sequence)[::SEGMENTED]:
             segmenter(frame)

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
 import scipy.optimize
 import torch
-from helpers.bundle_scene import CAMERA, DEPTH_SIGMA, Scene
+from helpers.observed_scenes import CAMERA, DEPTH_SIGMA, Scene
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
-from v3d_torch.mapping.bundle_adjustment import BundleProblem, Observations, bundle_adjust
+from v3d_torch.mapping.bundle_problem import prepare_bundle
 from v3d_torch.optim.levenberg_marquardt import huber
-from v3d_torch.optim.reprojection import reprojection_residuals
 from v3d_torch.optim.schur import solve_normal_equations
-
-
-def residuals(T_cw: Tensor, points: Tensor, observations: Observations) -> Tensor:
-    T = T_cw[observations.pose]
-    in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
-    return reprojection_residuals(in_camera, observations, CAMERA)
 
 
 def test_damped_step_equals_the_dense_solution() -> None:
@@ -32,27 +23,28 @@ def test_damped_step_equals_the_dense_solution() -> None:
 
     def moved(xi: Tensor, shift: Tensor) -> Tensor:
         T_cw = scene.start.index_copy(0, free, se3_exp(xi) @ scene.start[free])
-        return residuals(T_cw, scene.start_points + shift, scene.observations)
+        return scene.residuals(T_cw, scene.start_points + shift)
 
     zeros = torch.zeros(2, 6, dtype=torch.float64), torch.zeros(12, 3, dtype=torch.float64)
     by_pose, by_point = torch.autograd.functional.jacobian(moved, zeros)
     r = moved(*zeros)
     J = torch.cat([by_pose.reshape(-1, 12), by_point.reshape(-1, 36)], dim=1)
-    _, weights = huber((r * r).sum(dim=-1), scene.observations.chi2_threshold)
+    _, weights = huber((r * r).sum(dim=-1), scene.measured.chi2_threshold)
     weighted = (J * weights.repeat_interleave(3)[:, None]).T
     H = weighted @ J
     expected = torch.linalg.solve(H + damping * H.diagonal().diag(), -weighted @ r.flatten())
 
-    state = scene.start, scene.start_points
-    problem = BundleProblem(scene.observations, CAMERA, ~torch.isin(torch.arange(4), free), point_count=12)
+    fixed = ~torch.isin(torch.arange(4), free)
+    optional = dict.fromkeys(("weights", "valid"))
+    problem, state = prepare_bundle(scene.start, scene.start_points, **scene.observations | {"fixed": fixed} | optional)
     _, at_start = problem.residuals_at(state)
-    xi, shift = (step[..., 0] for step in solve_normal_equations(at_start.normal_equations, damping))
-    torch.testing.assert_close(torch.cat([xi.flatten(), shift.flatten()]), expected, rtol=1e-7, atol=1e-9)
+    xi, shift = solve_normal_equations(problem.linearise(at_start, points=12), damping)
+    torch.testing.assert_close(torch.cat([xi.T.flatten(), shift.T.flatten()]), expected, rtol=1e-7, atol=1e-9)
 
 
 def test_optimum_equals_scipy() -> None:
     scene = Scene(poses=3, points=12, observers=3)
-    limit = scene.observations.chi2_threshold
+    limit = scene.measured.chi2_threshold
 
     def unpack(x: np.ndarray) -> tuple[Tensor, Tensor]:
         numbers = torch.from_numpy(x)
@@ -60,14 +52,14 @@ def test_optimum_equals_scipy() -> None:
         return T_cw, scene.start_points + numbers[12:].reshape(-1, 3)
 
     def robust_residuals(x: np.ndarray) -> np.ndarray:
-        r = residuals(*unpack(x), scene.observations)
+        r = scene.residuals(*unpack(x))
         squared = (r * r).sum(dim=-1)
         costs, _ = huber(squared, limit)
         return (r * (costs / squared).sqrt()[:, None]).flatten().numpy()
 
     best = scipy.optimize.least_squares(robust_residuals, np.zeros(12 + 36), x_scale="jac", xtol=1e-12, ftol=1e-12)
     T_cw, points = unpack(best.x)
-    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=30)
+    result = scene.adjust(iterations=30)
     assert result.cost_after == pytest.approx(2 * best.cost, rel=1e-5)
     assert se3_log(result.T_cw @ invert(T_cw)).abs().max() < 1e-4
     assert (result.points - points).norm(dim=1).max() < 1e-3
@@ -85,15 +77,15 @@ def test_optimum_equals_gtsam() -> None:
     stereo = gtsam.Cal3_S2Stereo(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy, 1 / CAMERA.fx)
     mono = gtsam.Cal3_S2(CAMERA.fx, CAMERA.fy, 0.0, CAMERA.cx, CAMERA.cy)
     A = np.array([[1.0, 0, 0], [1, 0, -1], [0, 1, 0]])
-    observations = scene.observations
-    for m in range(observations.pose.shape[0]):
+    observations = scene.measured
+    for m in range(len(scene.pose)):
         (u, v), w, sigma = (
             observations.uv[m].tolist(),
             float(observations.inverse_depth[m]),
             float(observations.pixel_sigma[m]),
         )
         kernel = gtsam.noiseModel.mEstimator.Huber.Create(float(observations.chi2_threshold[m].sqrt()))
-        keys = int(observations.pose[m]), 1000 + int(observations.point[m])
+        keys = int(scene.pose[m]), 1000 + int(scene.point[m])
         if w > 0:
             noise = gtsam.noiseModel.Gaussian.Covariance(A @ np.diag([sigma**2, sigma**2, DEPTH_SIGMA**2]) @ A.T)
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)
@@ -102,7 +94,7 @@ def test_optimum_equals_gtsam() -> None:
             noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
             graph.add(gtsam.GenericProjectionFactorCal3_S2(gtsam.Point2(u, v), noise, *keys, mono))
     best = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed, iterations=30)
+    result = scene.adjust(iterations=30)
     assert result.cost_before == pytest.approx(2 * graph.error(start), rel=1e-6)
     assert result.cost_after == pytest.approx(2 * graph.error(best), rel=1e-5)
     expected = torch.stack([torch.from_numpy(best.atPose3(k).matrix()) for k in range(5)])
@@ -113,7 +105,7 @@ def test_optimum_equals_gtsam() -> None:
 
 def test_noise_free_scene_is_recovered() -> None:
     scene = Scene(poses=6, points=100, observers=4, noise=0.0)
-    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=20)
+    result = scene.adjust(iterations=20)
     torch.testing.assert_close(result.T_cw, scene.T_cw, rtol=0, atol=1e-7)
     torch.testing.assert_close(result.points, scene.points, rtol=0, atol=1e-6)
     assert result.cost_after < 1e-6 < result.cost_before
@@ -121,20 +113,20 @@ def test_noise_free_scene_is_recovered() -> None:
 
 def test_mean_chi2_equals_the_degrees_of_freedom() -> None:
     scene = Scene(poses=6, points=400, observers=5)
-    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
-    degrees = (2 + (scene.observations.inverse_depth > 0)).sum() - 5 * 6 - 400 * 3
+    result = scene.adjust()
+    degrees = (2 + (scene.measured.inverse_depth > 0)).sum() - 5 * 6 - 400 * 3
     assert float(result.chi2.sum() / degrees) == pytest.approx(1.0, abs=0.05)
 
 
 def test_outliers_are_detected_and_do_not_change_the_poses() -> None:
     scene = Scene(poses=6, points=300, observers=5)
-    shifted = torch.arange(scene.observations.pose.shape[0]) % 10 == 0
-    uv = torch.where(shifted[:, None], scene.observations.uv + 40.0, scene.observations.uv)
-    observations = replace(scene.observations, uv=uv)
-    result = bundle_adjust(scene.start, scene.start_points, observations, CAMERA, scene.fixed)
-    clean = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
+    shifted = torch.arange(len(scene.pose)) % 10 == 0
+    uv = torch.where(shifted[:, None], scene.measured.uv + 40.0, scene.measured.uv)
+    result = scene.adjust(uv=uv)
+    clean = scene.adjust()
     assert se3_log(result.T_cw @ invert(clean.T_cw)).abs().max() < 0.005
-    outlier = result.chi2 > observations.chi2_threshold
+    outlier = ~result.inliers
+    assert torch.equal(outlier, result.chi2 > scene.measured.chi2_threshold)
     assert outlier[shifted].double().mean() > 0.99
     assert outlier[~shifted].double().mean() < 0.15
 
@@ -142,11 +134,11 @@ def test_outliers_are_detected_and_do_not_change_the_poses() -> None:
 def test_fixed_poses_are_bit_identical() -> None:
     scene = Scene(poses=5, points=50, observers=4)
     fixed = torch.tensor([True, False, True, False, True])
-    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, fixed)
+    result = scene.adjust(fixed=fixed)
     assert torch.equal(result.T_cw[fixed], scene.start[fixed])
     assert not torch.equal(result.T_cw[1], scene.start[1])
     everything = torch.ones(5, dtype=torch.bool)
-    only_points = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, everything)
+    only_points = scene.adjust(fixed=everything)
     assert torch.equal(only_points.T_cw, scene.start)
     assert only_points.cost_after < only_points.cost_before
 
@@ -154,36 +146,34 @@ def test_fixed_poses_are_bit_identical() -> None:
 def test_inputs_are_not_modified() -> None:
     scene = Scene(poses=3, points=20, observers=3)
     before = scene.start.clone(), scene.start_points.clone()
-    bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed)
+    scene.adjust()
     assert torch.equal(scene.start, before[0])
     assert torch.equal(scene.start_points, before[1])
 
 
 def test_degenerate_points_stay_finite() -> None:
     scene = Scene(poses=5, points=40, observers=4)
-    given = scene.observations
+    measured, point = scene.measured, scene.point
     # Point 0 is observed once without depth, 1 once with depth, 2 never; 3 is behind its cameras.
-    rank = torch.arange(given.pose.shape[0]) % 4
-    keep = ~((given.point <= 1) & (rank > 0)) & (given.point != 2)
-    inverse_depth = torch.where(given.point == 0, 0.0, torch.where(given.point == 1, 0.4, given.inverse_depth))
-    observations = Observations(
-        pose=given.pose[keep],
-        point=given.point[keep],
-        uv=given.uv[keep],
-        inverse_depth=inverse_depth[keep],
-        pixel_sigma=given.pixel_sigma[keep],
-        inverse_depth_sigma=DEPTH_SIGMA,
-    )
+    rank = torch.arange(len(point)) % 4
+    keep = ~((point <= 1) & (rank > 0)) & (point != 2)
+    inverse_depth = torch.where(point == 0, 0.0, torch.where(point == 1, 0.4, measured.inverse_depth))
+    observations = {
+        "pose": scene.pose[keep],
+        "point": point[keep],
+        "uv": measured.uv[keep],
+        "inverse_depth": inverse_depth[keep],
+        "pixel_sigma": measured.pixel_sigma[keep],
+    }
     points = scene.start_points.clone()
     points[3] = -points[3]
-    result = bundle_adjust(scene.start, points, observations, CAMERA, scene.fixed)
+    result = scene.adjust(points=points, **observations)
     assert torch.isfinite(result.points).all()
     assert (result.points[:2] - points[:2]).norm(dim=1).max() < 1.0
     assert torch.equal(result.points[2], points[2])
-    once = bundle_adjust(scene.T_cw, points, observations, CAMERA, torch.ones(5, dtype=torch.bool))
-    assert 1 / float(
-        (scene.T_cw[observations.pose[1]] @ torch.cat([once.points[1], torch.ones(1)]))[2]
-    ) == pytest.approx(0.4, abs=1e-4)
+    once = scene.adjust(T_cw=scene.T_cw, points=points, fixed=torch.ones(5, dtype=torch.bool), **observations)
+    in_camera = scene.T_cw[observations["pose"][1]] @ torch.cat([once.points[1], torch.ones(1)])
+    assert 1 / float(in_camera[2]) == pytest.approx(0.4, abs=1e-4)
     good = torch.arange(40) > 3
     assert (result.points - scene.points)[good].norm(dim=1).median() < 0.02
 
@@ -191,16 +181,14 @@ def test_degenerate_points_stay_finite() -> None:
 def test_cost_without_a_fixed_pose_reaches_the_same_minimum() -> None:
     scene = Scene(poses=4, points=50, observers=4)
     free = torch.zeros(4, dtype=torch.bool)
-    result = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, free, iterations=20)
-    tied = bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed, iterations=20)
-    assert result.cost_after == pytest.approx(tied.cost_after, rel=1e-3)
+    result = scene.adjust(fixed=free, iterations=20)
+    tied = scene.adjust(iterations=20)
+    assert result.cost_after == pytest.approx(float(tied.cost_after), rel=1e-3)
     assert (result.T_cw - scene.start).abs().max() < 0.3
 
 
 def test_result_is_deterministic() -> None:
     scene = Scene(poses=6, points=200, observers=4)
-    first, second = (
-        bundle_adjust(scene.start, scene.start_points, scene.observations, CAMERA, scene.fixed) for _ in range(2)
-    )
+    first, second = (scene.adjust() for _ in range(2))
     assert torch.equal(first.T_cw, second.T_cw)
     assert torch.equal(first.points, second.points)

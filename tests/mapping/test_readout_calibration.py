@@ -1,34 +1,63 @@
-"""Calibration of the readout against the weighted mean; its limits."""
+"""Calibration of the readout against the weighted mean and finite differences; its limits."""
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import pytest
+import torch
+from helpers.observed_scenes import Scene
 from helpers.rolling_camera import KINECT
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from v3d_torch.geometry.camera import MAX_READOUT
-from v3d_torch.mapping.readout_calibration import calibrate_readout
+from v3d_torch.mapping.readout_calibration import combine_readouts, estimate_readout
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
+
+
+def combine(prior: Readout, slope: float, curvature: float) -> Readout:
+    numbers = (torch.tensor(value, dtype=torch.float64) for value in (*astuple(prior), slope, curvature))
+    return Readout(*map(float, combine_readouts(*numbers)))
 
 
 @settings(deadline=None, max_examples=50)
 @given(st.floats(0, 0.03), st.floats(0, 0.03), st.floats(1e3, 1e8), st.floats(1e3, 1e8))
 def test_calibration_with_a_quadratic_cost_is_the_weighted_mean(a: float, b: float, prior: float, new: float) -> None:
-    calibrated = calibrate_readout(Readout(a, prior), slope=2 * new * (a - b), curvature=2 * new)
+    calibrated = combine(Readout(a, prior), slope=2 * new * (a - b), curvature=2 * new)
     assert calibrated.information == pytest.approx(0.8 * prior + 0.1 * new, rel=1e-12)
     assert calibrated.seconds == pytest.approx((0.8 * prior * a + 0.1 * new * b) / calibrated.information, abs=1e-9)
 
 
 @pytest.mark.parametrize("curvature", [0.0, -1e6])
 def test_calibration_ignores_a_cost_without_minimum(curvature: float) -> None:
-    assert calibrate_readout(KINECT, slope=5.0, curvature=curvature) == KINECT
+    assert combine(KINECT, slope=5.0, curvature=curvature) == KINECT
 
 
 def test_calibration_keeps_a_certain_readout() -> None:
-    assert calibrate_readout(GLOBAL_SHUTTER, slope=5.0, curvature=1e6) == GLOBAL_SHUTTER
+    assert combine(GLOBAL_SHUTTER, slope=5.0, curvature=1e6) == GLOBAL_SHUTTER
 
 
 def test_calibrated_readout_is_at_most_the_longest_accepted() -> None:
-    calibrated = calibrate_readout(Readout(0.01, 1.0), slope=-2e6 * 2.99, curvature=2e6)
+    calibrated = combine(Readout(0.01, 1.0), slope=-2e6 * 2.99, curvature=2e6)
     assert calibrated.seconds == pytest.approx(MAX_READOUT, abs=1e-6)
+
+
+def test_derivatives_of_the_minimum_cost_equal_finite_differences() -> None:
+    """Finite differences of the minimum cost for measurements that are shifted in both directions."""
+    scene = Scene(poses=4, points=40, observers=3)
+    uv_jacobian = 5.0 * torch.randn(len(scene.pose), 2, generator=torch.Generator().manual_seed(5)).double()
+    optimum = scene.adjust(iterations=50, tolerance=1e-13)
+
+    def cost(step: float) -> float:
+        shifted = {"T_cw": optimum.T_cw, "points": optimum.points, "uv": scene.measured.uv + step * uv_jacobian}
+        return float(scene.adjust(**shifted, iterations=50, tolerance=1e-13).cost_after)
+
+    step = 1e-3
+    less, same, more = cost(-step), cost(0.0), cost(step)
+    slope, curvature = (more - less) / (2 * step), (more - 2 * same + less) / step**2
+    expected = combine(Readout(0.02, 1e3), slope, curvature)
+    state = 0.02, 1e3, uv_jacobian, optimum.T_cw, optimum.points
+    seconds, information = estimate_readout(*state, **scene.observations)
+    assert float(seconds) == pytest.approx(expected.seconds, abs=1e-6)
+    assert float(information) == pytest.approx(expected.information, rel=0.05)

@@ -17,7 +17,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, RollingShutterCompensation
+from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, compensate_features
 
 
 def insert(sparse_map: SparseMap, landmarks: list[int], T_cw: Tensor = EYE, seed: int = 0) -> Keyframe:
@@ -181,8 +181,8 @@ def map_of_two_keyframes(readout: Readout) -> SparseMap:
     config = Config()
     sparse_map = SparseMap(config.mapping, config.features, rolling_camera.CAMERA)
     sparse_map.readout = readout
-    compensate = RollingShutterCompensation(rolling_camera.CAMERA)
-    observed = compensate(observe_rolling(points_in_view(), VELOCITY, KINECT.seconds), VELOCITY, readout)
+    rolling = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
+    observed = compensate_features(rolling, VELOCITY, readout, rolling_camera.CAMERA)
     first = sparse_map.insert_keyframe(0, 0.0, EYE, observed, unmatched(len(observed)))
     sparse_map.insert_keyframe(1, 0.1, EYE, observed, first.landmarks)
     return sparse_map
@@ -201,8 +201,8 @@ def test_update_features_moves_the_observations_of_that_keyframe_only() -> None:
     sparse_map = map_of_two_keyframes(KINECT)
     newest, others = sparse_map.keyframes[1], sparse_map.observations["keyframe"] == 0
     before = sparse_map.observations["uv"].clone()
-    compensate = RollingShutterCompensation(rolling_camera.CAMERA)
-    sparse_map.update_features(newest, compensate(newest.features, VELOCITY / 2, KINECT))
+    slower = compensate_features(newest.features, VELOCITY / 2, KINECT, rolling_camera.CAMERA)
+    sparse_map.update_features(newest, slower)
     assert torch.equal(sparse_map.observations["uv"][others], before[others])
     feature = sparse_map.observations["feature"][~others]
     assert torch.equal(sparse_map.observations["uv"][~others], newest.features.uv[feature])

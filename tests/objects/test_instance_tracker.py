@@ -220,7 +220,7 @@ def test_turning_camera_keeps_ids_of_flickering_classes() -> None:
 def test_visible_missed_object_is_not_matched_to_a_nearby_instance(there: bool) -> None:
     """The new board is within the gate and of the same class, but the first is still visible at its position."""
     first, other = Board(-0.3), Board(0.28)
-    track_boards = BoardTracker()
+    track_boards = BoardTracker(5.0)
     track_thrice(track_boards, first)
     tracks = track_boards(*([replace(first, detected=False)] if there else []), other)
     assert at(tracks, other).id == (2 if there else 1)
@@ -289,6 +289,29 @@ def test_object_detected_again_too_late_gets_a_new_id() -> None:
         for _ in range(6):
             tracks = track_boards()
         assert tracks == []
+
+
+def test_object_hidden_for_longer_than_the_maximum_lost_time_gets_a_new_id() -> None:
+    """A cupboard hides the board."""
+    track_boards = BoardTracker(10.0)
+    track_thrice(track_boards, Board(0.0, 3.0))
+    cupboard = Board(0.0, 1.5, width=1.0, height=2.0, detected=False)
+    for _ in range(70):
+        assert not any(track.visible for track in track_boards(Board(0.0, 3.0), cupboard))
+    assert track_boards.tracker.lost == []
+    assert [track.id for track in track_boards(Board(0.0, 3.0))] == [2]
+
+
+def test_part_of_a_tracked_object_is_not_a_second_object() -> None:
+    """The network finds a person, and the upper half of the same person again."""
+    depth, instances = render([Board(0.0)])
+    upper = instances.masks.clone()
+    upper[:, CAMERA.height // 2 :] = False
+    twice = instances.concatenate(replace(instances, masks=upper))
+    tracker, back_project = BoardTracker().tracker, InstanceBackProjector(CLOUDS, CAMERA)
+    tracker(0.0, instances, back_project(depth, instances), depth, HERE)
+    tracks = tracker(1 / 30, twice, back_project(depth, twice), depth, HERE)
+    assert [track.id for track in tracks] == [1]
 
 
 def test_predicted_mask_follows_the_camera() -> None:

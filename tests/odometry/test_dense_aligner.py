@@ -32,7 +32,7 @@ from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.odometry.dense_aligner import DenseAligner, DenseAlignment
+from v3d_torch.odometry.dense_aligner import DenseAligner, DenseAlignment, align_depth
 from v3d_torch.odometry.dense_view import DenseView
 
 # ---------------------------------------------------------------------------------------------- accuracy
@@ -109,7 +109,7 @@ def test_alignment_is_deterministic_for_any_number_of_threads() -> None:
     aligner = DenseAligner(DenseOdometryConfig(halvings=(4, 1), iterations=2), LENS)
 
     def run() -> DenseAlignment | None:
-        return aligner(aligner.view(*a, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), MOTION)
+        return aligner.align_views(aligner.view(*a, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), MOTION)
 
     first, second = run(), run()
     torch.set_num_threads(2)
@@ -121,7 +121,7 @@ def test_alignment_is_deterministic_for_any_number_of_threads() -> None:
         assert first is not None and other is not None
         assert torch.equal(first.T_ba, other.T_ba)
         assert torch.equal(first.information, other.information)
-        assert replace(first, T_ba=0, information=0) == replace(other, T_ba=0, information=0)
+        assert first._replace(T_ba=0, information=0) == other._replace(T_ba=0, information=0)
 
 
 # ---------------------------------------------------------------------------------------------- rejection
@@ -167,7 +167,7 @@ def test_too_little_overlap_gives_none() -> None:
     b = render(T_ba)
     for min_overlap, accepted in ((0.3, False), (0.1, True)):
         aligner = DenseAligner(DenseOdometryConfig(min_overlap=min_overlap, min_observability=1e-6), LENS)
-        alignment = aligner(aligner.view(*A, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), T_ba)
+        alignment = aligner.align_views(aligner.view(*A, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), T_ba)
         assert (alignment is not None) is accepted
 
 
@@ -204,4 +204,34 @@ def test_random_images_with_invalid_values_give_none(seed: int) -> None:
         return aligner.view(grey, depth, torch.rand(49, 67, generator=generator) < 0.9)
 
     T_ba = se3_exp(3 * torch.randn(6, generator=generator, dtype=torch.float64))
-    assert aligner(view(), view(), T_ba) is None
+    assert aligner.align_views(view(), view(), T_ba) is None
+
+
+# ---------------------------------------------------------------------------------------------- batches
+
+
+def test_pairs_of_a_batch_are_aligned_as_alone() -> None:
+    """One pair is black, one has masks, and one a prediction."""
+    greys_a, depths_a = (torch.stack([each, each * scale, each]) for each, scale in zip(A, (0, 1), strict=True))
+    greys_b, depths_b = (torch.stack([each] * 3) for each in B)
+    masks = ALL_PIXELS.repeat(3, 1, 1)
+    masks[2, :, :100] = False
+    motions = torch.stack([MOTION, IDENTITY, IDENTITY])
+    config = DenseOdometryConfig(halvings=(4, 3, 2))
+    found = align_depth(greys_a, depths_a, greys_b, depths_b, LENS, motions, static_a=masks, config=config)
+    assert found.reliable.tolist() == [True, False, True]
+    assert found.T_ba.shape == (3, 4, 4) and found.information.shape == (3, 6, 6) and found.overlap.shape == (3,)
+    assert found.T_ba[1].isnan().all()
+    aligner = DenseAligner(config, LENS)
+    for k in (0, 2):
+        alone = aligner.align_views(aligner.view(*A, masks[k]), aligner.view(*B, ALL_PIXELS), motions[k])
+        assert alone is not None
+        for one, other in zip(found, alone, strict=True):
+            assert torch.equal(one[k], other)
+    assert align_depth(greys_a[:0], depths_a[:0], greys_b[:0], depths_b[:0], LENS).T_ba.shape == (0, 4, 4)
+
+
+def test_images_without_a_batch_dimension_are_aligned() -> None:
+    found = align_depth(*A, *B, LENS)
+    assert found.T_ba.shape == (4, 4) and bool(found.reliable)
+    assert motion_error(found, MOTION)[0] < 1.0

@@ -61,7 +61,7 @@ def test_convention_information_is_of_the_left_perturbation() -> None:
     a, b = A, render(T_ba)
     aligner = DenseAligner(DenseOdometryConfig(halvings=(2, 1)), LENS)
     views = aligner.view(*a, ALL_PIXELS), aligner.view(*b, ALL_PIXELS)
-    alignment = aligner(*views, T_ba)
+    alignment = aligner.align_views(*views, T_ba)
     assert alignment is not None
     assert motion_error(alignment, T_ba)[0] < 0.5
     state = alignment.T_ba, torch.tensor([1.0, 0.0], dtype=torch.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -11,14 +12,13 @@ from helpers.rolling_camera import AT_REST, CAMERA, KINECT, VELOCITY, features_o
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.mapping.readout_calibration import calibrate_readout
-from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, RollingShutterCompensation
+from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, compensate_features
 
 
 def max_error(velocity: Tensor, readout: Readout) -> float:
     """Largest distance of compensated features to the projections at the time of the middle row, pixels."""
     observed = observe_rolling(points_in_view(), velocity, KINECT.seconds)
-    compensated = RollingShutterCompensation(CAMERA)(observed, velocity, readout)
+    compensated = compensate_features(observed, velocity, readout, CAMERA)
     return float((compensated.uv - CAMERA.project(points_in_view())).norm(dim=1).max())
 
 
@@ -30,7 +30,7 @@ def test_compensation_moves_features_to_the_time_of_the_middle_row() -> None:
 def test_readout_jacobian_is_the_derivative_by_the_readout() -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
     shorter, longer = (
-        RollingShutterCompensation(CAMERA)(observed, VELOCITY, Readout(seconds, 1.0)) for seconds in (0.010, 0.020)
+        compensate_features(observed, VELOCITY, Readout(seconds, 1.0), CAMERA) for seconds in (0.010, 0.020)
     )
     torch.testing.assert_close((longer.uv - shorter.uv) / 0.010, shorter.readout_jacobian, rtol=1e-9, atol=1e-6)
 
@@ -39,7 +39,7 @@ def test_features_without_depth_are_compensated_as_infinitely_far() -> None:
     uv = CAMERA.project(points_in_view())
     far = features_of(uv, torch.full((len(uv),), 1e9).double())
     without_depth = features_of(uv, torch.zeros(len(uv)).double())
-    compensate = RollingShutterCompensation(CAMERA)
+    compensate = partial(compensate_features, camera=CAMERA)
     torch.testing.assert_close(
         compensate(without_depth, VELOCITY, KINECT).uv, compensate(far, VELOCITY, KINECT).uv, rtol=0, atol=1e-6
     )
@@ -47,7 +47,7 @@ def test_features_without_depth_are_compensated_as_infinitely_far() -> None:
 
 def test_compensation_with_another_velocity_replaces_the_first() -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
-    compensate = RollingShutterCompensation(CAMERA)
+    compensate = partial(compensate_features, camera=CAMERA)
     twice = compensate(compensate(observed, -2 * VELOCITY, KINECT), VELOCITY, KINECT)
     torch.testing.assert_close(twice.uv, compensate(observed, VELOCITY, KINECT).uv, rtol=0, atol=1e-9)
     torch.testing.assert_close(compensate(twice, AT_REST, KINECT).uv, observed.uv, rtol=0, atol=1e-9)
@@ -56,19 +56,19 @@ def test_compensation_with_another_velocity_replaces_the_first() -> None:
 @pytest.mark.parametrize(("velocity", "readout"), [(AT_REST, KINECT), (VELOCITY, GLOBAL_SHUTTER)])
 def test_features_are_unchanged_at_rest_or_with_a_global_shutter(velocity: Tensor, readout: Readout) -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
-    assert torch.equal(RollingShutterCompensation(CAMERA)(observed, velocity, readout).uv, observed.uv)
+    assert torch.equal(compensate_features(observed, velocity, readout, CAMERA).uv, observed.uv)
 
 
 def test_compensation_of_no_features_is_empty() -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)[torch.zeros(0, dtype=torch.int64)]
-    assert len(RollingShutterCompensation(CAMERA)(observed, VELOCITY, KINECT)) == 0
+    assert len(compensate_features(observed, VELOCITY, KINECT, CAMERA)) == 0
 
 
 def test_readout_of_a_camera_is_certain_if_given_else_the_prior() -> None:
     prior = Config().rolling_shutter
     assert Readout.from_camera(CAMERA, prior) == Readout(prior.readout, prior.readout_sigma**-2)
     assert Readout.from_camera(replace(CAMERA, readout=0.0), prior) == GLOBAL_SHUTTER
-    assert calibrate_readout(Readout.from_camera(replace(CAMERA, readout=0.025), prior), 5.0, 1e6).seconds == 0.025
+    assert Readout.from_camera(replace(CAMERA, readout=0.025), prior) == Readout(0.025, math.inf)
 
 
 @pytest.mark.parametrize(

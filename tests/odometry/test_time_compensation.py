@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.depth_delay import DepthDelayCompensation
-from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, RollingShutterCompensation
+from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, compensate_features
 from v3d_torch.odometry.time_compensation import TimeCompensation
 
 CAMERA = PinholeCamera(525.0, 520.0, 320.0, 240.0)
@@ -20,7 +22,7 @@ DELAY = 0.02  # seconds
 
 compensate = TimeCompensation(Config(), CAMERA)
 compensate_depth_delay = DepthDelayCompensation(Config(), CAMERA)
-compensate_rolling_shutter = RollingShutterCompensation(CAMERA)
+compensate_rolling_shutter = partial(compensate_features, camera=CAMERA)
 
 
 @pytest.fixture(scope="module")

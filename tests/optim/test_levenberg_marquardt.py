@@ -42,19 +42,41 @@ def test_student_t_scale_equals_the_fit_of_scipy() -> None:
     assert abs(float(scale) / expected - 1) < 0.02
 
 
+def rosenbrock(x: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Cost and normal equations of Rosenbrock's function, (..., 2)."""
+    a, b = x.unbind(-1)
+    o = torch.zeros_like(a)
+    r = torch.stack([10 * (b - a * a), 1 - a], dim=-1)
+    J = torch.stack([torch.stack([-20 * a, o + 10], dim=-1), torch.stack([o - 1, o], dim=-1)], dim=-2)
+    return r.square().sum(dim=-1), (J.mT @ J, (J.mT @ r[..., None])[..., 0])
+
+
+def damped_step(x: Tensor, system: tuple[Tensor, Tensor], damping: Tensor) -> Tensor:
+    H, g = system
+    return x - torch.linalg.solve(H + torch.diag_embed(damping[..., None] * H.diagonal(dim1=-2, dim2=-1)), g)
+
+
+ROSENBROCK = rosenbrock, damped_step
+
+
 def test_levenberg_marquardt_solves_rosenbrock() -> None:
-    def linearise(x: Tensor) -> tuple[float, tuple[Tensor, Tensor]]:
-        r = torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]])
-        J = torch.tensor([[-20 * float(x[0]), 10.0], [-1.0, 0.0]], dtype=torch.float64)
-        return float(r @ r), (J.T @ J, J.T @ r)
-
-    def step(x: Tensor, system: tuple[Tensor, Tensor], damping: float) -> Tensor:
-        H, g = system
-        return x - torch.linalg.solve(H + damping * H.diagonal().diag(), g)
-
-    initial = torch.tensor([-1.2, 1.0], dtype=torch.float64)
-    result = levenberg_marquardt(initial, linearise, step, iterations=50)
+    result = levenberg_marquardt(torch.tensor([-1.2, 1.0], dtype=torch.float64), *ROSENBROCK, iterations=50)
     torch.testing.assert_close(result.state, torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-6)
     assert result.converged
     assert result.iterations < 50
     assert result.cost_after < 1e-10 < result.cost_before
+
+
+def test_problems_of_a_batch_are_solved_as_alone() -> None:
+    """Each has its own damping and ends by itself; finished ones are not changed."""
+    start = 2 * torch.randn(5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    finished = torch.tensor([False, False, True, False, False])
+    result = levenberg_marquardt(start, *ROSENBROCK, iterations=50, finished=finished)
+    assert len(result.iterations.unique()) > 2
+    for k in range(5):
+        if finished[k]:
+            assert torch.equal(result.state[k], start[k]) and result.iterations[k] == 0
+            continue
+        alone = levenberg_marquardt(start[k], *ROSENBROCK, iterations=50)
+        assert alone.iterations == result.iterations[k] and alone.converged == result.converged[k]
+        torch.testing.assert_close(alone.state, result.state[k], rtol=1e-9, atol=1e-9)

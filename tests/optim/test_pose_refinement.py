@@ -1,22 +1,31 @@
-"""Pose refinement against SciPy and gtsam; outliers and degenerate measurements."""
+"""Pose refinement against SciPy and gtsam; outliers, degenerate measurements, padding; gradients, training."""
 
 from __future__ import annotations
+
+import doctest
+from collections.abc import Callable
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
 import scipy.optimize
 import torch
+from helpers import camera_inputs
+from helpers.gradients import check_gradients, count_graph_nodes
 from helpers.measured_landmarks import CAMERA, INVERSE_DEPTH_SIGMA, measure_landmarks
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
-from v3d_torch.optim.reprojection import Measurements, reprojection_residuals
+from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian, reprojection_residuals
 
 
 def refine(T_cw: Tensor, points: Tensor, measured: Measurements) -> PoseRefinement:
-    return refine_pose(T_cw, points, measured, CAMERA)
+    return refine_pose(T_cw, points, K=CAMERA.K, **vars(measured))
 
 
 def perturb(T_cw: Tensor, scale: float = 0.03) -> Tensor:
@@ -30,7 +39,7 @@ def test_refined_pose_equals_the_optimum_of_scipy() -> None:
 
     def residuals(xi: np.ndarray) -> np.ndarray:
         T = se3_exp(torch.from_numpy(xi)) @ T_cw
-        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)[inliers].flatten().numpy()
+        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA.K)[inliers].flatten().numpy()
 
     best = scipy.optimize.least_squares(residuals, np.zeros(6), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     expected = se3_exp(torch.from_numpy(best.x)) @ T_cw
@@ -85,7 +94,7 @@ def test_one_measurement_with_depth_determines_the_distance() -> None:
         pixel_sigma=torch.ones(1, dtype=torch.float64),
         inverse_depth_sigma=INVERSE_DEPTH_SIGMA,
     )
-    refined = refine_pose(torch.eye(4, dtype=torch.float64), points, measured, CAMERA)
+    refined = refine(torch.eye(4, dtype=torch.float64), points, measured)
     in_camera = refined.T_cw[:3, :3] @ points[0] + refined.T_cw[:3, 3]
     assert abs(float(in_camera[2]) - 1.9) < 1e-3
     assert refined.inliers.tolist() == [True]
@@ -122,3 +131,190 @@ def test_refinement_is_deterministic() -> None:
     first, second = (refine(perturb(T_cw), points, measured) for _ in range(2))
     assert torch.equal(first.T_cw, second.T_cw)
     assert torch.equal(first.inliers, second.inliers)
+
+
+# ---------------------------------------------------------------- batches, padding, weights
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.lists(st.booleans(), min_size=60, max_size=60), st.integers(1, 4))
+def test_padding_between_measurements_has_no_effect(present: list[bool], rounds: int) -> None:
+    inputs, valid = camera_inputs.view(1, 60, torch.float64), torch.tensor([present])
+    alone = {name: each[:, valid[0]] if each.shape[1:2] == (60,) else each for name, each in inputs.items()}
+    padded = {
+        name: torch.where(valid.reshape(1, 60, *[1] * (each.ndim - 2)), each, torch.nan)
+        if each.shape[1:2] == (60,) and each.is_floating_point()
+        else each
+        for name, each in inputs.items()
+    }
+    found = refine_pose(**padded | {"valid": valid}, rounds=rounds)
+    expected = refine_pose(**alone | {"valid": None}, rounds=rounds)
+    torch.testing.assert_close(found.T_cw, expected.T_cw, rtol=0, atol=1e-9)
+    assert torch.equal(found.inliers[valid], expected.inliers[0]) and not found.inliers[~valid].any()
+    torch.testing.assert_close(found.chi2[valid], expected.chi2[0], rtol=1e-6, atol=1e-9)
+
+
+def test_convention_a_weight_counts_a_measurement_so_many_times() -> None:
+    inputs = camera_inputs.view(2, 40, torch.float64) | {"weights": None, "valid": None}
+    weights = torch.arange(40).expand(2, 40) % 3
+    repeats = torch.arange(40).repeat_interleave(weights[0])
+    repeated = {
+        name: each[:, repeats] if each is not None and each.shape[1:2] == (40,) else each
+        for name, each in inputs.items()
+    }
+    found = refine_pose(**inputs | {"weights": weights}, iterations=20, tolerance=1e-12)
+    expected = refine_pose(**repeated, iterations=20, tolerance=1e-12)
+    torch.testing.assert_close(found.T_cw, expected.T_cw, rtol=0, atol=1e-8)
+    torch.testing.assert_close(found.information, expected.information, rtol=1e-4, atol=1.0)
+
+
+def test_leading_dimensions_are_those_of_the_batch() -> None:
+    """A single camera matrix, and landmarks that all cameras share, are broadcast."""
+    T_cw, points, measured, _ = measure_landmarks(80)
+    starts = torch.stack([perturb(T_cw, scale) for scale in (0.01, 0.02, 0.03, -0.01, -0.02, 0.0)]).reshape(2, 3, 4, 4)
+    refined = refine_pose(starts, points, K=CAMERA.K, **vars(measured))
+    assert refined.T_cw.shape == (2, 3, 4, 4) and refined.inliers.shape == (2, 3, 80)
+    alone = refine(starts[1, 2], points, measured)
+    torch.testing.assert_close(refined.T_cw[1, 2], alone.T_cw, rtol=0, atol=1e-9)
+    torch.testing.assert_close(refined.T_cw, alone.T_cw.expand(2, 3, 4, 4), rtol=0, atol=1e-4)
+
+
+def test_float32_is_computed_in_float64() -> None:
+    inputs = camera_inputs.view(2, 60, torch.float64)
+    single = {name: each.float() if each.is_floating_point() else each for name, each in inputs.items()}
+    found, expected = refine_pose(**single), refine_pose(**inputs)
+    assert found.T_cw.dtype == found.chi2.dtype == found.information.dtype == torch.float32
+    torch.testing.assert_close(found.T_cw.double(), expected.T_cw, rtol=0, atol=1e-6)
+
+
+# ---------------------------------------------------------------- gradients
+
+CONVERGED = {"iterations": 60, "tolerance": 1e-15}
+
+
+def clean_view() -> dict[str, Tensor]:
+    """Two cameras with 20 landmarks each, whose measurements are all inliers."""
+    inputs = camera_inputs.view(2, 20, torch.float64)
+    return inputs | {"valid": torch.arange(20).expand(2, 20) % 5 > 0}
+
+
+@pytest.mark.parametrize("rounds", [1, 4], ids=["robust", "inliers"])
+def test_gradients_equal_finite_differences(rounds: int) -> None:
+    """With respect to landmarks, pixels, intrinsics, depths, standard deviations, and weights."""
+    inputs = clean_view()
+    if rounds == 1:
+        inputs["uv"][:, ::4] += 6.0  # where Huber's kernel is linear
+    measured = inputs["inverse_depth"] > 0
+
+    def pose(points: Tensor, uv: Tensor, K: Tensor, depth: Tensor, sigmas: Tensor, weights: Tensor) -> Tensor:
+        inverse_depth = torch.where(measured, inputs["inverse_depth"] / (1 + depth), 0.0)
+        given = {"points": points, "uv": uv, "K": K, "inverse_depth": inverse_depth, "weights": weights}
+        pixel_sigma, inverse_depth_sigma = sigmas.exp()
+        noise = {"pixel_sigma": pixel_sigma, "inverse_depth_sigma": 0.02 * inverse_depth_sigma}
+        return refine_pose(**inputs | given, **noise, rounds=rounds, **CONVERGED).T_cw
+
+    scales = torch.zeros_like(inputs["inverse_depth"]), torch.zeros(2, dtype=torch.float64)
+    assert check_gradients(pose, inputs["points"], inputs["uv"], inputs["K"], *scales, inputs["weights"])
+
+
+def test_gradients_equal_those_of_unrolled_iterations() -> None:
+    inputs = clean_view()
+    inputs["uv"][:, ::4] += 6.0
+    weights = inputs["weights"].clone().requires_grad_()
+    refined = refine_pose(**inputs | {"weights": weights}, rounds=1, **CONVERGED)
+    projection = torch.randn(refined.T_cw.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    (implicit,) = torch.autograd.grad((projection * refined.T_cw).sum(), weights)
+
+    T_cw, influence = inputs["T_cw"], torch.where(inputs["valid"], weights, 0.0)
+    measured = Measurements(
+        uv=inputs["uv"], inverse_depth=inputs["inverse_depth"], pixel_sigma=1.0, inverse_depth_sigma=0.025
+    )
+    for _ in range(60):  # Gauss-Newton with autograd through every step
+        in_camera = inputs["points"] @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]
+        r = reprojection_residuals(in_camera, measured, inputs["K"])
+        J = reprojection_jacobian(in_camera, measured, inputs["K"])
+        _, robust = huber(r.square().sum(dim=-1), measured.chi2_threshold)
+        weighted = J.mT * (robust * influence)[..., None, None]
+        H, g = (weighted @ J).sum(dim=1), (weighted @ r[..., None]).sum(dim=1)[..., 0]
+        T_cw = se3_exp(-torch.linalg.solve(H, g)) @ T_cw
+    torch.testing.assert_close(refined.T_cw, T_cw, rtol=0, atol=1e-7)
+    (unrolled,) = torch.autograd.grad((projection * T_cw).sum(), weights)
+    torch.testing.assert_close(implicit, unrolled, rtol=1e-4, atol=1e-9)
+
+
+def test_memory_of_the_gradient_does_not_grow_with_the_iterations() -> None:
+    inputs = clean_view()
+    weights = inputs.pop("weights").requires_grad_()
+    few, many = (
+        refine_pose(**inputs, weights=weights, rounds=rounds, iterations=iterations, tolerance=0.0)
+        for rounds, iterations in ((1, 1), (8, 50))
+    )
+    assert count_graph_nodes(few.T_cw) == count_graph_nodes(many.T_cw) < 200
+
+
+def test_prediction_and_outliers_have_no_gradient() -> None:
+    T_cw, points, measured, correct = measure_landmarks(100, outliers=0.2)
+    start, uv = perturb(T_cw).requires_grad_(), measured.uv.clone().requires_grad_()
+    refined = refine_pose(start, points, K=CAMERA.K, **vars(measured) | {"uv": uv}, rounds=12)
+    gradients = torch.autograd.grad(refined.T_cw.sum(), (start, uv), allow_unused=True)
+    assert gradients[0] is None and gradients[1][refined.inliers].any(dim=1).all()
+    assert not gradients[1][~refined.inliers].any() and (~refined.inliers & ~correct).any()
+    by_transform = torch.func.grad(lambda T: refine_pose(T, points, uv, CAMERA.K).T_cw.sum())(perturb(T_cw))
+    assert torch.equal(by_transform, torch.zeros(4, 4, dtype=torch.float64))
+
+
+def test_gradient_mode_does_not_change_the_result() -> None:
+    inputs = camera_inputs.view(3, 40, torch.float64)
+    plain = refine_pose(**inputs)
+    tracked = refine_pose(**inputs | {"weights": inputs["weights"].requires_grad_()})
+    for one, other in zip(tracked, plain, strict=True):
+        torch.testing.assert_close(one.detach(), other, rtol=1e-9, atol=1e-9)
+
+
+def test_gradients_at_exact_measurements_are_finite() -> None:
+    """All residuals vanish."""
+    inputs = clean_view()
+    in_camera = inputs["points"] @ inputs["T_cw"][..., :3, :3].mT + inputs["T_cw"][..., None, :3, 3]
+    uv = CAMERA.project(in_camera).requires_grad_()
+    refined = refine_pose(inputs["T_cw"], inputs["points"], uv, CAMERA.K, 1 / in_camera[..., 2], rounds=1)
+    (gradient,) = torch.autograd.grad(refined.T_cw.square().sum() + refined.chi2.sum(), uv)
+    assert gradient.isfinite().all() and gradient.any()
+
+
+@pytest.mark.parametrize("transform", [torch.func.jacrev, torch.func.jacfwd])
+def test_transforms_give_the_gradient(transform: Callable[..., Any]) -> None:
+    inputs = clean_view()
+    uv = inputs.pop("uv")
+    jacobian = transform(lambda uv: refine_pose(uv=uv, **inputs, **CONVERGED).T_cw)(uv)
+    expected = torch.autograd.functional.jacobian(lambda uv: refine_pose(uv=uv, **inputs, **CONVERGED).T_cw, uv)
+    torch.testing.assert_close(jacobian, expected, rtol=1e-5, atol=1e-9)
+
+
+# ---------------------------------------------------------------- training
+
+
+def test_weights_of_features_are_learnt_through_the_poses_of_a_batch() -> None:
+    """A quarter of the features is inaccurate; only the first number of their descriptors tells so."""
+    torch.manual_seed(0)
+    frames = camera_inputs.view(32, 50, torch.float64) | {"weights": None, "valid": None}
+    true = refine_pose(**frames).T_cw
+    descriptors = torch.randn(32, 50, 4, dtype=torch.float64)
+    frames["uv"] += 5 * torch.randn(32, 50, 2) * (descriptors[..., :1] > 0.7)
+
+    network = torch.nn.Sequential(torch.nn.Linear(4, 1), torch.nn.Sigmoid()).double()
+    optimiser, losses = torch.optim.Adam(network.parameters(), lr=0.2), []
+    for _ in range(30):
+        refined = refine_pose(**frames | {"weights": network(descriptors)[..., 0]}, rounds=1)
+        losses.append(se3_log(refined.T_cw @ invert(true)).square().sum())
+        optimiser.zero_grad()
+        losses[-1].backward()
+        optimiser.step()
+    assert losses[-1] < 0.5 * losses[0]
+    assert network[0].weight[0, 0] < -3 * network[0].weight[0, 1:].abs().max()
+
+
+def test_example_of_the_documentation_runs() -> None:
+    finder, runner = doctest.DocTestFinder(recurse=False), doctest.DocTestRunner(verbose=False)
+    for example in finder.find(refine_pose, "refine_pose", globs={}):
+        runner.run(example)
+    assert runner.summarize(verbose=False) == (0, 9)

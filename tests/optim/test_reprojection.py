@@ -18,7 +18,7 @@ def test_convention_residuals_are_projection_minus_measurement() -> None:
         inverse_depth_sigma=0.1,
     )
     points = torch.tensor([[0.01, 0.02, 1.0]] * 2, dtype=torch.float64)
-    residuals = reprojection_residuals(points, measured, CAMERA)
+    residuals = reprojection_residuals(points, measured, CAMERA.K)
     expected = [[535.4 * 0.01 / 2, 539.2 * 0.02 / 2, 0.5 / 0.1], [535.4 * 0.01 / 2, 539.2 * 0.02 / 2, 0.0]]
     torch.testing.assert_close(residuals, torch.tensor(expected, dtype=torch.float64))
 
@@ -28,8 +28,8 @@ def test_jacobian_equals_autograd() -> None:
 
     def residuals(xi: Tensor) -> Tensor:
         T = se3_exp(xi) @ T_cw
-        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA)
+        return reprojection_residuals(points @ T[:3, :3].T + T[:3, 3], measured, CAMERA.K)
 
     expected = torch.autograd.functional.jacobian(residuals, torch.zeros(6, dtype=torch.float64))
-    jacobian = reprojection_jacobian(points @ T_cw[:3, :3].T + T_cw[:3, 3], measured, CAMERA)
+    jacobian = reprojection_jacobian(points @ T_cw[:3, :3].T + T_cw[:3, 3], measured, CAMERA.K)
     torch.testing.assert_close(jacobian, expected, rtol=1e-10, atol=1e-8)

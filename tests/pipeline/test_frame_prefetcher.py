@@ -90,7 +90,8 @@ def test_number_of_frames_read_ahead_is_limited(demo: RGBDSequence, ahead: bool)
             slam.track(preprocessed)
             assert preprocessed.frame.index == tracked
             assert len(read) <= tracked + 1 + ahead * PREFETCHED_FRAMES
-            assert set(preprocessed.times) == {"read", "segmentation", "depth", "features"}
+            times = {**preprocessed.read_times, **preprocessed.segmentation.times, **preprocessed.extraction.times}
+            assert set(times) == {"read", "segmentation", "depth", "features"}
     assert read == list(range(FRAMES))
 
 

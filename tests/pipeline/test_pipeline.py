@@ -50,7 +50,7 @@ def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_
     pipeline = make_pipeline(Wall(broken=broken))
     record = pipeline()
     assert record.failure is not None and "truncated" in record.failure
-    evaluation = write_results(tmp_path, pipeline)
+    evaluation = write_results(tmp_path, pipeline, pipeline.flush())
     lines = (tmp_path / "trajectory.txt").read_text().splitlines()
     assert len(lines) == broken
     assert (evaluation is not None) == (broken >= 3)
@@ -63,7 +63,7 @@ def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_
 def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> None:
     pipeline = make_pipeline(Wall(interrupted=4))
     assert pipeline().failure == f"interrupted after 4 of {FRAMES} frames"
-    write_results(tmp_path, pipeline)
+    write_results(tmp_path, pipeline, pipeline.flush())
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
 
 

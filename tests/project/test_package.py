@@ -36,12 +36,25 @@ LAYERS = (
         "tracking",
         "backend",
         "reconstruction",
+        "occupancy",
         "evaluation",
         "calibration",
-        "frame_result",
     ),
-    "stage_checks",
-    *("slam", "pipeline", "viz", "runs", "batch", "cli", "run", "__main__"),
+    *(
+        "calibration",
+        "frame_result",
+        "stage_checks",
+        "slam",
+        "live",
+        "pipeline",
+        "viz",
+        "export",
+        "runs",
+        "batch",
+        "cli",
+        "run",
+        "__main__",
+    ),
 )
 """Folders and modules of the package's root, from low to high: a layer imports only from itself and lower layers."""
 

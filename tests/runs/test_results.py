@@ -18,6 +18,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import evaluate
+from v3d_torch.occupancy.occupancy_io import load_occupancy
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
 
@@ -31,7 +32,7 @@ def run() -> Pipeline:
 @pytest.fixture(scope="module")
 def results(run: Pipeline, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results") / "new" / "folder"
-    write_results(folder, run)
+    write_results(folder, run, run.flush())
     return folder
 
 
@@ -39,7 +40,7 @@ def test_all_documented_files_are_written(results: Path) -> None:
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
     assert names == {
         *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json"),
-        *("frames.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+        *("frames.parquet", "states.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
         *("figures/trajectory.png", "figures/masks.png", "figures/clusters.png"),  # a single object has no votes
     }
 
@@ -145,12 +146,25 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
     config, with_mesh = run.slam.config, load_config(overrides=["dense_map.mesh.enabled=true"])
     try:
         run.slam.config = with_mesh
-        write_results(tmp_path, run)
+        write_results(tmp_path, run, run.flush())
     finally:
         run.slam.config = config
     mesh = plyfile.PlyData.read(tmp_path / "mesh.ply")
     assert np.abs(np.asarray(mesh["vertex"]["z"]) - WALL).max() < 0.02
     assert mesh["face"].count > 1000 and mesh["vertex"]["red"].std() > 10
+
+
+def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:
+    assert not {"occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml"} & {path.name for path in results.iterdir()}
+    run = run_along_wall("occupancy.enabled=true")
+    write_results(tmp_path, run, run.flush())
+    assert (tmp_path / "trajectory.txt").read_bytes() == (results / "trajectory.txt").read_bytes()
+    stored, wall = load_occupancy(tmp_path / "occupancy.npz"), torch.tensor([[0.0, 0.0, WALL]])
+    assert stored.map.distance(wall - torch.tensor([0.0, 0.0, 0.5])).item() == pytest.approx(0.5, abs=0.05)
+    assert (stored.map.occupied_points[:, 2] - WALL).abs().max() < 0.05
+    assert (tmp_path / "occupancy.bt").read_bytes().startswith(b"# Octomap OcTree binary file\n")
+    assert stored.floor is None and not (tmp_path / "map.yaml").exists()  # a wall is no floor
+    assert cv2.imread(str(tmp_path / "figures" / "occupancy.png")) is not None
 
 
 def test_figures_are_images_with_content(results: Path) -> None:
@@ -164,7 +178,7 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
     without_truth = Pipeline(Wall(), run.slam)
     without_truth.sequence.groundtruth = None  # type: ignore[misc]
     without_truth.record = replace(run.record)
-    assert write_results(tmp_path, without_truth) is None
+    assert write_results(tmp_path, without_truth, without_truth.flush()) is None
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert "rmse" not in (metrics.get("ate") or {})
     assert metrics["frames"] == FRAMES
@@ -175,10 +189,11 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
 def test_results_that_cannot_be_written_raise_an_error(run: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"file/trajectory\.txt: cannot be written"):
-        write_results(tmp_path / "file", run)
+        write_results(tmp_path / "file", run, run.flush())
 
 
 def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> None:
-    write_results(tmp_path, run_along_wall())
+    again = run_along_wall()
+    write_results(tmp_path, again, again.flush())
     for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "dynamics.parquet"):
         assert (tmp_path / name).read_bytes() == (results / name).read_bytes(), name

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.segmentation.upright import UprightSegmenter
+from v3d_torch.segmentation.upright import UprightSegmenter, up_votes
 from v3d_torch.types import (
     Instances,
     PoseAwareSegmenter,
@@ -130,6 +131,22 @@ def test_frame_without_a_pose_keeps_its_orientation_and_gives_no_vote() -> None:
     assert torch.equal(upright.state_dict()["up"], before["up"])
 
 
+@pytest.mark.parametrize("start", range(4))
+def test_measured_gravity_gives_the_up_direction_from_the_first_frame_on(start: int) -> None:
+    """No frame needs a search, also if the network never detects anything upright, and if the camera rolls later."""
+    network = Network(confident=0.9, doubtful=0.9)
+    upright = UprightSegmenter(network)
+    angle = math.radians(90 * start + 20)  # 20 degrees off a quarter turn
+    gravity = -torch.tensor([math.sin(angle), -math.cos(angle), 0.0], dtype=torch.float64)
+    first = replace(make_frame(0, start), gravity=gravity)
+    assert upright(first).labels.tolist() == [0]  # without a pose
+    assert upright.segment_with_pose(first, IDENTITY).labels.tolist() == [0]
+    for index, degrees in enumerate((0, 90, 180), start=1):
+        frame = make_frame(index, (start - round(degrees / 90)) % 4)
+        assert upright.segment_with_pose(frame, rolled(degrees)).labels.tolist() == [0]
+    assert len(network.sizes) == 5
+
+
 def test_segmenter_that_loads_a_state_continues_with_the_same_results() -> None:
     first, second = Network(), Network()
     upright, loaded = UprightSegmenter(first), UprightSegmenter(second)
@@ -198,3 +215,11 @@ def test_methods_forwarded_by_a_proxy_are_used() -> None:
     assert segment_frame(proxy, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
     state = segmenter_state_of(proxy)
     assert state is not None and state["calls"] == 1
+
+
+def test_votes_are_read_from_the_state_of_upright_segmenters_only() -> None:
+    upright = UprightSegmenter(Network())
+    upright.segment_with_pose(make_frame(0, 1), IDENTITY)
+    votes = up_votes(segmenter_state_of(upright))
+    assert votes is not None and votes.norm() > 0.5 and votes[0].abs() > votes[1].abs()
+    assert up_votes(None) is None and up_votes({"up": 3}) is None and up_votes({}) is None

@@ -226,3 +226,19 @@ def test_landmark_ids_are_those_of_the_last_found_frame() -> None:
     camera.append(0.0, frame_pose(EYE, landmarks=(5, -1, 2)), None)
     camera.append(0.1, frame_pose(EYE, TrackingStatus.LOST, landmarks=(-1, -1)), None)
     assert camera.poses.observed_landmarks.tolist() == [5, 2]
+
+
+def test_poses_of_chosen_frames_follow_their_keyframes() -> None:
+    camera, own = Camera(), keyframe(true_pose(0))
+    assert camera.poses.keyframe is None and camera.poses.poses_of([]).shape == (0, 4, 4)
+    camera.append(0.0, frame_pose(true_pose(0)), None, None, own)
+    for index in range(1, 6):
+        camera.append(index / 10, frame_pose(true_pose(index)), own, STEP)
+    assert camera.poses.keyframe is own
+    frames = [5, 0, 3]
+    expected = torch.stack([true_pose(index) for index in frames])
+    torch.testing.assert_close(camera.poses.poses_of(frames), expected, rtol=0, atol=1e-9)
+    own.T_cw = own.T_cw @ STEP
+    moved = invert(camera.trajectory().T_wc)[frames]
+    torch.testing.assert_close(camera.poses.poses_of(frames), moved, rtol=0, atol=1e-9)
+    torch.testing.assert_close(moved, expected @ STEP, rtol=0, atol=1e-9)

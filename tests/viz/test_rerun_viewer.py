@@ -32,11 +32,13 @@ from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.frame_objects import MotionState
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, level_frame
 from v3d_torch.pipeline import NULL_VIEWER, Pipeline
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 from v3d_torch.viz.rerun.objects import CLASS_IDS
+from v3d_torch.viz.rerun.occupancy import log_floor
 from v3d_torch.viz.rerun.stream import open_stream
 from v3d_torch.viz.rerun.viewer import RerunViewer
 from v3d_torch.viz.viewer import make_viewer
@@ -97,7 +99,7 @@ class RunLog:
 
 CONFIG = (
     *("mapping.max_keyframe_interval=5", "objects.free_space.enabled=false"),
-    *("objects.voting.baselines=[0.3]", "objects.chamfer.baseline=0.0"),
+    *("objects.voting.baselines=[0.3]", "objects.chamfer.baseline=0.0", "occupancy.enabled=true"),
 )
 """A keyframe every five frames, and the paper's voting, over a baseline so long that Chamfer distances are measured
 before an object is voted dynamic."""
@@ -138,7 +140,7 @@ def test_recording_has_all_entities(recorded: tuple[Recording, RunLog, Pipeline]
     stages = [stage for stage in pipeline.slam.timer.seconds if stage != "viewer"]
     assert recording.entities >= {
         "/world",
-        *(f"/world/{name}" for name in (*world, "map/landmarks", "map/keyframes", "groundtruth")),
+        *(f"/world/{name}" for name in (*world, "map/landmarks", "map/keyframes", "groundtruth", "occupancy")),
         *(f"/world/camera/image{name}" for name in image),
         *(f"/seconds/{stage}" for stage in stages),
         *("/votes/1", "/votes/2", "/votes/3", "/chamfer/1", "/frame_summary", "/log"),
@@ -221,6 +223,26 @@ def test_votes_are_red_lines_between_centroids(recorded: tuple[Recording, RunLog
         votes = [recording.at(f"/votes/{obj.id}")[index]["scalars"][0] for obj in result.objects]
         assert votes == [obj.votes for obj in result.objects]
     assert drawn > 0
+
+
+def test_occupied_voxels_are_logged(recorded: tuple[Recording, RunLog, Pipeline]) -> None:
+    recording, _, pipeline = recorded
+    rows, mapper = recording.all("/world/occupancy"), pipeline.slam.occupancy
+    assert mapper is not None and len(rows) > 2
+    np.testing.assert_allclose(rows[-1]["positions"], mapper.map.occupied_points, atol=1e-6)
+    assert rows[-1]["radii"] == [pytest.approx(0.025)] and len(rows[-1]["colors"]) == len(rows[-1]["positions"])
+
+
+def test_free_cells_are_logged_on_the_floor(tmp_path: Path) -> None:
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    states = torch.tensor([[0, 1, -1], [0, 0, 1]], dtype=torch.int8)
+    stream = open_stream(live=False, file=tmp_path / "floor.rrd")
+    log_floor(stream, OccupancyGrid(states, 0.1, (1.0, -2.0), level_frame(up, -1.5)))
+    stream.disconnect()
+    (row,) = Recording(tmp_path / "floor.rrd").all("/world/occupancy/floor")
+    # x of the grid is z of the world, y is -x; the floor is 1.5 m below the camera.
+    expected = [(1.95, 1.5, 1.05), (1.85, 1.5, 1.05), (1.85, 1.5, 1.15)]
+    np.testing.assert_allclose(row["positions"], expected, atol=1e-6)
 
 
 def test_map_and_poses_are_logged_again_after_each_keyframe(recorded: tuple[Recording, RunLog, Pipeline]) -> None:

@@ -1,8 +1,7 @@
 """Pose-graph optimisation: poses that fit measured relative poses best (paper, Sec. III-E).
 
-Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. PyPose
-provides Lie groups and their Jacobians. The normal equations are sparse, with 6x6 blocks for poses joined by an edge,
-and are solved by SciPy's SuperLU.
+Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. The
+normal equations are sparse, with 6x6 blocks for poses joined by an edge.
 
 Convention: poses ``T_wc`` are perturbed on the right, ``T_wc @ exp(xi)``, with ``xi = [translation, rotation]`` in the
 camera frame; the error of an edge is ``log(T_ij^-1 T_wi^-1 T_wj)``, in the same order.
@@ -10,149 +9,272 @@ camera frame; the error of an edge is ``log(T_ij^-1 T_wi^-1 T_wj)``, in the same
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
-import pypose as pp
-import scipy.sparse
-import scipy.sparse.linalg
 import torch
-from pypose.lietensor.operation import SE3_Adj, se3_Jl_inv
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
+from v3d_torch.optim.block_system import solve_block_system
+from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
+from v3d_torch.runtime.batches import common_batch, fill_padding
 
-
-@dataclass(frozen=True)
-class PoseGraphResult:
-    """Result of a pose-graph optimisation.
-
-    Attributes:
-        T_wc: Camera-to-world poses, float64, shape :math:`(N, 4, 4)`; fixed poses are bit-identical to the input.
-        cost_before: Sum of (robust) squared errors at the initial poses.
-        cost_after: Sum of (robust) squared errors at the optimised poses.
-        iterations: Number of Levenberg-Marquardt steps tried.
-        converged: True if the optimisation stopped because the cost no longer changed.
-    """
-
-    T_wc: Tensor
-    cost_before: float
-    cost_after: float
-    iterations: int
-    converged: bool
-
-
-@dataclass(frozen=True)
-class _Edges:
-    """Measured relative poses, with the indices i and j of the poses that each of them joins."""
-
-    i: Tensor
-    j: Tensor
-    T_ji: pp.LieTensor
-    information: Tensor
-
-
-_NormalEquations = tuple[scipy.sparse.csc_array, Tensor]
-"""J^T W J and J^T W r over the free poses, six unknowns each."""
+if TYPE_CHECKING:
+    import pypose as pp
 
 _REGULARISATION = 1e-9
 """Added to the diagonal of the normal equations, so that they have a solution for poses without any edge; negligible
 beside the information of an edge."""
 
 
-@torch.no_grad()
+class PoseGraphResult(NamedTuple):
+    """Result of a pose-graph optimisation.
+
+    Attributes:
+        T_wc: Camera-to-world poses, shape :math:`(*, N, 4, 4)`, or PyPose's SE3, shape :math:`(*, N)`, if the initial
+            poses had that type; fixed poses are bit-identical to the input.
+        cost_before: Sum of the weighted (robust) squared errors at the initial poses, shape :math:`(*)`.
+        cost_after: Sum of the weighted (robust) squared errors at the optimised poses, shape :math:`(*)`.
+        iterations: Number of Levenberg-Marquardt steps tried, int64, shape :math:`(*)`.
+        converged: True if the optimisation stopped because the cost no longer changed, bool, shape :math:`(*)`.
+    """
+
+    T_wc: Tensor
+    cost_before: Tensor
+    cost_after: Tensor
+    iterations: Tensor
+    converged: Tensor
+
+
 def optimise_pose_graph(
     T_wc: Tensor,
     edges: Tensor,
     T_ij: Tensor,
     information: Tensor | None = None,
     fixed: Tensor | None = None,
+    weights: Tensor | None = None,
+    valid: Tensor | None = None,
     *,
     iterations: int = 50,
+    tolerance: float = 1e-6,
     robust: float | None = None,
 ) -> PoseGraphResult:
-    r"""Minimise :math:`\sum_{ij} \rho(e_{ij}^T \Omega_{ij} e_{ij})` over the free poses.
+    r"""Minimise the errors of a pose graph over the free poses.
+
+    .. math::
+        \min_{\{T_{wi}\}} \sum_{(i, j)} w_{ij}\, \rho( e_{ij}^\top \Omega_{ij} e_{ij} ), \qquad
+        e_{ij} = \log\left( T_{ij}^{-1}\, T_{wi}^{-1}\, T_{wj} \right)
+
+    The result is differentiable in the measured poses, information, weights and fixed poses, by the implicit function
+    theorem: memory does not grow with the iterations, but with the square of N. The Hessian is that of the robust cost,
+    with the dependence of the robust weights on the errors. The derivatives are as accurate as the optimum: train with
+    a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
+
+    Grisetti et al., A Tutorial on Graph-Based SLAM, 2010; Gould et al., On Differentiating Parameterized Argmin and
+    Argmax Problems, 2016.
 
     Args:
-        T_wc: Initial camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
-        edges: Indices (i, j) of the poses joined by each measurement, i and j different, int64, shape :math:`(E, 2)`.
-        T_ij: Measured pose of camera j in camera i, ``T_wi^-1 T_wj``, float64, shape :math:`(E, 4, 4)`.
-        information: Inverse covariances of the errors, float64, shape :math:`(E, 6, 6)`; the identity by default.
-        fixed: Mask of the poses that are not optimised, bool, shape :math:`(N,)`; only the first by default.
+        T_wc: Initial camera-to-world poses, shape :math:`(*, N, 4, 4)`, or PyPose's SE3 of shape :math:`(*, N)`. All
+            inputs are floating point except edges and masks, and computed with in float64.
+        edges: Indices (i, j) of the poses joined by each measurement, i and j different, int64, shape
+            :math:`(*, E, 2)`.
+        T_ij: Measured pose of camera j in camera i, ``T_wi^-1 T_wj``, shape :math:`(*, E, 4, 4)`, or PyPose's SE3 of
+            shape :math:`(*, E)`.
+        information: Inverse covariances of the errors, shape :math:`(*, E, 6, 6)`; the identity by default.
+        fixed: Poses that stay unchanged, bool, shape :math:`(*, N)`; only the first by default. Poses that are padding
+            have no edges; they must be finite, and are returned unchanged.
+        weights: Weight of each edge, not negative, shape :math:`(*, E)`; 1 by default.
+        valid: Edges that are not padding, bool, shape :math:`(*, E)`; all by default.
         iterations: Maximum number of Levenberg-Marquardt steps.
+        tolerance: Relative change of the cost that ends the optimisation.
         robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
 
     Returns:
-        The poses of minimal cost. Poses that no path of edges joins to a fixed pose are determined only relative to
-        each other.
+        The poses of minimal cost, with the dtype of ``T_wc``. Poses that no path of edges joins to a fixed pose are
+        determined only relative to each other.
     """
-    if fixed is None:
-        fixed = torch.arange(T_wc.shape[0]) == 0
-    if information is None:
-        information = torch.eye(6, dtype=torch.float64).expand(edges.shape[0], 6, 6)
-    graph = _Edges(edges[:, 0], edges[:, 1], pp.mat2SE3(T_ij, check=False).Inv(), information)
-    free = torch.nonzero(~fixed)[:, 0]
-    found = levenberg_marquardt(
-        pp.mat2SE3(T_wc, check=False),
-        partial(_linearise, graph=graph, free=free, limit=torch.inf if robust is None else robust**2),
-        partial(_step, free=free),
-        iterations,
+    initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
+    KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
+    KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
+    KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
+    graph, start = _prepare(initial, edges, measured, information, fixed, weights, valid, robust)
+    constant, steps = graph.detach(), None
+    with torch.no_grad():
+        found = levenberg_marquardt(start.detach(), constant.linearise, constant.step, iterations, tolerance)
+    cost_after = found.cost_after
+    if needs_gradient(start, *graph):
+        steps = graph.differentiate(found.state, start)
+        cost_after, _ = graph.linearise(torch.where(graph.is_fixed, start, found.state @ se3_exp(steps)))
+    return PoseGraphResult(
+        T_wc=_move(T_wc, found.state, steps, graph.is_fixed),
+        cost_before=found.cost_before.to(T_wc.dtype),
+        cost_after=cost_after.to(T_wc.dtype),
+        iterations=found.iterations,
+        converged=found.converged,
     )
-    optimised = T_wc.index_copy(0, free, found.state.matrix()[free])
-    return PoseGraphResult(optimised, found.cost_before, found.cost_after, found.iterations, found.converged)
 
 
-def edge_errors(T_wi: pp.LieTensor, T_wj: pp.LieTensor, T_ji: pp.LieTensor) -> tuple[Tensor, Tensor, Tensor]:
+def edge_errors(T_wi: Tensor, T_wj: Tensor, T_ji: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Errors of edges and their Jacobians with respect to right perturbations of both poses.
 
     Args:
-        T_wi: Poses at the start of each edge, SE3, shape :math:`(E,)`.
-        T_wj: Poses at the end of each edge, SE3, shape :math:`(E,)`.
-        T_ji: Inverse of the measured relative pose of each edge, SE3, shape :math:`(E,)`.
+        T_wi: Poses at the start of each edge, shape :math:`(..., E, 4, 4)`.
+        T_wj: Poses at the end of each edge, shape :math:`(..., E, 4, 4)`.
+        T_ji: Inverse of the measured relative pose of each edge, shape :math:`(..., E, 4, 4)`.
 
     Returns:
-        Errors, shape :math:`(E, 6)`, and their Jacobians with respect to pose i and pose j, each of shape
-        :math:`(E, 6, 6)`.
+        Errors, shape :math:`(..., E, 6)`, and their Jacobians with respect to pose i and pose j, each of shape
+        :math:`(..., E, 6, 6)`.
     """
-    predicted_T_ij = T_wi.Inv() @ T_wj
-    error = (T_ji @ predicted_T_ij).Log().tensor()
-    J_j = se3_Jl_inv(-error)  # log(E exp(xi)) = log(E) + Jr^-1(log(E)) xi, and Jr(e) = Jl(-e)
-    J_i = -J_j @ SE3_Adj(predicted_T_ij.Inv().tensor())  # exp(-xi) T = T exp(-Ad(T^-1) xi)
+    predicted_T_ij = invert(T_wi) @ T_wj
+    error = se3_log(T_ji @ predicted_T_ij)
+    J_j = left_jacobian_inverse(-error)  # log(E exp(xi)) = log(E) + Jr^-1(log(E)) xi, and Jr(e) = Jl(-e)
+    J_i = -J_j @ adjoint(invert(predicted_T_ij))  # exp(-xi) T = T exp(-Ad(T^-1) xi)
     return error, J_i, J_j
 
 
-def _linearise(T_wc: pp.LieTensor, graph: _Edges, free: Tensor, limit: float) -> tuple[float, _NormalEquations]:
-    """Cost and normal equations at given poses; ``limit`` is the squared error from which Huber's kernel is linear."""
-    error, J_i, J_j = edge_errors(T_wc[graph.i], T_wc[graph.j], graph.T_ji)
-    squared = torch.einsum("ea,eab,eb->e", error, graph.information, error)
-    costs, weights = huber(squared, limit)
+class _Graph(NamedTuple):
+    """Measured relative poses, with the indices of the poses that each of them joins."""
 
-    J = torch.cat([J_i, J_j], dim=2)  # E x 6 x 12
-    weighted = J.mT @ (weights[:, None, None] * graph.information)
-    free_index = torch.full((T_wc.shape[0],), -1)
-    free_index[free] = torch.arange(free.shape[0])
-    # Index of the unknown of each of the 12 columns of an edge; negative if the pose is fixed.
-    unknown = (6 * free_index[torch.stack([graph.i, graph.j], dim=1)][..., None] + torch.arange(6)).flatten(1)
-    size = 6 * free.shape[0]
+    edges: Tensor  # (..., E, 2)
+    T_ji: Tensor  # (..., E, 4, 4)
+    information: Tensor  # (..., E, 6, 6)
+    weights: Tensor  # (..., E)
+    fixed: Tensor  # (..., N)
+    limit: Tensor  # (), squared error from which Huber's kernel is linear
 
-    gradient = torch.zeros(size, dtype=error.dtype)
-    is_free = unknown >= 0
-    gradient.index_add_(0, unknown[is_free], (weighted @ error[..., None])[..., 0][is_free])
-    rows, columns = unknown[:, :, None].expand(-1, 12, 12), unknown[:, None, :].expand(-1, 12, 12)
-    is_free = (rows >= 0) & (columns >= 0)
-    entries = (weighted @ J)[is_free].numpy(), (rows[is_free].numpy(), columns[is_free].numpy())
-    return float(costs.sum()), (scipy.sparse.coo_array(entries, shape=(size, size)).tocsc(), gradient)
+    @property
+    def is_fixed(self) -> Tensor:
+        return self.fixed[..., None, None]
+
+    def detach(self) -> _Graph:
+        return _Graph(*(column.detach() for column in self))
+
+    def linearise(self, T_wc: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """Cost at given poses, and the blocks (..., E, 12, 12) and gradients (..., E, 12) of the edges."""
+        error, J, weights, costs = self._evaluate(self._ends(T_wc))
+        weighted = J.mT @ (weights[..., None, None] * self.information)
+        return (costs * self.weights).sum(dim=-1), (weighted @ J, (weighted @ error[..., None])[..., 0])
+
+    def step(self, T_wc: Tensor, system: tuple[Tensor, Tensor], damping: Tensor | float) -> Tensor:
+        """Poses after one damped step."""
+        xi = solve_block_system(*system, self.edges, self.fixed, damping, _REGULARISATION)
+        return torch.where(self.is_fixed, T_wc, T_wc @ se3_exp(xi))
+
+    def differentiate(self, T_wc: Tensor, initial: Tensor) -> Tensor:
+        """Steps at the optimum, zero with the derivatives by the measurements and the fixed poses of ``initial``."""
+        constant = self.detach()
+        ends = constant._ends(T_wc)
+        blocks = jacobian(lambda xi: constant._gradient(ends, xi), T_wc.new_zeros(*self.edges.shape[:-1], 12))
+        anchored = torch.where(self.is_fixed, initial, T_wc)
+        gradient = self._gradient(self._ends(anchored), None)
+        steps = solve_block_system(blocks, gradient, self.edges, self.fixed, 0.0, _REGULARISATION)
+        return zero_with_gradient(steps)
+
+    def _ends(self, T_wc: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses at both ends of each edge, (..., E, 4, 4)."""
+        i, j = (torch.take_along_dim(T_wc, end[..., None, None], dim=-3) for end in self.edges.unbind(-1))
+        return i, j
+
+    def _evaluate(self, ends: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Errors (..., E, 6), Jacobians (..., E, 6, 12), weights in the normal equations and robust costs (..., E)."""
+        error, J_i, J_j = edge_errors(*ends, self.T_ji)
+        squared = ((error[..., None, :] @ self.information)[..., 0, :] * error).sum(dim=-1)
+        costs, weights = huber(squared, self.limit)
+        return error, torch.cat([J_i, J_j], dim=-1), weights * self.weights, costs
+
+    def _gradient(self, ends: tuple[Tensor, Tensor], xi: Tensor | None) -> Tensor:
+        """Half the gradient of the cost of each edge by its unknowns, (..., E, 12), after a change by these."""
+        if xi is not None:
+            ends = ends[0] @ se3_exp(xi[..., :6]), ends[1] @ se3_exp(xi[..., 6:])
+        error, J, weights, _ = self._evaluate(ends)
+        return (J.mT @ (weights[..., None, None] * self.information) @ error[..., None])[..., 0]
 
 
-def _step(T_wc: pp.LieTensor, system: _NormalEquations, damping: float, free: Tensor) -> pp.LieTensor:
-    """Poses after one damped step."""
-    H, gradient = system
-    damped = H + scipy.sparse.diags_array(damping * H.diagonal() + _REGULARISATION)
-    # The matrix is symmetric and positive definite: use a symmetric ordering and no pivoting.
-    factors = scipy.sparse.linalg.splu(
-        damped.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+def _prepare(
+    T_wc: Tensor,
+    edges: Tensor,
+    T_ij: Tensor,
+    information: Tensor | None,
+    fixed: Tensor | None,
+    weights: Tensor | None,
+    valid: Tensor | None,
+    robust: float | None,
+) -> tuple[_Graph, Tensor]:
+    """Graph and initial poses in float64, with the batch dimensions of all inputs."""
+    batch = common_batch(T_wc.shape[:-3], edges.shape[:-2], T_ij.shape[:-3])
+    count, device = edges.shape[-2], T_wc.device
+    identity = torch.eye(6, dtype=torch.float64, device=device)
+    if fixed is None:
+        fixed = torch.arange(T_wc.shape[-3], device=device) == 0
+    if information is None:
+        information = identity.expand(count, 6, 6)
+    if weights is None:
+        weights = torch.ones(count, dtype=torch.float64, device=device)
+    T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
+    if valid is not None:
+        edges = torch.where(valid[..., None], edges, 0)
+        T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
+        information = torch.where(valid[..., None, None], information, identity)
+    graph = _Graph(
+        edges=edges.expand(*batch, count, 2),
+        T_ji=invert(T_ij).expand(*batch, count, 4, 4),
+        information=information.expand(*batch, count, 6, 6),
+        weights=fill_padding(weights, valid, 0.0).expand(*batch, count),
+        fixed=fixed.expand(*batch, T_wc.shape[-3]),
+        limit=torch.tensor(torch.inf if robust is None else robust**2, dtype=torch.float64, device=device),
     )
-    xi = torch.from_numpy(factors.solve(-gradient.numpy())).reshape(-1, 6)
-    moved = T_wc.tensor().clone()
-    moved[free] = (T_wc[free] @ pp.se3(xi).Exp()).tensor()
-    return pp.SE3(moved)
+    return graph, T_wc.to(torch.float64).expand(*batch, *T_wc.shape[-3:])
+
+
+def _is_lie_tensor(T: Tensor) -> TypeGuard[pp.LieTensor]:
+    """Check for a tensor of PyPose without importing PyPose."""
+    return hasattr(T, "ltype")
+
+
+def _move(initial: Tensor, optimum: Tensor, steps: Tensor | None, is_fixed: Tensor) -> Tensor:
+    """Optimum with its derivatives, in the type of the initial poses, whose fixed ones are kept."""
+    if _is_lie_tensor(initial):
+        import pypose as pp  # the package takes long to import, and few callers need it
+
+        T = pp.mat2SE3(optimum, check=False)
+        T = T if steps is None else T @ pp.se3(steps).Exp()
+        return pp.SE3(torch.where(is_fixed[..., 0], initial.tensor(), T.tensor().to(initial.dtype)))
+    T = optimum if steps is None else optimum @ se3_exp(steps)
+    return torch.where(is_fixed, initial, T.to(initial.dtype))
+
+
+class PoseGraphOptimiser(torch.nn.Module):
+    """:func:`optimise_pose_graph` as a module.
+
+    Args:
+        iterations: Maximum number of Levenberg-Marquardt steps.
+        tolerance: Relative change of the cost that ends the optimisation.
+        robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
+    """
+
+    def __init__(self, iterations: int = 50, tolerance: float = 1e-6, robust: float | None = None) -> None:
+        super().__init__()
+        self.iterations = iterations
+        self.tolerance = tolerance
+        self.robust = robust
+
+    def forward(
+        self,
+        T_wc: Tensor,
+        edges: Tensor,
+        T_ij: Tensor,
+        information: Tensor | None = None,
+        fixed: Tensor | None = None,
+        weights: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> PoseGraphResult:
+        """Optimise poses :math:`(*, N, 4, 4)` by E edges; see :func:`optimise_pose_graph`."""
+        return optimise_pose_graph(
+            *(T_wc, edges, T_ij, information, fixed, weights, valid),
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+            robust=self.robust,
+        )

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,12 +19,13 @@ from torch import Tensor
 from v3d_torch.calibration.parameters import DERIVATIVE_STEPS, LIMITS, get_values, with_values
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.mapping.bundle_adjustment import Observations, bundle_adjust
-from v3d_torch.mapping.map_observations import select_observations
+from v3d_torch.mapping.bundle_adjustment import bundle_adjust
+from v3d_torch.mapping.bundle_problem import prepare_bundle
+from v3d_torch.mapping.map_observations import MapObservations, select_observations
 from v3d_torch.mapping.map_tables import MapTables
-from v3d_torch.mapping.reduced_cost import reduced_cost_derivatives
+from v3d_torch.mapping.reduced_cost import differentiate_minimum_cost
 from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt
-from v3d_torch.optim.reprojection import perspective, whiten
+from v3d_torch.optim.reprojection import reprojection_residuals
 
 _MAX_STEPS = 20
 """Maximum number of steps of the parameters."""
@@ -41,8 +43,7 @@ _NORMAL_MAD = 0.6745
 """Median absolute value of a standard normal distribution."""
 
 
-@dataclass(frozen=True)
-class AdjustedMap:
+class AdjustedMap(NamedTuple):
     """Poses and points adjusted for given parameters, and the derivatives of the minimum cost at these parameters.
 
     Attributes:
@@ -90,26 +91,25 @@ class SelfCalibration:
     ) -> None:
         active = torch.tensor([keyframe.index for keyframe in tables.active_keyframes], dtype=torch.int64)
         window = active if max_keyframes is None else active[-max_keyframes:]
-        selected = select_observations(tables, window, config, with_neighbours=False)
+        self.observations = select_observations(tables, window, config, with_neighbours=False)
+        keyframes, landmarks = self.observations.keyframes, self.observations.landmarks
         self.given = camera if given is None else given
         self._camera, self._readout = camera, tables.readout.seconds
         self._given_readout = self._readout if self.given.readout is None else self.given.readout
-        self._fixed = torch.arange(len(selected.keyframes)) == 0  # the gauge
-        self._pixel = camera.distort(selected.observations.uv)  # in the recorded image
-        self._readout_jacobian = selected.readout_jacobian
-        self.observations = selected.observations
-        self.T_cw, self.points = tables.T_cw[selected.keyframes], tables.landmarks["point"][selected.landmarks]
+        self._fixed = torch.arange(len(keyframes)) == 0  # the gauge
+        self._pixel = camera.distort(self.observations.measured.uv)  # in the recorded image
+        self._readout_jacobian = tables.observations["readout_jacobian"].index_select(0, self.observations.rows)
+        self.T_cw, self.points = tables.T_cw[keyframes], tables.landmarks["point"][landmarks]
         for _ in range(2):
-            adjusted = bundle_adjust(
-                self.T_cw, self.points, self.observations, camera, self._fixed, _MAX_STEPS, _TOLERANCE
-            )
+            arguments = self.observations.arguments(camera.K, self._fixed)
+            adjusted = bundle_adjust(self.T_cw, self.points, **arguments, iterations=_MAX_STEPS, tolerance=_TOLERANCE)
             self.T_cw, self.points = adjusted.T_cw, adjusted.points
             self.observations = self._with_estimated_noise()
 
     @property
     def residual_count(self) -> int:
         """Number of residuals: two pixel coordinates of each observation, and its depth if it was measured."""
-        return 2 * len(self.observations.uv) + int((self.observations.inverse_depth > 0).sum())
+        return 2 * len(self.observations) + int((self.observations.measured.inverse_depth > 0).sum())
 
     @property
     def unknown_count(self) -> int:
@@ -131,10 +131,10 @@ class SelfCalibration:
             Values, float64, shape :math:`(C,)`, and the map adjusted for them.
         """
 
-        def linearise(state: State) -> tuple[float, AdjustedMap]:
+        def linearise(state: State) -> tuple[Tensor, AdjustedMap]:
             return self.linearise(names, *state)
 
-        def step(state: State, at: AdjustedMap, damping: float) -> State:
+        def step(state: State, at: AdjustedMap, damping: Tensor) -> State:
             return _damped_step(names, state[0], at, damping), at.T_cw, at.points
 
         values = self.given_values(names) if start is None else start
@@ -143,7 +143,7 @@ class SelfCalibration:
 
     def linearise(
         self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor
-    ) -> tuple[float, AdjustedMap]:
+    ) -> tuple[Tensor, AdjustedMap]:
         """Adjust poses and points for given values of parameters, and differentiate the minimum cost.
 
         Args:
@@ -153,66 +153,68 @@ class SelfCalibration:
             points: Initial points, float64, shape :math:`(P, 3)`.
 
         Returns:
-            Cost, and the adjusted map.
+            Cost, shape :math:`()`, and the adjusted map.
         """
         observations, camera = self._measured_with(names, values)
-        adjusted = bundle_adjust(T_cw, points, observations, camera, self._fixed, _INNER_STEPS, _TOLERANCE)
+        arguments = observations.arguments(camera.K, self._fixed)
+        adjusted = bundle_adjust(T_cw, points, **arguments, iterations=_INNER_STEPS, tolerance=_TOLERANCE)
         T_cw, points = adjusted.T_cw, adjusted.points
-        jacobian = self.jacobian(names, values, T_cw, points)
-        derivatives = reduced_cost_derivatives(T_cw, points, observations, camera, self._fixed, jacobian)
+        problem, state = prepare_bundle(T_cw, points, **arguments, weights=None, valid=None)
+        derivatives = differentiate_minimum_cost(problem, state, self.jacobian(names, values, T_cw, points))
         return adjusted.cost_after, AdjustedMap(T_cw, points, *derivatives)
 
     def residuals(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
-        """Whitened residuals of pixels and inverse depth, float64, shape :math:`(M, 3)`."""
+        """Whitened residuals of pixels and inverse depth, float64, shape :math:`(3, M)`."""
         return _whitened_residuals(*self._measured_with(names, values), T_cw, points)
 
     def jacobian(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
-        """Derivatives of the whitened residuals by the parameters, by central differences, shape :math:`(M, 3, C)`."""
-        columns = []
+        """Derivatives of the whitened residuals by the parameters, by central differences, shape :math:`(C, 3, M)`."""
+        rows = []
         for index, name in enumerate(names):
             step = torch.zeros_like(values).index_fill_(0, torch.tensor(index), DERIVATIVE_STEPS[name])
             ahead, behind = (self.residuals(names, values + sign * step, T_cw, points) for sign in (1, -1))
-            columns.append((ahead - behind) / (2 * DERIVATIVE_STEPS[name]))
-        return torch.stack(columns, dim=-1)
+            rows.append((ahead - behind) / (2 * DERIVATIVE_STEPS[name]))
+        return torch.stack(rows)
 
-    def _measured_with(self, names: Sequence[str], values: Tensor) -> tuple[Observations, PinholeCamera]:
-        """Observations as they would have been measured with other parameters, and a camera with these parameters."""
+    def _measured_with(self, names: Sequence[str], values: Tensor) -> tuple[MapObservations, PinholeCamera]:
+        """Observations as they would have been with other parameters, and a camera with these parameters."""
         of_name = dict(zip(names, values.tolist(), strict=True))
         readout = of_name.pop("readout", self._given_readout)
         camera = with_values(self.given, of_name)
         uv, scale = _undistort_with_scale(camera, self._pixel)
-        measured = self.observations.inverse_depth
+        measured = self.observations.measured
         change = camera.inverse_depth_offset - self._camera.inverse_depth_offset
-        observations = replace(
-            self.observations,
+        changed = replace(
+            measured,
             uv=uv + (readout - self._readout) * self._readout_jacobian,
-            inverse_depth=torch.where(measured > 0, measured + change, 0.0),
-            pixel_sigma=scale * self.observations.pixel_sigma,
+            inverse_depth=torch.where(measured.inverse_depth > 0, measured.inverse_depth + change, 0.0),
+            pixel_sigma=scale * measured.pixel_sigma,
         )
-        return observations, camera
+        return replace(self.observations, measured=changed), camera
 
-    def _with_estimated_noise(self) -> Observations:
+    def _with_estimated_noise(self) -> MapObservations:
         """The observations with standard deviations that agree with their residuals in the given map."""
-        observations = self.observations
-        residuals = _whitened_residuals(observations, self._camera, self.T_cw, self.points).abs()
-        depth = residuals[observations.inverse_depth > 0, 2]
+        measured = self.observations.measured
+        residuals = _whitened_residuals(self.observations, self._camera, self.T_cw, self.points).abs()
+        depth = residuals[2, measured.inverse_depth > 0]
         freedom = math.sqrt(self.residual_count / max(self.residual_count - self.unknown_count, 1))
         pixel, inverse_depth = (
             float(errors.median()) * freedom / _NORMAL_MAD if len(errors) else 1.0
-            for errors in (residuals[:, :2].flatten(), depth)
+            for errors in (residuals[:2].flatten(), depth)
         )
-        return replace(
-            observations,
-            pixel_sigma=pixel * observations.pixel_sigma,
-            inverse_depth_sigma=inverse_depth * observations.inverse_depth_sigma,
+        estimated = replace(
+            measured,
+            pixel_sigma=pixel * measured.pixel_sigma,
+            inverse_depth_sigma=inverse_depth * measured.inverse_depth_sigma,
         )
+        return replace(self.observations, measured=estimated)
 
 
-def _whitened_residuals(observations: Observations, camera: PinholeCamera, T_cw: Tensor, points: Tensor) -> Tensor:
-    """Whitened residuals of all observations, float64, shape :math:`(M, 3)`."""
+def _whitened_residuals(observations: MapObservations, camera: PinholeCamera, T_cw: Tensor, points: Tensor) -> Tensor:
+    """Whitened residuals of all observations, (3, M)."""
     T = T_cw[observations.pose]
     in_camera = (T[:, :3, :3] @ points[observations.point, :, None])[..., 0] + T[:, :3, 3]
-    return whiten(observations, camera).residuals(perspective(in_camera.T)).T
+    return reprojection_residuals(in_camera, observations.measured, camera.K).mT
 
 
 def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor, Tensor]:
@@ -232,7 +234,7 @@ def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor,
     return uv, determinant.abs().sqrt() / _SCALE_STEP
 
 
-def _damped_step(names: Sequence[str], values: Tensor, at: AdjustedMap, damping: float) -> Tensor:
+def _damped_step(names: Sequence[str], values: Tensor, at: AdjustedMap, damping: Tensor) -> Tensor:
     """Values of the parameters after a damped Gauss-Newton step, within their limits."""
     gradient, hessian = at.gradient.sum(dim=0), at.hessian.sum(dim=0)
     diagonal = damping * hessian.diagonal() + torch.finfo(torch.float64).tiny

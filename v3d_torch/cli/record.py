@@ -28,33 +28,48 @@ def main(
     depth_topic: DepthTopic = None,
     info_topic: InfoTopic = None,
     fps: Fps = None,
+    static: Annotated[
+        bool,
+        typer.Option(
+            "--static", help="Track the camera and remove what moves: depth 0, masks, and the estimated poses beside."
+        ),
+    ] = False,
+    config: Annotated[
+        str | None, typer.Option(help="With --static: name of a configuration or a YAML file [full].")
+    ] = None,
 ) -> None:
     """Save a live camera or any other source in TUM layout.
 
     Writes PNG images, their lists and the camera until the source ends or Ctrl-C is pressed.
     """
     from rich.console import Console
-    from rich.progress import track
 
+    from v3d_torch.cli.record_command import record_all, record_static
+    from v3d_torch.config.loading import FULL, find_config, load_config
     from v3d_torch.datasets import SourceOptions, open_source
     from v3d_torch.datasets.stored import StoredSequence
-    from v3d_torch.datasets.tum_writer import TUMWriter
-    from v3d_torch.errors import InputError
+    from v3d_torch.errors import ConfigError, InputError
     from v3d_torch.runs.console import interrupts_between_frames, print_assumptions
 
     console = Console(soft_wrap=True)
     with exit_on_error():
+        if config is not None and not static:
+            raise ConfigError(f"--config {config}: has an effect with --static only; remove it")
         with console.status(f"opening {seq}"):
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
         print_assumptions(source, console)
-        with interrupts_between_frames() as interrupted, TUMWriter(out, source.camera, source.groundtruth) as writer:
-            for frame in track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal):
-                writer.add(frame)
-                if interrupted.is_set():
-                    break
-        if not len(writer):
+        with interrupts_between_frames() as interrupted:
+            if static:
+                frames, failure = record_static(
+                    source, out, load_config(find_config(config or FULL)), interrupted, console
+                )
+            else:
+                frames, failure = record_all(source, out, interrupted, console), None
+        if failure is not None:
+            raise InputError(f"{failure} (the {frames} frames before are saved in {out})")
+        if not frames:
             raise InputError(f"{seq}: the source ended before its first frame")
-        console.print(f"{len(writer)} frames: {out}", markup=False)
+        console.print(f"{frames} frames: {out}", markup=False)
         if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
             raise InputError(f"{source.groundtruth_error} (the frames are saved in {out} without ground truth)")

@@ -48,14 +48,25 @@ def main(
     skip_broken: SkipBroken = False,
     viz: Annotated[str | None, typer.Option(help="Show the run live with a viewer: rerun.")] = None,
     rerun: Annotated[Path | None, typer.Option(help="Record the run for rerun in this .rrd file.")] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Record the run as ROS 2 messages in this .mcap file."),
+    ] = None,
     profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the static scene.")] = False,
+    occupancy: Annotated[
+        bool, typer.Option("--occupancy", help="Grow and write an occupancy map, for planning.")
+    ] = False,
     save_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Save the map at the end, for later runs.")
     ] = None,
     load_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Localise the camera in this map and extend it.")
     ] = None,
+    realtime: Annotated[
+        bool,
+        typer.Option("--realtime", help="Play the sequence at its own rate, and leave out frames as on a live camera."),
+    ] = False,
     serial: Annotated[bool, typer.Option("--serial", help="Use one thread; the results are the same.")] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: do not change the map.")] = False,
     resume: Annotated[
@@ -81,12 +92,13 @@ def main(
     overrides += [f"segmentation.model={model}"] if model is not None else []
     overrides += [f"seed={seed}"] if seed is not None else []
     overrides += ["dense_map.mesh.enabled=true"] if mesh else []
+    overrides += ["occupancy.enabled=true"] if occupancy else []
     overrides += ["mapping.enabled=false"] if localise else []
     overrides += ["prefetch=false"] if serial else []
     data_root_source = context.get_parameter_source("data_root")
     if resume is not None and data_root_source is not None and data_root_source.name == "ENVIRONMENT":
         data_root = None  # the run to resume has its own
-    choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, profile)
+    choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, bag, profile)
     with exit_on_error():
         request = RunRequest(
             seq=seq or "",
@@ -102,6 +114,7 @@ def main(
             load_map=_text(load_map),
             save_map=_text(save_map),
             save_masks=save_masks,
+            realtime=realtime,
             skip_broken=skip_broken,
         )
         if resume is None:

@@ -14,6 +14,7 @@ from rich.table import Table
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDStream, open_source
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
@@ -21,7 +22,7 @@ from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
-from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import ProgressBar, print_assumptions, progress_bars, run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
@@ -67,12 +68,29 @@ class Display:
     Attributes:
         viz: Viewer that shows the run live: ``rerun``; None for none.
         rerun_file: File in which the run is recorded for rerun; None for none.
+        bag: File in which the run is recorded as ROS 2 messages; None for none.
         profile: True to print the time of each stage.
     """
 
     viz: str | None = None
     rerun_file: Path | None = None
+    bag: Path | None = None
     profile: bool = False
+
+    def make_viewer(self, sequence: RGBDStream) -> Viewer:
+        """Create the viewer of a run.
+
+        Raises:
+            ConfigError: If the viewer is unknown.
+            ViewerError: If the viewer cannot be started.
+            OutputError: If a recording cannot be written.
+        """
+        viewers = [make_viewer(self.viz, self.rerun_file, sequence)]
+        if self.bag is not None:
+            from v3d_torch.export.ros.bag_viewer import BagViewer  # loads the definitions of all messages
+
+            viewers.append(BagViewer(self.bag, sequence.camera))
+        return ViewerGroup(viewers)
 
 
 def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
@@ -136,7 +154,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if request.load_map is not None and checkpoint is None:  # a checkpoint contains the map
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
     segment = make_segmenter(request.config.segmentation, weights=_path(request.weights), masks_dir=masks)
-    viewer = make_viewer(display.viz, display.rerun_file, sequence)
+    viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
     if masks is not None and masks.resolve() == (folder / "masks").resolve():
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
@@ -158,8 +176,10 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
 
 
 def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
+    if request.realtime and request.skip_broken:
+        raise ConfigError("--realtime: a broken frame ends the playback; remove --skip-broken")
     with progress_bars(console) as progress:
-        return open_source(
+        source = open_source(
             request.seq,
             data_root=_path(request.data_root),
             camera=request.camera,
@@ -167,6 +187,7 @@ def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
             progress=ProgressBar(progress, "sequence"),
             skip_broken=request.skip_broken,
         )
+    return RealtimePlayback(source) if request.realtime else source
 
 
 def _path(text: str | None) -> Path | None:
@@ -236,6 +257,11 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
     if known:
         table.add_row("loaded map", f"{known} keyframes")
     table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
+    if (latency := record.live.latency_statistics()) is not None:
+        text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
+        table.add_row("latency", text)
+        rejected = f", {record.rejected} late or out of order" if record.rejected else ""
+        table.add_row("left out", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")

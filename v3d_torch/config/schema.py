@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 
 class Section(BaseModel):
@@ -96,6 +96,9 @@ class TrackerConfig(Section):
     between frames, but a cup does not turn into the table below it."""
     max_missed_time: float = Field(0.5, ge=0)
     """Time for which a missed object is predicted, seconds: about one step of a person. 0 in the ablation."""
+    max_lost_time: float = Field(5.0, ge=0)
+    """Time after that for which an object that comes back keeps its id, seconds: people walk behind others, or leave
+    the view of a camera that turns. Appearance and position have to fit. 0 in the ablation."""
 
 
 class VotingConfig(Section):
@@ -365,6 +368,55 @@ class DenseMapConfig(Section):
     mesh: MeshConfig = MeshConfig()
 
 
+class OccupancyConfig(Section):
+    """Occupancy map: free and occupied space for planning, grown with every frame (OctoMap, Hornung et al. 2013)."""
+
+    enabled: bool = False
+    """True to grow an occupancy map and write it."""
+    voxel_size: float = Field(0.05, ge=0.01)
+    """Side of a voxel, metres: OctoMap's and ROS's usual resolution in rooms, twice the depth error of a Kinect at
+    4 m."""
+    interval: int = Field(3, gt=0)
+    """Every n-th frame is added: at 30 Hz the map is updated ten times per second, and a person walks 0.1 m between."""
+    stride: int = Field(8, gt=0, le=100)
+    """Every n-th row and column is added, with another offset each time: rays are 0.06 m apart at 4 m, about a
+    voxel."""
+    max_depth: float = Field(4.0, gt=0, le=10)
+    """Maximum depth of obstacles, metres, as for the dense map; farther rays show free space up to it."""
+    depth_tolerance: float = Field(0.006, ge=0)
+    """Depth error divided by the squared depth, 1/m: four standard deviations of a structured-light camera (Khoshelham
+    and Elberink, Sensors 2012). Space that close to a surface is not observed as free."""
+    hit_probability: float = Field(0.7, gt=0.5, lt=1)
+    """Probability that a voxel is occupied in which a depth measurement lies (OctoMap)."""
+    miss_probability: float = Field(0.4, gt=0, lt=0.5)
+    """Probability that a voxel is occupied through which a ray passes (OctoMap)."""
+    min_probability: float = Field(0.12, gt=0, lt=0.5)
+    """Smallest probability of a voxel: free space can become occupied after a few hits (OctoMap)."""
+    max_probability: float = Field(0.97, gt=0.5, lt=1)
+    """Largest probability of a voxel: an object that was taken away is forgotten after about ten misses (OctoMap)."""
+    window_radius: float = Field(6.0, gt=0)
+    """Space within this distance of the camera is never forgotten to limit the memory, metres: more than the depth
+    that is added."""
+    max_blocks: int = Field(8192, gt=0)
+    """Maximum number of blocks of 16 x 16 x 16 voxels, 4 kB each. They hold dozens of rooms; beyond, the blocks
+    farthest from the camera are removed."""
+    max_views: int = Field(1000, gt=0)
+    """Maximum number of stored views, 15 kB each, from which the map is rebuilt after corrections of the poses. Beyond,
+    only the newest of similar views is kept."""
+    max_distance: float = Field(1.0, gt=0)
+    """Distances to obstacles are truncated to this, metres: more than robots keep from obstacles."""
+    obstacle_heights: tuple[float, float] = (0.15, 1.8)
+    """Lowest and highest obstacle in the 2D grid, metres above the floor: a voxel and the error of the floor at 4 m,
+    which 1.5 degrees of tilt make, and the height of a person."""
+
+    @field_validator("obstacle_heights")
+    @classmethod
+    def _check_heights(cls, heights: tuple[float, float]) -> tuple[float, float]:
+        if not heights[0] < heights[1]:
+            raise ValueError("the lowest height should be below the highest")
+        return heights
+
+
 class CheckpointConfig(Section):
     """Checkpoints, from which an interrupted run is resumed."""
 
@@ -398,4 +450,5 @@ class Config(Section):
     mapping: MappingConfig = MappingConfig()
     loop: LoopConfig = LoopConfig()
     dense_map: DenseMapConfig = DenseMapConfig()
+    occupancy: OccupancyConfig = OccupancyConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()

@@ -32,6 +32,17 @@ class RGBDStream(Protocol):
 
 
 @runtime_checkable
+class LiveStream(RGBDStream, Protocol):
+    """A stream whose frames come at their own rate, whether they are processed or not, such as a camera."""
+
+    def captured_at(self, frame: RGBDFrame) -> float:
+        """Return the time of capture of the newest frame in the clock of the computer (`time.monotonic`), seconds."""
+
+    def stop(self) -> None:
+        """End the iteration soon; another thread calls this."""
+
+
+@runtime_checkable
 class RGBDSequence(RGBDStream, Protocol):
     """A source with a fixed number of RGB-D frames that can be indexed."""
 

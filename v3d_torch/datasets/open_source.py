@@ -96,6 +96,11 @@ def load_sequence(
     return source
 
 
+def is_live(name: str) -> bool:
+    """Check whether the name of a source is that of a live camera."""
+    return name.partition(":")[0] == "realsense"
+
+
 def _open(
     name: StrPath,
     data_root: StrPath | None,
@@ -132,7 +137,7 @@ def _open_by_name(
 
         reject_options(name, "the demo", options, frozenset())
         return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
-    if name.partition(":")[0] == "realsense":
+    if is_live(name):
         reject_options(name.removesuffix(":"), "a live camera", options, frozenset({"fps"}))
         return open_realsense_camera(name, camera, fps=options.fps)
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)

@@ -45,6 +45,8 @@ class StoredSequence(ABC):
         groundtruth: Measured poses of the camera; None if there are none or they cannot be read. The frames remain
             usable without them.
         groundtruth_error: Error that occurred while reading the ground truth; None if it was read.
+        gravity: Direction of gravity at the first frame, a unit vector in its camera frame, float64, shape
+            :math:`(3,)`; None if it was not measured.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class StoredSequence(ABC):
         self.name = name.encode(errors="replace").decode()  # the name of a folder can be invalid UTF-8
         self.stamps: Tensor = torch.tensor(stamps, dtype=torch.float64)
         self.camera = camera
+        self.gravity: Tensor | None = None
         self._depth_delays = delays or [0.0] * len(stamps)
         self.groundtruth: Trajectory | None = None
         self.groundtruth_error: InputError | None = None
@@ -94,8 +97,15 @@ class StoredSequence(ABC):
         if not 0 <= index < len(self):
             raise IndexError(f"{self.name} has {len(self)} frames, index {index} is out of range")
         image, depth = self._read(index)
-        depth, stamp = self.camera.correct_depth(depth), float(self.stamps[index])
-        return RGBDFrame(index, stamp, image, depth, camera=self.camera, depth_delay=self._depth_delays[index])
+        return RGBDFrame(
+            index,
+            float(self.stamps[index]),
+            image,
+            self.camera.correct_depth(depth),
+            camera=self.camera,
+            depth_delay=self._depth_delays[index],
+            gravity=self.gravity if index == 0 else None,
+        )
 
     def files(self, index: int) -> tuple[Path, ...]:
         """Return the files that only frame ``index`` is read from; empty if all frames share their files."""

@@ -6,16 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.datasets.tum_trajectory import write_trajectory
-from v3d_torch.errors import OutputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import SATURATED_DEPTH
-from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.io.files import check_empty_folder, write_png, write_text
 from v3d_torch.types import RGBDFrame, Trajectory
 
 _DEPTH_SCALE = 5000.0
@@ -38,8 +35,7 @@ class TUMWriter:
     """
 
     def __init__(self, folder: Path, camera: PinholeCamera, groundtruth: Trajectory | None = None) -> None:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")
+        check_empty_folder(folder)
         self.folder = folder
         self._depth_scale = _DEPTH_SCALE if camera.depth_scale is None else camera.depth_scale
         self._written: list[tuple[str, str]] = []
@@ -72,13 +68,6 @@ class TUMWriter:
         stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self._depth_scale)
         units[units >= SATURATED_DEPTH] = 0
-        colour = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
-        _save(self.folder / "rgb" / f"{stamps[0]}.png", colour)
-        _save(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))
+        write_png(self.folder / "rgb" / f"{stamps[0]}.png", frame.image.permute(1, 2, 0).numpy())
+        write_png(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))
         self._written.append(stamps)
-
-
-def _save(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    encoded = cv2.imencode(".png", image)[1]
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())

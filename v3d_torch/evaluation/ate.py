@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
+
+from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
+from v3d_torch.runtime.batches import fill_padding
 
 _MIN_PLANE_SPREAD = 1e-3
 """Minimum standard deviation of the positions along their second principal axis, metres. Positions with less spread do
@@ -28,71 +32,119 @@ class RotationSource(StrEnum):
     ORIENTATIONS = "orientations"
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """Rigid alignment of an estimate to its ground truth.
+class Alignment(NamedTuple):
+    """Rigid alignment of estimates to their ground truths.
 
     Attributes:
         T_ge: Transform from the estimate's world to the ground truth's world, ``T_gc = T_ge @ T_ec``, float64, shape
-            :math:`(4, 4)`.
-        source: Source of the rotation.
+            :math:`(..., 4, 4)`.
+        by_orientations: True if the rotation is the mean of the orientation differences, bool, shape :math:`(...)`.
     """
 
     T_ge: Tensor
-    source: RotationSource
+    by_orientations: Tensor
+
+    @property
+    def source(self) -> RotationSource:
+        """Source of the rotation, for a single alignment."""
+        return RotationSource.ORIENTATIONS if bool(self.by_orientations) else RotationSource.POSITIONS
 
 
-def spans_plane(positions: Tensor) -> bool:
+def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
+    r"""Absolute trajectory error: root mean square distance of positions after a rigid alignment.
+
+    .. math::
+        \mathrm{ATE} = \sqrt{ \frac{1}{n} \sum_i \left\| \mathrm{trans}(T_{ge} T_{ec, i}) - \mathrm{trans}(T_{gc, i})
+            \right\|^2 }
+
+    The alignment ``T_ge`` is the least-squares fit of the positions. If the positions of the ground truth do not span a
+    plane, its rotation is the mean of the orientation differences. Differentiable in both trajectories.
+
+    Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
+
+    Args:
+        T_gc: Ground truth, camera-to-world poses, floating point, shape :math:`(*, N, 4, 4)`; computed with in float64.
+        T_ec: Estimate at the same times, camera-to-world poses in any world, shape :math:`(*, N, 4, 4)`.
+        valid: Poses that are not padding, bool, shape :math:`(*, N)`; all by default.
+
+    Returns:
+        ATE, metres, dtype of ``T_ec``, shape :math:`(*)`; NaN without poses.
+    """
+    KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
+    KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
+    each = None if valid is None else valid[..., None, None]
+    truth, estimate = fill_padding(T_gc, each, 0.0), fill_padding(T_ec, each, 0.0)
+    errors = absolute_errors(truth, estimate, align(truth, estimate, valid))
+    return root_mean_square(errors, valid).to(T_ec.dtype)
+
+
+def root_mean_square(errors: Tensor, valid: Tensor | None) -> Tensor:
+    """Root mean square of the errors that are valid, shape (..., N) to (...); its gradient at 0 is 0."""
+    if valid is None:
+        valid = torch.ones_like(errors, dtype=torch.bool)
+    norm = torch.linalg.vector_norm(torch.where(valid, errors, 0.0), dim=-1)
+    return norm / valid.sum(dim=-1).to(errors.dtype).sqrt()
+
+
+def spans_plane(positions: Tensor, valid: Tensor | None = None) -> Tensor:
     """Check whether positions span a plane, and so determine the rotation of an alignment.
 
     Positions of a camera that stands still, only turns, or moves along a line do not.
 
     Args:
-        positions: Camera positions, metres, shape :math:`(N, 3)`.
+        positions: Camera positions, metres, shape :math:`(..., N, 3)`.
+        valid: Positions that are not padding, bool, shape :math:`(..., N)`; all by default.
+
+    Returns:
+        Bool, shape :math:`(...)`.
     """
-    centred = positions - positions.mean(dim=0)
-    spread = torch.linalg.eigvalsh(centred.mT @ centred / len(positions)).clamp(min=0).sqrt()  # increasing
-    return bool(spread[1] > _MIN_PLANE_SPREAD)
+    each = None if valid is None else valid[..., None]
+    centred = positions - weighted_mean(positions, None if each is None else each.to(positions.dtype))[..., None, :]
+    if each is None:
+        count: Tensor | int = max(positions.shape[-2], 1)
+    else:
+        centred, count = torch.where(each, centred, 0.0), each.sum(dim=-2, keepdim=True).clamp(min=1)
+    spread = torch.linalg.eigvalsh(centred.mT @ centred / count).clamp(min=0).sqrt()  # increasing
+    return spread[..., 1] > _MIN_PLANE_SPREAD
 
 
-def align(T_gc: Tensor, T_ec: Tensor, *, oriented: bool = True) -> Alignment:
-    """Align the estimate to the ground truth by a rigid transform, without scale (Umeyama, PAMI 1991).
+def align(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None, *, oriented: bool = True) -> Alignment:
+    """Align estimates to their ground truths by a rigid transform, without scale (Umeyama, PAMI 1991).
 
     The alignment is the least-squares fit of the positions. If the positions of the ground truth do not span a plane,
     they do not determine the rotation: the rotation is then the mean of the orientation differences, and the
     translation follows from the centroids.
 
     Args:
-        T_gc: Ground truth, camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
-        T_ec: Estimate at the same times, camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
+        T_gc: Ground truth, camera-to-world poses, float64, shape :math:`(..., N, 4, 4)`.
+        T_ec: Estimate at the same times, camera-to-world poses, float64, shape :math:`(..., N, 4, 4)`.
+        valid: Poses that are not padding, bool, shape :math:`(..., N)`; all by default.
         oriented: True if the orientations of the ground truth were measured.
     """
-    p_g, p_e = T_gc[:, :3, 3], T_ec[:, :3, 3]
-    mean_g, mean_e = p_g.mean(dim=0), p_e.mean(dim=0)
-    if oriented and not spans_plane(p_g):
-        source = RotationSource.ORIENTATIONS
-        R_ge = _nearest_rotation((T_gc[:, :3, :3] @ T_ec[:, :3, :3].mT).sum(dim=0))
-    else:
-        source = RotationSource.POSITIONS
-        R_ge = _nearest_rotation((p_g - mean_g).mT @ (p_e - mean_e))
-    T_ge = torch.eye(4, dtype=T_gc.dtype)
-    T_ge[:3, :3] = R_ge
-    T_ge[:3, 3] = mean_g - R_ge @ mean_e
-    return Alignment(T_ge, source)
+    p_g, p_e = T_gc[..., :3, 3], T_ec[..., :3, 3]
+    T_ge = umeyama(p_e, p_g, valid=valid)
+    by_orientations = ~spans_plane(p_g.detach(), valid) & oriented
+    between = T_gc[..., :3, :3] @ T_ec[..., :3, :3].mT
+    R = nearest_rotation((between if valid is None else between * valid[..., None, None]).sum(dim=-3))
+    weights = None if valid is None else valid[..., None].to(p_g.dtype)
+    t = weighted_mean(p_g, weights) - (R @ weighted_mean(p_e, weights)[..., None])[..., 0]
+    rotated = torch.cat([torch.cat([R, t[..., None]], dim=-1), T_ge[..., 3:, :]], dim=-2)
+    return Alignment(torch.where(by_orientations[..., None, None], rotated, T_ge), by_orientations)
 
 
 def absolute_errors(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> Tensor:
     """Compute the distance between each aligned position and the ground truth.
 
     Args:
-        T_gc: Ground truth, camera-to-world poses, shape :math:`(N, 4, 4)`.
-        T_ec: Estimate at the same times, camera-to-world poses, shape :math:`(N, 4, 4)`.
+        T_gc: Ground truth, camera-to-world poses, shape :math:`(..., N, 4, 4)`.
+        T_ec: Estimate at the same times, camera-to-world poses, shape :math:`(..., N, 4, 4)`.
         alignment: Alignment of the estimate to the ground truth, from `align`.
 
     Returns:
-        Position errors, metres, shape :math:`(N,)`.
+        Position errors, metres, shape :math:`(..., N)`.
     """
-    return ((alignment.T_ge @ T_ec)[:, :3, 3] - T_gc[:, :3, 3]).norm(dim=-1)
+    aligned = alignment.T_ge[..., None, :, :] @ T_ec
+    return (aligned[..., :3, 3] - T_gc[..., :3, 3]).norm(dim=-1)
 
 
 def scale_error(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> float | None:
@@ -115,11 +167,3 @@ def scale_error(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> float | Non
     unexplained = (factor * p_e - p_g).square().sum() / p_g.square().sum()
     same_size = 1 / _MIN_SCALE_FACTOR < factor < _MIN_SCALE_FACTOR
     return factor if factor > 0 and not same_size and unexplained < _MAX_UNEXPLAINED_VARIANCE else None
-
-
-def _nearest_rotation(M: Tensor) -> Tensor:
-    """Return the rotation R that maximises trace(R^T M), shape (3, 3)."""
-    U, _, Vh = torch.linalg.svd(M)
-    signs = torch.ones(3, dtype=M.dtype)
-    signs[2] = torch.linalg.det(U @ Vh).sign()  # exclude reflections
-    return U @ torch.diag(signs) @ Vh

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.evaluation.association import Matches
+from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.runtime.batches import common_batch
 from v3d_torch.types import Trajectory
 
 
@@ -43,6 +46,48 @@ class RelativeErrors:
     first: Tensor
     trans: Tensor
     rot: Tensor
+
+
+def rpe(
+    T_gc: Tensor, T_ec: Tensor, stamps: Tensor, valid: Tensor | None = None, *, delta: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    r"""Relative pose error: root mean square error of the motions over a fixed time.
+
+    .. math::
+        E_i = \left( T_{ei}^{-1} T_{ej} \right) \left( T_{gi}^{-1} T_{gj} \right)^{-1}
+
+    for the pose j nearest to ``delta`` after pose i. Pairs that span a gap, or end in the last pose, do not count, as
+    in the benchmark's tool. Differentiable in both trajectories.
+
+    Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
+
+    Args:
+        T_gc: Ground truth, camera-to-world poses, floating point, shape :math:`(*, N, 4, 4)`; computed with in float64.
+        T_ec: Estimate at the same times, camera-to-world poses in any world, shape :math:`(*, N, 4, 4)`.
+        stamps: Timestamps, seconds, strictly increasing, shape :math:`(*, N)`; the frame numbers for a ``delta`` in
+            frames.
+        valid: Poses that are not padding, bool, shape :math:`(*, N)`; all by default.
+        delta: Time between the poses of a pair, seconds.
+
+    Returns:
+        Translation error, metres per ``delta``, and rotation error, degrees per ``delta``, dtype of ``T_ec``, shape
+        :math:`(*)` each; NaN if there is no pair.
+    """
+    KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
+    KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
+    KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
+    batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1])
+    exists = stamps.new_ones(*batch, stamps.shape[-1], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
+    order = torch.argsort(~exists, dim=-1, stable=True)  # padding last
+    times = torch.where(exists, stamps.to(torch.float64), torch.inf).gather(-1, order)
+    second, is_pair = find_later(times, exists.sum(dim=-1), delta)
+    identity = torch.eye(4, dtype=torch.float64, device=T_gc.device)
+    truth, estimate = (
+        _take_poses(torch.where(exists[..., None, None], T.to(torch.float64), identity), order) for T in (T_gc, T_ec)
+    )
+    errors = relative_errors(truth, _take_poses(truth, second), estimate, _take_poses(estimate, second))
+    trans, rot = (root_mean_square(each, is_pair).to(T_ec.dtype) for each in errors)
+    return trans, rot
 
 
 def relative_pose_error(
@@ -80,11 +125,7 @@ def motion_errors(
 
 
 def pairs_apart(stamps: Tensor, delta: float) -> tuple[Tensor, Tensor]:
-    """Pair each pose with the pose nearest to ``delta`` seconds later.
-
-    As in the TUM benchmark's tool, a pair that ends in the last pose is dropped, because for most such pairs the time
-    ``delta`` later is past the end. A pair is also dropped if its time difference deviates from ``delta`` by more than
-    half of ``delta``, because then it spans a gap.
+    """Pair each pose with the pose nearest to ``delta`` seconds later; see `find_later`.
 
     Args:
         stamps: Timestamps, seconds, increasing, float64, shape :math:`(N,)`.
@@ -93,13 +134,39 @@ def pairs_apart(stamps: Tensor, delta: float) -> tuple[Tensor, Tensor]:
     Returns:
         Indices of the first and of the second poses, int64, shape :math:`(P,)` each.
     """
-    last = len(stamps) - 1
-    after = torch.searchsorted(stamps, stamps + delta).clamp(max=last)
-    before = (after - 1).clamp(min=0)
+    second, is_pair = find_later(stamps, torch.tensor(len(stamps)), delta)
+    return is_pair.nonzero()[:, 0], second[is_pair]
+
+
+def find_later(stamps: Tensor, count: Tensor, delta: float) -> tuple[Tensor, Tensor]:
+    """Find the pose nearest to ``delta`` seconds after each pose.
+
+    As in the TUM benchmark's tool, a pair that ends in the last pose is dropped, because for most such pairs the time
+    ``delta`` later is past the end. A pair is also dropped if its time difference deviates from ``delta`` by more than
+    half of ``delta``, because then it spans a gap.
+
+    Args:
+        stamps: Timestamps, seconds, increasing, float64, shape :math:`(..., N)`; those of padding, at the end, are
+            infinite.
+        count: Number of poses that are not padding, int64, shape :math:`(...)`.
+        delta: Time between the poses of a pair, seconds.
+
+    Returns:
+        Index of the later pose, int64, and a mask of the poses that have one, bool, both of shape :math:`(..., N)`.
+    """
+    last = (count - 1).clamp(min=0)[..., None]
     later = stamps + delta
-    second = torch.where(later - stamps[before] <= stamps[after] - later, before, after)
-    valid = (second != last) & ((stamps[second] - later).abs() <= delta / 2)
-    return valid.nonzero()[:, 0], second[valid]
+    after = torch.minimum(torch.searchsorted(stamps.contiguous(), later.contiguous()), last)
+    before = (after - 1).clamp(min=0)
+    at_before, at_after = stamps.gather(-1, before), stamps.gather(-1, after)
+    second = torch.where(later - at_before <= at_after - later, before, after)
+    exists = torch.arange(stamps.shape[-1], device=stamps.device) < count[..., None]
+    return second, exists & (second != last) & ((stamps.gather(-1, second) - later).abs() <= delta / 2)
+
+
+def _take_poses(T: Tensor, index: Tensor) -> Tensor:
+    """Poses (..., N, 4, 4) at indices (..., N)."""
+    return torch.take_along_dim(T, index[..., None, None], dim=-3)
 
 
 def relative_errors(T_gi: Tensor, T_gj: Tensor, T_ei: Tensor, T_ej: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,13 +177,29 @@ def relative_errors(T_gi: Tensor, T_gj: Tensor, T_ei: Tensor, T_ej: Tensor) -> t
     differ slightly.
 
     Args:
-        T_gi: Ground truth at times i, camera-to-world poses, shape :math:`(P, 4, 4)`.
-        T_gj: Ground truth at times j, camera-to-world poses, shape :math:`(P, 4, 4)`.
-        T_ei: Estimate at times i, camera-to-world poses in any world, shape :math:`(P, 4, 4)`.
-        T_ej: Estimate at times j, camera-to-world poses in the same world, shape :math:`(P, 4, 4)`.
+        T_gi: Ground truth at times i, camera-to-world poses, shape :math:`(..., P, 4, 4)`.
+        T_gj: Ground truth at times j, camera-to-world poses, shape :math:`(..., P, 4, 4)`.
+        T_ei: Estimate at times i, camera-to-world poses in any world, shape :math:`(..., P, 4, 4)`.
+        T_ej: Estimate at times j, camera-to-world poses in the same world, shape :math:`(..., P, 4, 4)`.
 
     Returns:
-        Translation errors in metres and rotation errors in degrees, shape :math:`(P,)` each.
+        Translation errors in metres and rotation errors in degrees, shape :math:`(..., P)` each.
     """
     E = (invert(T_ei) @ T_ej) @ invert(invert(T_gi) @ T_gj)
-    return E[:, :3, 3].norm(dim=-1), torch.rad2deg(se3_log(E)[:, 3:].norm(dim=-1))
+    return E[..., :3, 3].norm(dim=-1), torch.rad2deg(se3_log(E)[..., 3:].norm(dim=-1))
+
+
+class RelativePoseError(torch.nn.Module):
+    """:func:`rpe` as a module.
+
+    Args:
+        delta: Time between the poses of a pair, seconds.
+    """
+
+    def __init__(self, delta: float = 1.0) -> None:
+        super().__init__()
+        self.delta = delta
+
+    def forward(self, T_gc: Tensor, T_ec: Tensor, stamps: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the errors of trajectories :math:`(*, N, 4, 4)`, metres and degrees; see :func:`rpe`."""
+        return rpe(T_gc, T_ec, stamps, valid, delta=self.delta)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-import faiss
 import numpy as np
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.config import OdometryConfig
 from v3d_torch.kernels import descriptors as descriptor_kernels
 from v3d_torch.kernels import projection_matching as projection_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+
+MAX_HAMMING, MAX_RATIO = OdometryConfig().max_hamming, OdometryConfig().max_ratio
+"""Default thresholds: those of the configuration of odometry."""
+
+_BYTES = 32
+"""Bytes of an ORB descriptor."""
 
 _CELL = 8.0
 """Side of the cells of the search grid, pixels. Cells of about half a search radius keep the candidates few."""
@@ -37,50 +44,111 @@ def _as_words(descriptors: Tensor) -> NDArray[np.uint64]:
     return descriptors.contiguous().numpy().view(np.uint64)
 
 
-def _match_descriptors_compiled(a: Tensor, b: Tensor, *, max_hamming: int, max_ratio: float) -> Tensor:
-    if not _are_descriptors(a, b):
-        return NotImplemented
-    if min(a.shape[0], b.shape[0]) < 2:
-        return torch.zeros(0, 2, dtype=torch.int64)
-    return torch.from_numpy(descriptor_kernels.match_descriptors(_as_words(a), _as_words(b), max_hamming, max_ratio))
-
-
 def _are_descriptors(*tensors: Tensor) -> bool:
     """Check whether all tensors have the type and shape of 256-bit descriptors."""
     return all(tensor.dtype == torch.uint8 and tensor.shape[1:] == (32,) for tensor in tensors)
 
 
+def _match_descriptors_compiled(
+    a: Tensor,
+    b: Tensor,
+    a_valid: Tensor | None = None,
+    b_valid: Tensor | None = None,
+    *,
+    max_hamming: int = MAX_HAMMING,
+    max_ratio: float = MAX_RATIO,
+) -> Tensor:
+    if a.dtype != torch.uint8 or b.dtype != torch.uint8 or a.shape[-1] != _BYTES or a.shape[:-2] != b.shape[:-2]:
+        return NotImplemented
+    matches = torch.full(a.shape[:-1], -1)
+    for index in np.ndindex(a.shape[:-2]):
+        rows, columns = (
+            None if valid is None else valid.expand(each.shape[:-1])[index].nonzero()[:, 0]
+            for each, valid in ((a, a_valid), (b, b_valid))
+        )
+        queries, candidates = (
+            each[index] if chosen is None else each[index][chosen] for each, chosen in ((a, rows), (b, columns))
+        )
+        if min(len(queries), len(candidates)) < 2:
+            continue
+        words = _as_words(queries), _as_words(candidates)
+        row, column = torch.from_numpy(descriptor_kernels.match_descriptors(*words, max_hamming, max_ratio)).unbind(1)
+        matches[index][row if rows is None else rows[row]] = column if columns is None else columns[column]
+    return matches
+
+
 @compiled_by(_match_descriptors_compiled)
-def match_descriptors(a: Tensor, b: Tensor, *, max_hamming: int, max_ratio: float) -> Tensor:
-    """Match descriptors: mutual nearest neighbours that pass Lowe's ratio test.
+def match_descriptors(
+    a: Tensor,
+    b: Tensor,
+    a_valid: Tensor | None = None,
+    b_valid: Tensor | None = None,
+    *,
+    max_hamming: int = MAX_HAMMING,
+    max_ratio: float = MAX_RATIO,
+) -> Tensor:
+    """Match binary descriptors: mutual nearest neighbours that pass Lowe's ratio test.
+
+    Of several nearest neighbours the first one counts. Memory grows with N times M. The descriptors are those of ORB
+    (Rublee et al., ICCV 2011); Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004.
 
     Args:
-        a: Descriptors, uint8, shape :math:`(N, 32)`.
-        b: Descriptors, uint8, shape :math:`(M, 32)`.
+        a: Descriptors, uint8, shape :math:`(*, N, D)`, 8 D bits.
+        b: Descriptors, uint8, shape :math:`(*, M, D)`.
+        a_valid: Descriptors of ``a`` that are not padding, bool, shape :math:`(*, N)`; all by default.
+        b_valid: Descriptors of ``b`` that are not padding, bool, shape :math:`(*, M)`; all by default.
         max_hamming: Maximum Hamming distance, bits.
         max_ratio: Maximum ratio of the best to the second-best distance.
 
     Returns:
-        Pairs (row of ``a``, row of ``b``), int64, shape :math:`(K, 2)`.
+        Row of ``b`` that each row of ``a`` matches, -1 for none, int64, shape :math:`(*, N)`. There are no matches if
+        ``a`` or ``b`` has fewer than two descriptors.
     """
-    if min(a.shape[0], b.shape[0]) < 2:
-        return torch.zeros(0, 2, dtype=torch.int64)
-    queries, candidates = a.numpy(), b.numpy()
-    distance, nearest = _index(candidates).search(queries, 2)
-    accepted = np.flatnonzero((distance[:, 0] <= max_hamming) & (distance[:, 0] < max_ratio * distance[:, 1]))
-    matched = nearest[accepted, 0]
-    # Cross-check: search backwards only for candidates that were matched.
-    unique, inverse = np.unique(matched, return_inverse=True)
-    _, back = _index(queries).search(candidates[unique], 1)
-    mutual = back[inverse, 0] == accepted
-    return torch.from_numpy(np.stack([accepted[mutual], matched[mutual]], axis=1))
+    KORNIA_CHECK_SHAPE(a, ["*", "N", "D"])
+    KORNIA_CHECK_SHAPE(b, ["*", "M", str(a.shape[-1])])
+    distance = _pairwise_hamming_distances(a, b)
+    if 0 in distance.shape[-2:]:
+        return distance.new_full(distance.shape[:-1], -1, dtype=torch.int64)
+    a_valid = distance.new_ones(a.shape[-2], dtype=torch.bool) if a_valid is None else a_valid
+    b_valid = distance.new_ones(b.shape[-2], dtype=torch.bool) if b_valid is None else b_valid
+    enough = (a_valid.sum(dim=-1) >= 2) & (b_valid.sum(dim=-1) >= 2)
+    never = 8 * a.shape[-1] + 1  # exceeds all distances
+    distance = torch.where(a_valid[..., :, None] & b_valid[..., None, :], distance, never)
+    best, nearest = distance.min(dim=-1)
+    second = distance.scatter(-1, nearest[..., None], never).amin(dim=-1)
+    row = torch.arange(a.shape[-2], device=a.device)
+    mutual = distance.argmin(dim=-2).gather(-1, nearest) == row
+    accepted = mutual & (best <= max_hamming) & (best < max_ratio * second) & enough[..., None]
+    return torch.where(accepted, nearest, -1)
 
 
-def _index(descriptors: NDArray[np.uint8]) -> faiss.IndexBinaryFlat:
-    """Exhaustive search index of descriptors (N, 32); faster than the matcher of kornia-rs."""
-    index = faiss.IndexBinaryFlat(8 * descriptors.shape[1])
-    index.add(descriptors)
-    return index
+def _pairwise_hamming_distances(a: Tensor, b: Tensor) -> Tensor:
+    """Hamming distances of all pairs of descriptors (..., N, D) and (..., M, D), float32, (..., N, M).
+
+    The scalar product of two vectors of +1 and -1, one for each bit, is the number of equal bits minus that of
+    different ones. The sums are whole numbers, and exact in float32.
+    """
+    place = torch.arange(8, dtype=torch.uint8, device=a.device)
+    signs = [((each[..., None] >> place & 1).to(torch.float32) * 2 - 1).flatten(-2) for each in (a, b)]
+    return (8 * a.shape[-1] - signs[0] @ signs[1].mT) / 2
+
+
+class DescriptorMatcher(torch.nn.Module):
+    """:func:`match_descriptors` as a module.
+
+    Args:
+        max_hamming: Maximum Hamming distance, bits.
+        max_ratio: Maximum ratio of the best to the second-best distance.
+    """
+
+    def __init__(self, max_hamming: int = MAX_HAMMING, max_ratio: float = MAX_RATIO) -> None:
+        super().__init__()
+        self.max_hamming = max_hamming
+        self.max_ratio = max_ratio
+
+    def forward(self, a: Tensor, b: Tensor, a_valid: Tensor | None = None, b_valid: Tensor | None = None) -> Tensor:
+        """Match descriptors :math:`(*, N, D)` and :math:`(*, M, D)`; see :func:`match_descriptors`."""
+        return match_descriptors(a, b, a_valid, b_valid, max_hamming=self.max_hamming, max_ratio=self.max_ratio)
 
 
 def _match_by_projection_compiled(

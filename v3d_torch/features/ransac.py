@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import kornia_rs
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.features.p3p import solve_p3p
+from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
 from v3d_torch.geometry.se3 import orthonormalise
+from v3d_torch.kernels.compiler import can_read, is_all_true
+from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
-from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, Measurements
+from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
+from v3d_torch.runtime.batches import common_batch
 
 _MIN_EPIPOLAR_PAIRS = 8
 """Pairs that determine a fundamental matrix (eight-point algorithm)."""
@@ -53,72 +59,183 @@ def epipolar_inliers(uv_a: Tensor, uv_b: Tensor, *, threshold: float, iterations
     return torch.tensor(result.inliers, dtype=torch.bool)
 
 
+class PnP(NamedTuple):
+    """Camera poses found by PnP-RANSAC.
+
+    Attributes:
+        T_cw: World-to-camera poses, shape :math:`(*, 4, 4)`; the identity if no pose was found.
+        inliers: Mask of the points that agree with the pose, bool, shape :math:`(*, N)`.
+        found: True if a pose was found, bool, shape :math:`(*)`.
+    """
+
+    T_cw: Tensor
+    inliers: Tensor
+    found: Tensor
+
+
 def pnp_ransac(
     points: Tensor,
     uv: Tensor,
-    camera: PinholeCamera,
-    *,
-    threshold: float,
-    iterations: int,
-    seed: int,
+    K: Tensor,
     initial_guess: Tensor | None = None,
-) -> tuple[Tensor, Tensor] | None:
-    """Camera pose from 3D points and their pixels: EPnP in RANSAC, refined on all inliers.
+    valid: Tensor | None = None,
+    *,
+    threshold: float = 4.0,
+    iterations: int = ITERATIONS,
+    seed: int = 0,
+) -> PnP:
+    """Estimate camera poses from 3D points and their pixels: PnP in RANSAC, refined on all inliers.
+
+    The poses are differentiable in points, pixels and camera matrix, as those of :func:`refine_pose`; the inliers are
+    constant. On the CPU, kornia-rs finds the hypotheses by EPnP, one problem of the batch after the other. On other
+    devices and where `torch.func` traces the computation, torch finds them by P3P, all at once.
+
+    Fischler and Bolles, Random Sample Consensus, CACM 1981; Lepetit et al., EPnP, IJCV 2009; Chum et al., Locally
+    Optimized RANSAC, DAGM 2003.
 
     Args:
-        points: Points in a frame "w", metres, float64, shape :math:`(N, 3)`.
-        uv: Undistorted pixels of the points, float64, shape :math:`(N, 2)`.
-        camera: Intrinsics.
+        points: Points in a frame "w", metres, floating point, shape :math:`(*, N, 3)`.
+        uv: Undistorted pixels of the points, shape :math:`(*, N, 2)`.
+        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`. If the prediction, once refined, explains more than
+            half of the points, RANSAC is skipped.
+        valid: Points that are not padding, bool, shape :math:`(*, N)`; all by default.
         threshold: Maximum reprojection error of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
-        initial_guess: Predicted ``T_cw``, float64, shape :math:`(4, 4)`. If the prediction, once refined, explains more
-            than half of the points, RANSAC is skipped.
 
     Returns:
-        Pose ``T_cw``, float64, shape :math:`(4, 4)`, and inlier mask, bool, shape :math:`(N,)`; None if no pose is
-        found.
+        Poses with the dtype of ``points``. No pose is found from fewer than 6 points.
     """
-    count = points.shape[0]
-    if count < _MIN_PNP_POINTS:
-        return None
-    sigma = uv.new_full((count,), threshold / math.sqrt(CHI2_THRESHOLD_2D))
-    # Residuals of pixels only: depth enters through the points.
-    measured = Measurements(uv=uv, inverse_depth=uv.new_zeros(count), pixel_sigma=sigma, inverse_depth_sigma=1.0)
+    KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
+    KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
+    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2])
+    mask = uv.new_ones(*batch, uv.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
+    count = mask.sum(dim=-1)
+    data = points.detach().expand(*batch, -1, 3), uv.detach().expand(*batch, -1, 2), K.detach().expand(*batch, 3, 3)
+    settings = threshold, iterations, seed
+    sigma = uv.new_full(uv.shape[:-1], threshold / math.sqrt(CHI2_THRESHOLD_2D))
+    T_cw = torch.eye(4, dtype=points.dtype, device=points.device).expand(*batch, 4, 4)
+    inliers, found, done = torch.zeros_like(mask), torch.zeros_like(count, dtype=torch.bool), count < _MIN_PNP_POINTS
 
-    def hypotheses() -> Iterator[Tensor]:
+    def hypotheses() -> Iterator[tuple[Tensor, Tensor]]:
         if initial_guess is not None:
-            yield initial_guess
-        for size in sorted({min(_SUBSET_SIZE, count), count}):
-            subset = torch.linspace(0, count - 1, size).round().to(torch.int64)
-            T_cw = _sample_pose(points[subset], uv[subset], camera.K, threshold, iterations, seed)
-            if T_cw is not None:
-                yield T_cw
+            yield initial_guess.detach().expand(*batch, 4, 4), torch.ones_like(done)
+        if not can_read(data[1]):
+            yield _sample_p3p(*_to_float64(*data), mask, *settings)
+            return
+        yield _sample_epnp(*data, mask, ~done, _SUBSET_SIZE, *settings)
+        yield _sample_epnp(*data, mask, ~done & (count > _SUBSET_SIZE), None, *settings)
 
-    pose = None
-    for T_cw in hypotheses():
-        refined = refine_pose(T_cw, points, measured, camera, rounds=2)
-        pose = refined.T_cw, refined.inliers
-        if 2 * int(refined.inliers.sum()) > count:
+    for hypothesis, exists in hypotheses():
+        # Residuals of pixels only: depth enters through the points.
+        refined = refine_pose(hypothesis, points, uv, K, pixel_sigma=sigma, valid=valid, rounds=2)
+        is_new = exists & ~done
+        T_cw, inliers = select(is_new, (refined.T_cw.to(points.dtype), refined.inliers), (T_cw, inliers))
+        found = found | is_new
+        done = done | (is_new & (2 * inliers.sum(dim=-1) > count))
+        if is_all_true(done):
             break
-    return pose
+    return PnP(T_cw, inliers, found)
 
 
-def _sample_pose(points: Tensor, uv: Tensor, K: Tensor, threshold: float, iterations: int, seed: int) -> Tensor | None:
-    """Best pose ``T_cw`` of one RANSAC run, without refinement on all points; None if there is none."""
-    try:
-        R, t, _, _ = kornia_rs.k3d.solve_pnp_ransac(
-            points.numpy(),
-            uv.numpy(),
-            K.numpy(),
-            threshold=threshold,
-            max_iterations=iterations,
-            lo_every=_LOCAL_OPTIMISATION_INTERVAL,
-            seed=seed,
+def _to_float64(points: Tensor, uv: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    return points.to(torch.float64), uv.to(torch.float64), K.to(torch.float64)
+
+
+def _sample_epnp(
+    points: Tensor,
+    uv: Tensor,
+    K: Tensor,
+    valid: Tensor,
+    wanted: Tensor,
+    size: int | None,
+    threshold: float,
+    iterations: int,
+    seed: int,
+) -> tuple[Tensor, Tensor]:
+    """Best poses ``T_cw``, (..., 4, 4), of one RANSAC run of kornia-rs, and True where there is one, (...).
+
+    Only the problems that are ``wanted`` are sampled, each from ``size`` of its points; None = all.
+    """
+    poses = torch.eye(4, dtype=torch.float64).repeat(*valid.shape[:-1], 1, 1)
+    found = torch.zeros(valid.shape[:-1], dtype=torch.bool)
+    for row in wanted.nonzero().tolist():
+        index = tuple(row)
+        chosen = valid[index].nonzero()[:, 0]
+        if size is not None and len(chosen) > size:
+            chosen = chosen[torch.linspace(0, len(chosen) - 1, size).round().to(torch.int64)]
+        try:
+            R, t, _, _ = kornia_rs.k3d.solve_pnp_ransac(
+                points[index][chosen].to(torch.float64).numpy(),
+                uv[index][chosen].to(torch.float64).numpy(),
+                K[index].to(torch.float64).contiguous().numpy(),
+                threshold=threshold,
+                max_iterations=iterations,
+                lo_every=_LOCAL_OPTIMISATION_INTERVAL,
+                seed=seed,
+            )
+        except ValueError:  # raised by kornia-rs if no sample gives a pose
+            continue
+        T_cw = torch.eye(4, dtype=torch.float64)
+        T_cw[:3, :3] = torch.from_numpy(R)
+        T_cw[:3, 3] = torch.from_numpy(t).reshape(3)
+        if bool(torch.isfinite(T_cw).all()):
+            poses[index], found[index] = orthonormalise(T_cw), True
+    return poses, found
+
+
+def _sample_p3p(
+    points: Tensor, uv: Tensor, K: Tensor, valid: Tensor, threshold: float, iterations: int, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Best poses ``T_cw``, (..., 4, 4), of RANSAC in torch, and True where there is one, (...)."""
+    focal, centre = K.diagonal(dim1=-2, dim2=-1)[..., None, :2], K[..., None, :2, 2]
+    xy = (uv - centre) / focal
+    rays = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
+
+    def solve(samples: Tensor) -> Tensor:
+        return solve_p3p(gather_samples(points, samples), gather_samples(rays, samples))
+
+    def squared_errors(T_cw: Tensor) -> Tensor:
+        x, y, z = (points[..., None, :, :] @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]).unbind(-1)
+        u, v = (xy * focal)[..., None, :, :].unbind(-1)
+        w = 1 / z.clamp(min=MIN_DEPTH)
+        error = (focal[..., 0, None] * x * w - u).square() + (focal[..., 1, None] * y * w - v).square()
+        return torch.where(z > MIN_DEPTH, error, torch.inf)
+
+    return find_best_hypothesis(
+        solve, squared_errors, valid, size=3, threshold=threshold, iterations=iterations, seed=seed
+    )
+
+
+class PnPRANSAC(torch.nn.Module):
+    """:func:`pnp_ransac` as a module.
+
+    Args:
+        threshold: Maximum reprojection error of an inlier, pixels.
+        iterations: Maximum number of hypotheses.
+        seed: Seed of the sampling.
+    """
+
+    def __init__(self, threshold: float = 4.0, iterations: int = ITERATIONS, seed: int = 0) -> None:
+        super().__init__()
+        self.threshold = threshold
+        self.iterations = iterations
+        self.seed = seed
+
+    def forward(
+        self,
+        points: Tensor,
+        uv: Tensor,
+        K: Tensor,
+        initial_guess: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> PnP:
+        """Estimate poses from points :math:`(*, N, 3)` at pixels :math:`(*, N, 2)`; see :func:`pnp_ransac`."""
+        return pnp_ransac(
+            *(points, uv, K, initial_guess, valid),
+            threshold=self.threshold,
+            iterations=self.iterations,
+            seed=self.seed,
         )
-    except ValueError:  # raised by kornia-rs if no sample gives a pose
-        return None
-    T_cw = torch.eye(4, dtype=torch.float64)
-    T_cw[:3, :3] = torch.from_numpy(R)
-    T_cw[:3, 3] = torch.from_numpy(t).reshape(3)
-    return orthonormalise(T_cw) if bool(torch.isfinite(T_cw).all()) else None

@@ -206,13 +206,13 @@ class PinholeCamera:
         Returns:
             Float64, shape :math:`(N, 2)`.
         """
-        return (uv.to(torch.float64) - self._principal_point) / self.focal_lengths
+        return (uv.to(torch.float64) - self._principal_point.to(uv.device)) / self.focal_lengths.to(uv.device)
 
     def _project_normalised(self, xy: Tensor) -> Tensor:
         """Distorted pixels at normalised image coordinates, both (N, 2) and float64."""
         if self.is_distorted:
             xy = distort(xy, self.distortion_model, self.distortion)
-        return xy * self.focal_lengths + self._principal_point
+        return xy * self.focal_lengths.to(xy.device) + self._principal_point.to(xy.device)
 
     def project(self, points: Tensor) -> Tensor:
         r"""Project points to undistorted pixels: :math:`u = f_x x / z + c_x,\; v = f_y y / z + c_y`.

@@ -17,26 +17,28 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import hat
 
 
-def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, camera: PinholeCamera) -> tuple[Tensor, Tensor]:
+def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Velocity of pixels and of their inverse depth, for static points in front of a moving camera.
 
     Args:
-        uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
-        inverse_depth: Inverse depth of each pixel, 1/m, float64, shape :math:`(N,)`; 0 = infinitely far, such a point
-            moves by the rotation alone.
+        uv: Undistorted pixels, float64, shape :math:`(..., N, 2)`.
+        inverse_depth: Inverse depth of each pixel, 1/m, float64, shape :math:`(..., N)`; 0 = infinitely far, such a
+            point moves by the rotation alone.
         velocity: Twist per second ``[m/s, rad/s]`` by which the points move in the camera frame, float64, shape
-            :math:`(6,)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
-        camera: Intrinsics.
+            :math:`(..., 6)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
+        K: Camera matrix, float64, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Pixel velocity, pixels per second, shape :math:`(N, 2)`, and the rate of inverse depth, 1/m per second, shape
-        :math:`(N,)`.
+        Pixel velocity, pixels per second, shape :math:`(..., N, 2)`, and the rate of inverse depth, 1/m per second,
+        shape :math:`(..., N)`.
     """
-    xy = camera.normalise(uv).T
+    focal_lengths, principal_point = K.diagonal(dim1=-2, dim2=-1)[..., None, :2], K[..., None, :2, 2]
+    xy = ((uv - principal_point) / focal_lengths).mT
     # Velocity of the points divided by their depth; in these units the points are (x / z, y / z, 1, 1 / z).
-    relative = hat(velocity)[:3] @ torch.cat([xy, torch.ones_like(inverse_depth)[None], inverse_depth[None]])
-    return (relative[:2] - relative[2] * xy).T * camera.focal_lengths, -relative[2] * inverse_depth
+    w = inverse_depth[..., None, :]
+    relative = hat(velocity)[..., :3, :] @ torch.cat([xy, torch.ones_like(w).expand_as(xy[..., :1, :]), w], dim=-2)
+    rate = relative[..., 2:, :]
+    return (relative[..., :2, :] - rate * xy).mT * focal_lengths, -rate[..., 0, :] * inverse_depth

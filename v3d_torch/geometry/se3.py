@@ -1,4 +1,4 @@
-"""SE(3) as 4x4 matrices: exponential, logarithm, inverse.
+"""SE(3) as 4x4 matrices: exponential, logarithm, inverse, adjoint, Jacobian of the logarithm.
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
 All functions are batched over leading dimensions, differentiable, and meant for float64. They compute the same as
@@ -49,6 +49,9 @@ _SMALL_ANGLE = 1e-4
 """Rotation angle in radians below which the limits of the closed forms are exact to float64."""
 
 _SMALL_ANGLE_SQUARED = _SMALL_ANGLE**2
+
+_SERIES_ANGLE_SQUARED = 1e-4
+"""Squared rotation angle below which the Jacobian is computed from its power series, to avoid cancellation."""
 
 
 def _is_single(tensor: Tensor, *shape: int) -> bool:
@@ -121,7 +124,7 @@ def se3_exp(xi: Tensor) -> Tensor:
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
     X2 = X @ X
-    return (torch.eye(4, dtype=xi.dtype) + X).addcmul(b, X2).addcmul(c, X2 @ X)
+    return (torch.eye(4, dtype=xi.dtype, device=xi.device) + X).addcmul(b, X2).addcmul(c, X2 @ X)
 
 
 def _se3_log_compiled(T: Tensor) -> Tensor:
@@ -145,7 +148,7 @@ def se3_log(T: Tensor) -> Tensor:
     safe = torch.where(is_small, 1.0, square)
     half = safe.sqrt() / 2
     c = torch.where(is_small, 1 / 12, (1 - half / half.tan()) / safe)
-    K = hat(torch.cat([phi, phi], dim=-1))[..., :3, :3]
+    K = _skew(phi)
     t = T[..., :3, 3:]
     rho = t - 0.5 * (K @ t) + c * (K @ (K @ t))
     return torch.cat([rho[..., 0], phi], dim=-1)
@@ -160,13 +163,69 @@ def hat(xi: Tensor) -> Tensor:
     Returns:
         Matrices :math:`\begin{pmatrix} {[\phi]}_\times & \rho \\ 0 & 0 \end{pmatrix}`, shape :math:`(..., 4, 4)`.
     """
-    return (xi @ _GENERATORS.to(xi.dtype)).unflatten(-1, (4, 4))
+    return (xi @ _GENERATORS.to(xi)).unflatten(-1, (4, 4))
+
+
+def _skew(v: Tensor) -> Tensor:
+    """Matrices (..., 3, 3) of the cross product with vectors (..., 3)."""
+    return hat(torch.cat([v, v], dim=-1))[..., :3, :3]
+
+
+def adjoint(T: Tensor) -> Tensor:
+    r"""Adjoint of rigid motions: :math:`T \exp(\xi) = \exp(\mathrm{Ad}_T\, \xi)\, T`.
+
+    Args:
+        T: Rigid motions, shape :math:`(..., 4, 4)`.
+
+    Returns:
+        Matrices :math:`\begin{pmatrix} R & {[t]}_\times R \\ 0 & R \end{pmatrix}`, shape :math:`(..., 6, 6)`.
+    """
+    R = T[..., :3, :3]
+    return _block_triangular(R, _skew(T[..., :3, 3]) @ R)
+
+
+def left_jacobian_inverse(xi: Tensor) -> Tensor:
+    r"""Inverse left Jacobian of SE(3), the derivative of the logarithm by a perturbation on the left.
+
+    With the adjoint :math:`A` of the tangent vector,
+
+    .. math::
+        \log(\exp(\epsilon) \exp(\xi)) = \xi + J^{-1} \epsilon + O(\epsilon^2), \qquad
+        J^{-1} = I - \frac{1}{2} A + a A^2 + b A^4
+
+    Barfoot, State Estimation for Robotics, 2017, Sec. 7.1.5.
+
+    Args:
+        xi: Tangent vectors ``[translation, rotation]``, shape :math:`(..., 6)`, with a rotation angle of at most pi.
+
+    Returns:
+        Shape :math:`(..., 6, 6)`.
+    """
+    K = _skew(xi[..., 3:])
+    A = _block_triangular(K, _skew(xi[..., :3]))
+    square = xi[..., 3:].square().sum(dim=-1)[..., None, None]
+    # A has the eigenvalues 0 and +-i angle, each twice, so that the series x / 2 coth(x / 2) of A ends at A^4.
+    is_small = square < _SERIES_ANGLE_SQUARED
+    safe = torch.where(is_small, 1.0, square)
+    angle = safe.sqrt()
+    cotangent = 1 / (angle / 2).tan()
+    value, slope = angle / 2 * cotangent, cotangent / 2 - angle / (4 * (angle / 2).sin().square())
+    b = torch.where(is_small, -1 / 720 - square / 15120, (1 + angle * slope / 2 - value) / safe.square())
+    a = torch.where(is_small, 1 / 12 - square.square() / 30240, 2 * b * safe - slope / (2 * angle))
+    A2 = A @ A
+    return torch.eye(6, dtype=xi.dtype, device=xi.device) - 0.5 * A + a * A2 + b * (A2 @ A2)
+
+
+def _block_triangular(D: Tensor, B: Tensor) -> Tensor:
+    """Matrices (..., 6, 6) of blocks (..., 3, 3): D, B above, 0, D below."""
+    return torch.cat([torch.cat([D, B], dim=-1), torch.cat([torch.zeros_like(D), D], dim=-1)], dim=-2)
 
 
 def _so3_log(R: Tensor) -> Tensor:
     """Rotation vectors (..., 3) of rotations (..., 3, 3), by way of quaternions: well conditioned up to pi."""
     # Each row of 4 q q^T is a multiple of the quaternion q; the longest row has the smallest relative error.
-    rows = (R.flatten(-2) @ _QUATERNION_PRODUCTS.to(R.dtype)).unflatten(-1, (4, 4)) + torch.eye(4, dtype=R.dtype)
+    rows = (R.flatten(-2) @ _QUATERNION_PRODUCTS.to(R)).unflatten(-1, (4, 4))
+    rows = rows + torch.eye(4, dtype=R.dtype, device=R.device)
     longest = rows.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
     q = torch.take_along_dim(rows, longest[..., None, None], dim=-2)[..., 0, :]
     q = q / q.norm(dim=-1, keepdim=True)

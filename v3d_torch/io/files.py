@@ -56,6 +56,16 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another file") from error
 
 
+def check_empty_folder(folder: Path) -> None:
+    """Check that a folder is new or empty, so that nothing is mixed with other files or overwritten.
+
+    Raises:
+        OutputError: If it is not.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically.
 
@@ -66,12 +76,12 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write a PNG file atomically.
 
     Args:
         path: File to write.
-        image: Grey or RGB image, uint8, shape (H, W) or (H, W, 3).
+        image: Grey image of shape (H, W), uint8 or uint16, or RGB image of shape (H, W, 3), uint8.
 
     Raises:
         OutputError: As `atomic_write`.

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.io.files import atomic_write
 
 _CORNER_COUNT = "corner_count"
@@ -15,6 +17,9 @@ _CORNER_COUNT = "corner_count"
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 """PLY name of each NumPy type."""
+
+_DTYPES = {name: f"<{numpy_type}" for numpy_type, name in _PLY_TYPES.items()}
+"""NumPy type of each PLY name."""
 
 
 def write_ply(
@@ -59,6 +64,40 @@ def write_ply(
         file.write(_header(elements).encode("ascii"))
         for rows in elements.values():
             file.write(rows.tobytes())
+
+
+def read_ply_points(path: Path) -> tuple[Tensor, Tensor]:
+    """Read the vertices of a file that `write_ply` wrote.
+
+    Args:
+        path: File to read.
+
+    Returns:
+        Positions, metres, float32, shape :math:`(N, 3)`, and RGB, uint8, shape :math:`(N, 3)`.
+
+    Raises:
+        InputError: If the file cannot be read or was not written by `write_ply`.
+    """
+    try:
+        header, _, content = path.read_bytes().partition(b"end_header\n")
+        first, count, fields = None, 0, []
+        for line in header.decode("ascii").splitlines():
+            match line.split():
+                case ["element", name, number] if first in (None, name):
+                    first, count = name, int(number)
+                case ["element", *_]:
+                    break
+                case ["property", kind, name]:
+                    fields.append((name, _DTYPES[kind]))
+        rows = np.frombuffer(content, dtype=fields, count=count)
+        points, colours = (
+            np.stack([rows[name] for name in names], axis=1) for names in (("x", "y", "z"), ("red", "green", "blue"))
+        )
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); run the sequence again") from error
+    except (ValueError, KeyError, TypeError) as error:  # of wrong or missing bytes
+        raise InputError(f"{path}: is damaged or not a point map of a run; run the sequence again") from error
+    return torch.from_numpy(points), torch.from_numpy(colours)
 
 
 def _header(elements: dict[str, NDArray[np.void]]) -> str:

@@ -14,8 +14,8 @@ Index = NDArray[np.int64]
 
 @device
 def _compute_residuals(
-    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, pose: Index, first: Index,
-    min_depth: float, r: Array, weights: Array, chi2: Array,
+    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, influence: Array, pose: Index,
+    first: Index, min_depth: float, r: Array, weights: Array, chi2: Array,
 ) -> float:  # fmt: skip
     """Robust cost; writes the whitened residuals, their weights, and the squared errors."""
     cost = 0.0
@@ -26,8 +26,9 @@ def _compute_residuals(
             r0, r1 = scale[0, m] * (x * w) + offset[0, m], scale[1, m] * (y * w) + offset[1, m]
             r2 = scale[2, m] * w + offset[2, m]
             squared = r0 * r0 + r1 * r1 + r2 * r2
-            robust, weights[m] = huber(squared, thresholds[m])
-            cost += robust
+            robust, weight = huber(squared, thresholds[m])
+            cost += influence[m] * robust
+            weights[m] = influence[m] * weight
             r[m, 0], r[m, 1], r[m, 2], chi2[m] = r0, r1, r2, squared if z > min_depth else np.inf
     return cost
 
@@ -76,12 +77,12 @@ def _find_rows(pose: Index, free: Index, count: int) -> Index:
 
 
 @kernel(
-    "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], i8, f8, f8, f8,"
+    "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], i8, f8, f8, f8,"
     " UniTuple(f8, 4))"
 )
 def bundle_adjust(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, pose: Index, first: Index,
-    free: Index, iterations: int, tolerance: float, regularisation: float, min_depth: float,
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, influence: Array, pose: Index,
+    first: Index, free: Index, iterations: int, tolerance: float, regularisation: float, min_depth: float,
     damping_schedule: tuple[float, float, float, float],
 ) -> tuple[Array, Array, Array, float, float, int]:  # fmt: skip
     """Optimise poses and points by Levenberg-Marquardt.
@@ -92,6 +93,7 @@ def bundle_adjust(
         scale: Scale of the whitened residuals, (3, M).
         offset: Offset of the whitened residuals, (3, M).
         chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
+        influence: Given weight of each observation, (M,).
         pose: Pose of each observation, sorted by point, (M,).
         first: First observation of each point, and M, (P + 1,).
         free: Indices of the poses that move, (F,).
@@ -109,7 +111,9 @@ def bundle_adjust(
     U, V, W = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((M, 3, 6))
     r, weights, chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
     new_r, new_weights, new_chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
-    cost = _compute_residuals(T_cw, points, scale, offset, chi2_thresholds, pose, first, min_depth, r, weights, chi2)
+    cost = _compute_residuals(
+        T_cw, points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, r, weights, chi2
+    )
     cost_before, iteration, converged, is_linearised = cost, 0, False, False
     while iteration < iterations and not converged:
         if not is_linearised:
@@ -119,8 +123,9 @@ def bundle_adjust(
         for f in range(F):
             new_T[free[f]] = multiply(se3_exp(xi[f]), T_cw[free[f]])
         new_cost = _compute_residuals(
-            new_T, new_points, scale, offset, chi2_thresholds, pose, first, min_depth, new_r, new_weights, new_chi2
-        )
+            new_T, new_points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, new_r, new_weights,
+            new_chi2,
+        )  # fmt: skip
         iteration += 1
         converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
         is_linearised = not new_cost < cost
@@ -133,10 +138,12 @@ def bundle_adjust(
     return T_cw, points, chi2, cost_before, cost, iteration
 
 
-@kernel("(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)")
+@kernel(
+    "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)"
+)
 def reduced_cost_derivatives(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, pose: Index, first: Index,
-    free: Index, j: Array, damping: float, regularisation: float, min_depth: float,
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, influence: Array, pose: Index,
+    first: Index, free: Index, j: Array, damping: float, regularisation: float, min_depth: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
 
@@ -146,6 +153,7 @@ def reduced_cost_derivatives(
         scale: Scale of the whitened residuals, (3, M).
         offset: Offset of the whitened residuals, (3, M).
         chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
+        influence: Given weight of each observation, (M,).
         pose: Pose of each observation, sorted by point, (M,).
         first: First observation of each point, and M, (P + 1,).
         free: Indices of the poses that move, (F,).
@@ -160,7 +168,9 @@ def reduced_cost_derivatives(
     F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
     r, weights, chi2, W = np.empty((M, 3)), np.empty(M), np.empty(M), np.empty((M, 3, 6))
     U, V, j_U, j_V = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((F, 6, 7)), np.empty((P, 3, 4))
-    _compute_residuals(T_cw, points, scale, offset, chi2_thresholds, pose, first, min_depth, r, weights, chi2)
+    _compute_residuals(
+        T_cw, points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, r, weights, chi2
+    )
     _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
     _linearise(T_cw, points, scale, pose, first, row, min_depth, j, weights, j_U, j_V, W)
     xi, delta = solve_normal_equations(j_U, j_V, W, row, first, damping, regularisation)

@@ -15,6 +15,7 @@ from threading import Lock
 from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -121,7 +122,7 @@ def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Call
 
         @wraps(function)
         def either(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-            if ENABLED and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
+            if ENABLED and not _is_traced() and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
                 if _TO_COMPILE:
                     deque(compile_kernels(), maxlen=0)
                 result = TWINS[name].compiled(*args, **kwargs)
@@ -137,6 +138,25 @@ def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Call
 def to_array(tensor: Tensor) -> NDArray[Any]:
     """Return a tensor as an array in row-major order; the memory is shared if the tensor already has that order."""
     return np.ascontiguousarray(tensor.detach().numpy())
+
+
+def can_read(tensor: Tensor) -> bool:
+    """Check whether the values of a tensor can be read at once.
+
+    Those of another device would have to be waited for; those of meta tensors, and of tensors that `torch.func`
+    transforms or a compiler traces, do not exist.
+    """
+    return type(tensor) is Tensor and tensor.device.type == "cpu" and not _is_traced()
+
+
+def is_all_true(mask: Tensor) -> bool:
+    """Check whether a mask is true everywhere; False if its values cannot be read at once."""
+    return can_read(mask) and bool(mask.all())
+
+
+def _is_traced() -> bool:
+    """Check whether `torch.func` or a compiler traces the computation."""
+    return torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling()
 
 
 def _is_plain(argument: object) -> bool:

@@ -21,8 +21,8 @@ Mask = NDArray[np.bool_]
 
 @device
 def _linearise(
-    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, active: Mask, min_depth: float,
-    H: Array, g: Array, chi2: Array,
+    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, influence: Array, active: Mask,
+    min_depth: float, H: Array, g: Array, chi2: Array,
 ) -> float:  # fmt: skip
     """Robust cost of the active measurements; writes the normal equations and the squared errors of all."""
     H[:], g[:] = 0.0, 0.0
@@ -37,7 +37,8 @@ def _linearise(
         if not active[i]:
             continue
         robust, weight = huber(squared, thresholds[i])
-        cost += robust
+        cost += influence[i] * robust
+        weight *= influence[i]
         perspective_jacobian(a, b, w, J)
         for k in range(6):
             j0, j1, j2 = scale[0, i] * J[0, k], scale[1, i] * J[1, k], scale[2, i] * J[2, k]
@@ -51,11 +52,12 @@ def _linearise(
     return cost
 
 
-@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], i8, i8, f8, f8, f8, UniTuple(f8, 4))")
+@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], b1[::1], i8, i8, f8, f8, f8, UniTuple(f8, 4))")
 def refine_pose(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, rounds: int, iterations: int,
-    tolerance: float, regularisation: float, min_depth: float, damping_schedule: tuple[float, float, float, float],
-) -> tuple[Array, Mask, Array, Array]:  # fmt: skip
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
+    rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
+    damping_schedule: tuple[float, float, float, float],
+) -> tuple[Array, Mask, Mask, Array, Array]:  # fmt: skip
     """Refine a pose in rounds of Levenberg-Marquardt.
 
     Args:
@@ -64,6 +66,8 @@ def refine_pose(
         scale: Scale of the whitened residuals, (3, N).
         offset: Offset of the whitened residuals, (3, N).
         chi2_thresholds: Squared residual up to which a measurement is an inlier, (N,).
+        weights: Weight of each measurement, (N,).
+        valid: Measurements that are not padding, (N,).
         rounds: Maximum number of rounds; the first half of them is robust.
         iterations: Maximum number of steps in a round.
         tolerance: Relative change of the cost at convergence.
@@ -72,18 +76,20 @@ def refine_pose(
         damping_schedule: First, smallest and largest damping, and the factor between two steps.
 
     Returns:
-        Pose (4, 4), inliers (N,), squared residuals (N,), information matrix (6, 6).
+        Pose (4, 4), inliers (N,), measurements that took part in the last round (N,), squared residuals (N,),
+        information matrix (6, 6).
     """
     first_damping, min_damping, max_damping, factor = damping_schedule
     count = len(points)
-    inliers, thresholds = np.ones(count, np.bool_), chi2_thresholds.copy()
+    inliers, active, thresholds = valid.copy(), valid.copy(), chi2_thresholds.copy()
     H, g, chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
     new_H, new_g, new_chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
     for index in range(rounds):
         robust = 2 * index < rounds
         if not robust:
             thresholds[:] = np.inf
-        cost = _linearise(T_cw, points, scale, offset, thresholds, inliers, min_depth, H, g, chi2)
+        active[:] = inliers
+        cost = _linearise(T_cw, points, scale, offset, thresholds, weights, active, min_depth, H, g, chi2)
         damping, converged, iteration = first_damping, False, 0
         while iteration < iterations and not converged:
             damped = H.copy()
@@ -91,7 +97,7 @@ def refine_pose(
                 damped[k, k] = damped[k, k] * (1 + damping) + regularisation
             candidate = multiply(se3_exp(-solve_symmetric(damped, g)), T_cw)
             new_cost = _linearise(
-                candidate, points, scale, offset, thresholds, inliers, min_depth, new_H, new_g, new_chi2
+                candidate, points, scale, offset, thresholds, weights, active, min_depth, new_H, new_g, new_chi2
             )
             iteration += 1
             converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
@@ -103,9 +109,12 @@ def refine_pose(
                 damping = min(damping * factor, max_damping)
         unchanged = True
         for i in range(count):
-            is_inlier = chi2[i] <= chi2_thresholds[i]
+            is_inlier = valid[i] and chi2[i] <= chi2_thresholds[i]
             unchanged &= is_inlier == inliers[i]
             inliers[i] = is_inlier
         if not robust and unchanged:
             break
-    return T_cw, inliers, chi2, H
+    for i in range(count):
+        if not valid[i]:
+            chi2[i] = np.inf
+    return T_cw, inliers, active, chi2, H

@@ -52,29 +52,30 @@ def compensate_depth_delay(
     return depth
 
 
-@kernel("(f8[:,::1], i8[:,::1], f8[::1], f8[:,::1], f8[::1], f8, i8, UniTuple(f8, 4))")
+@kernel("(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1], f8, i8)")
 def compensate_rolling_shutter(
-    uv: Array, pixel: NDArray[np.int64], inverse_depth: Array, readout_jacobian: Array, velocity: Array,
-    readout: float, rows: int, intrinsics: Intrinsics,
+    uv: Array, row: Array, inverse_depth: Array, velocity: Array, K: Array, readout_jacobian: Array, readout: float,
+    rows: int,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Pixels of features at the time of the middle row, and their derivatives by the readout, both (N, 2).
 
     Args:
         uv: Undistorted pixels, compensated with ``readout_jacobian``, (N, 2).
-        pixel: (column, row) in the recorded image, (N, 2).
+        row: Row in the recorded image, (N,).
         inverse_depth: 1/m, (N,); 0 = no measurement.
-        readout_jacobian: Earlier derivative of ``uv`` by the readout, pixels per second, (N, 2).
         velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
+        K: Camera matrix, (3, 3).
+        readout_jacobian: Earlier derivative of ``uv`` by the readout, pixels per second, (N, 2).
         readout: Time from the first to the last row, seconds.
         rows: Number of rows of the image.
-        intrinsics: ``fx, fy, cx, cy``.
     """
+    intrinsics = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     new_uv, new_jacobian = np.empty_like(uv), np.empty_like(uv)
     for i in range(len(uv)):
         u = uv[i, 0] - readout * readout_jacobian[i, 0]
         v = uv[i, 1] - readout * readout_jacobian[i, 1]
         du, dv, _ = _motion_field(u, v, inverse_depth[i], velocity, intrinsics)
-        time = pixel[i, 1] / (rows - 1) - 0.5  # of the row, from -0.5 to 0.5 readouts
+        time = row[i] / (rows - 1) - 0.5  # of the row, from -0.5 to 0.5 readouts
         new_jacobian[i, 0], new_jacobian[i, 1] = -time * du, -time * dv
         new_uv[i, 0], new_uv[i, 1] = u + readout * new_jacobian[i, 0], v + readout * new_jacobian[i, 1]
     return new_uv, new_jacobian

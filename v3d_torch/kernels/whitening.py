@@ -10,10 +10,9 @@ from v3d_torch.kernels.compiler import kernel
 Array = NDArray[np.float64]
 
 
-@kernel("(f8[:,::1], f8[::1], f8[::1], f8, UniTuple(f8, 4))")
+@kernel("(f8[:,::1], f8[::1], f8[::1], f8, f8[:,::1])")
 def whiten(
-    uv: Array, inverse_depth: Array, pixel_sigma: Array, inverse_depth_sigma: float,
-    intrinsics: tuple[float, float, float, float],
+    uv: Array, inverse_depth: Array, pixel_sigma: Array, inverse_depth_sigma: float, K: Array
 ) -> tuple[Array, Array]:  # fmt: skip
     """Scale and offset of the whitened residuals, both (3, M).
 
@@ -22,9 +21,9 @@ def whiten(
         inverse_depth: Inverse of the measured depth, 1/m, (M,); 0 = not measured.
         pixel_sigma: Standard deviation of u and of v, pixels, (M,).
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m.
-        intrinsics: ``fx, fy, cx, cy``.
+        K: Camera matrix, (3, 3).
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     scale, offset = np.empty((3, len(uv))), np.empty((3, len(uv)))
     for i in range(len(uv)):
         w, sigma = inverse_depth[i], pixel_sigma[i]

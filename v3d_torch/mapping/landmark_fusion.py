@@ -64,7 +64,8 @@ class LandmarkFusion:
         in_camera = local.points[row] @ keyframe.T_cw[:3, :3].T + keyframe.T_cw[:3, 3]
         measured = to_measurements(features[feature], config.tracking, config.features)
         inliers = (
-            chi_square(in_camera, reprojection_residuals(in_camera, measured, self._camera)) <= measured.chi2_threshold
+            chi_square(in_camera, reprojection_residuals(in_camera, measured, self._camera.K))
+            <= measured.chi2_threshold
         )
         matches = torch.full_like(keyframe.landmarks, -1)
         matches[feature[inliers]] = local.ids[row[inliers]]

@@ -13,8 +13,7 @@ from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.map_observations import select_observations
-from v3d_torch.mapping.readout_calibration import calibrate_readout
-from v3d_torch.mapping.reduced_cost import readout_cost_derivatives
+from v3d_torch.mapping.readout_calibration import estimate_readout
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.rolling_shutter import Readout
 
@@ -81,28 +80,27 @@ def local_bundle_adjust(
     selected = select_observations(sparse_map, window, config, with_neighbours=True)
     if len(window) < 2 or len(selected) == 0:
         return None
-    T_cw, keyframes = sparse_map.T_cw, selected.keyframes
-    fixed = ~torch.isin(keyframes, window) | (keyframes == 0)
+    poses, landmarks, T_cw = selected.keyframes, selected.landmarks, sparse_map.T_cw
+    fixed = ~torch.isin(poses, window) | (poses == 0)
     if not fixed.any():
         fixed[0] = True  # fix the gauge by the oldest keyframe
+    observations = selected.arguments(camera.K, fixed)
     result = bundle_adjust(
-        T_cw[keyframes],
-        sparse_map.landmarks["point"][selected.landmarks],
-        selected.observations,
-        camera,
-        fixed,
+        T_cw[poses],
+        sparse_map.landmarks["point"][landmarks],
+        **observations,
         iterations=_MAX_ITERATIONS,
         tolerance=_COST_TOLERANCE,
     )
     readout = sparse_map.readout
     if _is_calibration_due(sparse_map, keyframe, config.rolling_shutter):
-        derivatives = readout_cost_derivatives(
-            result.T_cw, result.points, selected.observations, camera, fixed, selected.readout_jacobian
+        readout_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, selected.rows)
+        estimate = estimate_readout(
+            *(readout.seconds, readout.information, readout_jacobian, result.T_cw, result.points), **observations
         )
-        readout = calibrate_readout(readout, *derivatives)
-    T_cw[keyframes[~fixed]] = orthonormalise(result.T_cw[~fixed])
-    outliers = selected.rows[result.chi2 > selected.observations.chi2_threshold]
-    return LocalAdjustment(T_cw, selected.landmarks, result.points, outliers, readout)
+        readout = Readout(*map(float, estimate))
+    T_cw[poses[~fixed]] = orthonormalise(result.T_cw[~fixed])
+    return LocalAdjustment(T_cw, landmarks, result.points, selected.rows[~result.inliers], readout)
 
 
 def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: RollingShutterConfig) -> bool:

@@ -6,10 +6,6 @@ Covisibility and the keyframe database are not stored, because they follow from 
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,7 +17,7 @@ import torch
 from v3d_torch.config import Config
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.io.files import atomic_write
+from v3d_torch.io.array_file import open_array_file, write_array_file
 from v3d_torch.io.paths import StrPath
 from v3d_torch.mapping.map_columns import fill_from_columns, find_inconsistency, to_columns
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -30,30 +26,13 @@ from v3d_torch.odometry.rolling_shutter import Readout
 
 _FORMAT, _VERSION = "v3d_torch map", 4
 
-_MIN_UNPACKED_LIMIT = 1 << 28
-"""Bytes to which any file may unpack, however small it is."""
-
-_MAX_UNPACKED_RATIO = 20
-"""Additional bytes to which a file may unpack, relative to its size. Maps unpack to about three times their size."""
+_FIX = "give a file written by --save-map"
 
 _PIXEL_TOLERANCE = 0.01
 """Maximum difference of intrinsics of the same camera, pixels: camera files differ in their number of digits."""
 
 _DISTORTION_TOLERANCE = 1e-5
 """Maximum difference of distortion coefficients of the same camera."""
-
-_DAMAGE_ERRORS = (
-    zipfile.BadZipFile,
-    zlib.error,
-    EOFError,
-    ValueError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    RuntimeError,
-    MemoryError,
-)
-"""Errors of zip archives, arrays and JSON with wrong or missing bytes."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +71,8 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
             **({"dense_map.stride": views.stride} if len(views) else {}),
         },
     }
-    arrays: dict[str, Any] = {name: column.numpy() for name, column in to_columns(sparse_map, views).items()}
-    with atomic_write(Path(path)) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, about=np.frombuffer(json.dumps(about).encode(), dtype=np.uint8), **arrays)
+    columns = to_columns(sparse_map, views)
+    write_array_file(Path(path), about, {name: column.numpy() for name, column in columns.items()})
 
 
 def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
@@ -110,38 +88,15 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     """
     path = Path(path)
     stored = StoredMap(SparseMap(config.mapping, config.features, camera), StaticViews(camera, config.dense_map.stride))
-    try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            _check_unpacked_size(archive, path.stat().st_size)
-            about = json.loads(_read_array(archive, "about").tobytes())
-            if about["format"] != _FORMAT:
-                raise ValueError(f"its format is not {_FORMAT!r}")
-            _check_compatibility(path, about, camera, config)
-            stored.map.readout = Readout.from_dict(about["readout"])
-            names = to_columns(stored.map, stored.views)
-            columns = {name: torch.from_numpy(_read_array(archive, name)) for name in names}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a file written by --save-map") from error
-    except _DAMAGE_ERRORS as error:
-        raise InputError(
-            f"{path}: is not a map file or is damaged ({error}); give a file written by --save-map"
-        ) from error
+    with open_array_file(path, _FORMAT, "a map file", _FIX) as file:
+        _check_compatibility(path, file.about, camera, config)
+        stored.map.readout = Readout.from_dict(file.about["readout"])
+        names = to_columns(stored.map, stored.views)
+        columns = {name: torch.from_numpy(file.read(name)) for name in names}
     if (problem := find_inconsistency(columns, stored.map, stored.views)) is not None:
-        raise InputError(f"{path}: is a damaged map file ({problem}); give a file written by --save-map")
+        raise InputError(f"{path}: is a damaged map file ({problem}); {_FIX}")
     fill_from_columns(columns, stored.map, stored.views)
     return stored
-
-
-def _check_unpacked_size(archive: zipfile.ZipFile, size: int) -> None:
-    """Raise ValueError if an archive of ``size`` bytes would unpack to far more bytes than any map."""
-    unpacked = sum(member.file_size for member in archive.infolist())
-    if unpacked > _MIN_UNPACKED_LIMIT + _MAX_UNPACKED_RATIO * size:
-        raise ValueError(f"it would unpack to {unpacked} bytes from {size}")
-
-
-def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray[Any, Any]:
-    """Read an array of an archive; its checksum is verified."""
-    return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
 
 
 def _check_compatibility(path: Path, about: Mapping[str, Any], camera: PinholeCamera, config: Config) -> None:

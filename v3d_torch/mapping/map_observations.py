@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,31 +11,42 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.features.features import pixel_sigma
-from v3d_torch.mapping.bundle_adjustment import Observations
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.tensor_table import unique_ids
+from v3d_torch.optim.reprojection import Measurements
 
 
 @dataclass(frozen=True)
 class MapObservations:
-    """Observations of K keyframes and P landmarks of a map.
+    """M observations of L landmarks by P keyframes of a map.
 
     Attributes:
         rows: Rows of the observations in the table of the map, int64, shape :math:`(M,)`.
-        keyframes: Indices of the keyframes, ascending, int64, shape :math:`(K,)`.
-        landmarks: IDs of the landmarks, ascending, int64, shape :math:`(P,)`.
-        observations: The observations; their poses and points are positions in ``keyframes`` and ``landmarks``.
-        readout_jacobian: Derivative of the pixels with respect to the readout, pixels/s, float64, shape :math:`(M, 2)`.
+        keyframes: Indices of the keyframes, ascending, int64, shape :math:`(P,)`.
+        landmarks: IDs of the landmarks, ascending, int64, shape :math:`(L,)`.
+        pose: Position of the keyframe of each observation in ``keyframes``, int64, shape :math:`(M,)`.
+        point: Position of the landmark of each observation in ``landmarks``, int64, shape :math:`(M,)`.
+        measured: Measured pixels and inverse depths.
     """
 
     rows: Tensor
     keyframes: Tensor
     landmarks: Tensor
-    observations: Observations
-    readout_jacobian: Tensor
+    pose: Tensor
+    point: Tensor
+    measured: Measurements
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def arguments(self, K: Tensor, fixed: Tensor) -> dict[str, Any]:
+        """Arguments of `bundle_adjust` and `estimate_readout` other than poses and points.
+
+        Args:
+            K: Camera matrix, shape :math:`(3, 3)`.
+            fixed: Keyframes whose poses stay unchanged, bool, shape :math:`(P,)`.
+        """
+        return {**vars(self.measured), "pose": self.pose, "point": self.point, "K": K, "fixed": fixed}
 
 
 def select_observations(tables: MapTables, window: Tensor, config: Config, *, with_neighbours: bool) -> MapObservations:
@@ -59,12 +71,10 @@ def select_observations(tables: MapTables, window: Tensor, config: Config, *, wi
     rows = torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))
     keyframes, pose = unique_ids(table["keyframe"][rows], len(tables.keyframes))
     landmarks, point = unique_ids(table["landmark"][rows], count)
-    observations = Observations(
+    measured = Measurements(
         uv=table["uv"].index_select(0, rows),
         inverse_depth=table["inverse_depth"][rows],
         pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
         inverse_depth_sigma=config.tracking.inverse_depth_sigma,
-        pose=pose,
-        point=point,
     )
-    return MapObservations(rows, keyframes, landmarks, observations, table["readout_jacobian"].index_select(0, rows))
+    return MapObservations(rows, keyframes, landmarks, pose, point, measured)

@@ -8,8 +8,17 @@ estimate of the readout, and its curvature is the information of that estimate.
 
 from __future__ import annotations
 
+import torch
+from torch import Tensor
+
 from v3d_torch.geometry.camera import MAX_READOUT
-from v3d_torch.odometry.rolling_shutter import Readout
+from v3d_torch.kernels import bundle_adjustment as kernels
+from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.mapping.bundle_adjustment import sort_by_point
+from v3d_torch.mapping.bundle_problem import NEGLIGIBLE_DAMPING, BundleProblem, prepare_bundle
+from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
+from v3d_torch.optim.schur import REGULARISATION
+from v3d_torch.runtime.batches import fill_padding, from_rows, to_rows
 
 _PRIOR_WEIGHT = 0.8
 """Weight of the earlier information. Successive local bundle adjustments share most of their observations, and the
@@ -20,24 +29,186 @@ _INFORMATION_WEIGHT = 0.1
 that the curvature overestimates the information; 0.1 stands for standard deviations that are three times larger."""
 
 
-def calibrate_readout(prior: Readout, slope: float, curvature: float) -> Readout:
-    """Combine the current estimate of the readout with the minimum of the cost.
+def estimate_readout(
+    seconds: Tensor | float,
+    information: Tensor | float,
+    readout_jacobian: Tensor,
+    T_cw: Tensor,
+    points: Tensor,
+    uv: Tensor,
+    pose: Tensor,
+    point: Tensor,
+    K: Tensor,
+    inverse_depth: Tensor | None = None,
+    pixel_sigma: Tensor | float = 1.0,
+    inverse_depth_sigma: Tensor | float = INVERSE_DEPTH_SIGMA,
+    fixed: Tensor | None = None,
+    weights: Tensor | None = None,
+    valid: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Improve an estimate of the readout, the time that a camera takes to read the rows of an image.
+
+    The adjusted observations were compensated with the earlier estimate. A linear step predicts how poses and
+    landmarks, and the minimum cost, would change with another readout. The minimum of that parabola is combined with
+    the earlier estimate, which is discounted, because successive adjustments share observations.
+
+    Differentiable in all inputs. The method is this project's; cf. Hedborg et al., Rolling Shutter Bundle Adjustment,
+    CVPR 2012.
 
     Args:
-        prior: Current estimate of the readout.
-        slope: First derivative of the cost (twice the negative log-likelihood) with respect to the readout in
-            seconds, at the current estimate.
-        curvature: Second derivative of the cost with respect to the readout.
+        seconds: Earlier estimate of the time from the first to the last row, seconds, for which ``uv`` was compensated,
+            a number or shape :math:`(*)`.
+        information: Inverse variance of ``seconds``, 1/s^2, a number or shape :math:`(*)`; infinite if it is known.
+        readout_jacobian: Derivatives of ``uv`` by the readout, pixels per second, shape :math:`(*, M, 2)`; see
+            :func:`compensate_rolling_shutter`.
+        T_cw: Poses at the minimum of the bundle adjustment, shape :math:`(*, P, 4, 4)`. These and all other arguments
+            are those of :func:`bundle_adjust`.
+        points: Landmarks at the minimum, world frame, metres, shape :math:`(*, L, 3)`.
+        uv: Observed pixels, undistorted, shape :math:`(*, M, 2)`.
+        pose: Index of the pose that made each observation, int64, shape :math:`(*, M)`.
+        point: Index of the observed landmark, int64, shape :math:`(*, M)`.
+        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured, as it is by default.
+        pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
+        fixed: Poses that stayed unchanged, bool, shape :math:`(*, P)`; only the first by default.
+        weights: Weight of each observation, not negative, shape :math:`(*, M)`; 1 by default.
+        valid: Observations that are not padding, bool, shape :math:`(*, M)`; all by default.
 
     Returns:
-        The new estimate. It equals ``prior`` if that is certain, or if the cost has no minimum because the camera
-        stood still or moved uniformly.
+        The new ``seconds`` and ``information``, with the dtype of ``T_cw``, shape :math:`(*)` each. They are the
+        earlier ones if these are known, or if the cost has no minimum because the camera stood still or moved
+        uniformly.
     """
-    if prior.is_certain or curvature <= 0:
-        return prior
-    minimum = prior.seconds - slope / curvature
-    prior_information = _PRIOR_WEIGHT * prior.information
-    information = _INFORMATION_WEIGHT * curvature / 2
-    total = prior_information + information
-    seconds = (prior_information * prior.seconds + information * min(max(minimum, -MAX_READOUT), MAX_READOUT)) / total
-    return Readout(seconds, total)
+    problem, state = prepare_bundle(
+        T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
+    )
+    sigma = fill_padding(pixel_sigma, valid, 1.0)[..., None] if isinstance(pixel_sigma, Tensor) else pixel_sigma
+    derivative = -fill_padding(readout_jacobian, None if valid is None else valid[..., None], 0.0) / sigma
+    by_readout = torch.cat([derivative, torch.zeros_like(derivative[..., :1])], dim=-1).mT.expand_as(problem.scale)
+    slope, curvature = reduced_cost_derivatives(*state, *problem, by_readout)
+    old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
+    old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
+    new_seconds, new_information = combine_readouts(old_seconds, old_information, slope, curvature)
+    return new_seconds.to(T_cw.dtype), new_information.to(T_cw.dtype)
+
+
+def combine_readouts(seconds: Tensor, information: Tensor, slope: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+    """Combine an estimate of the readout with the minimum of the cost.
+
+    Args:
+        seconds: Readout at which the cost was differentiated, shape :math:`(...)`.
+        information: Inverse variance of ``seconds``, 1/s^2, shape :math:`(...)`.
+        slope: First derivative of the cost, twice the negative log-likelihood, by the readout, shape :math:`(...)`.
+        curvature: Second derivative of the cost by the readout, shape :math:`(...)`.
+
+    Returns:
+        Seconds and information of the combination.
+    """
+    unchanged = information.isinf() | (curvature <= 0)
+    # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.
+    curvature, prior_information = torch.where(unchanged, 1.0, curvature), torch.where(unchanged, 1.0, information)
+    minimum = (seconds - slope / curvature).clamp(-MAX_READOUT, MAX_READOUT)
+    old, new = _PRIOR_WEIGHT * prior_information, _INFORMATION_WEIGHT * curvature / 2
+    combined = (old * seconds + new * minimum) / (old + new)
+    return torch.where(unchanged, seconds, combined), torch.where(unchanged, information, old + new)
+
+
+def _reduced_cost_derivatives_compiled(
+    T_cw: Tensor,
+    points: Tensor,
+    scale: Tensor,
+    offset: Tensor,
+    thresholds: Tensor,
+    weights: Tensor,
+    pose: Tensor,
+    point: Tensor,
+    fixed: Tensor,
+    derivative: Tensor,
+) -> tuple[Tensor, Tensor]:
+    batch = fixed.shape[:-1]
+    if 0 in batch:
+        return NotImplemented
+    problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
+    poses, landmarks, derivatives = to_rows(T_cw, batch), to_rows(points, batch), to_rows(derivative.mT, batch)
+    settings = NEGLIGIBLE_DAMPING, REGULARISATION, MIN_DEPTH
+    results = [
+        kernels.reduced_cost_derivatives(T, X, *problem, j[order], *settings)
+        for T, X, j, (order, problem) in zip(poses, landmarks, derivatives, problems, strict=True)
+    ]
+    slope, curvature = from_rows(results, batch)
+    return slope, curvature
+
+
+@compiled_by(_reduced_cost_derivatives_compiled)
+def reduced_cost_derivatives(
+    T_cw: Tensor,
+    points: Tensor,
+    scale: Tensor,
+    offset: Tensor,
+    thresholds: Tensor,
+    weights: Tensor,
+    pose: Tensor,
+    point: Tensor,
+    fixed: Tensor,
+    derivative: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Derivatives of the minimum cost of a bundle adjustment with respect to a parameter of the measurements.
+
+    Poses and points are adjusted again when the parameter changes, see `BundleProblem.remaining`.
+
+    Args:
+        T_cw: Poses at the minimum, float64, shape :math:`(..., P, 4, 4)`.
+        points: Landmarks at the minimum, float64, shape :math:`(..., L, 3)`.
+        scale: See `BundleProblem`, also for the arguments that follow.
+        offset: Shape :math:`(..., 3, M)`.
+        thresholds: Shape :math:`(..., M)`.
+        weights: Shape :math:`(..., M)`.
+        pose: Shape :math:`(..., M)`.
+        point: Shape :math:`(..., M)`.
+        fixed: Shape :math:`(..., P)`.
+        derivative: Derivative :math:`j` of the whitened residuals, shape :math:`(..., 3, M)`.
+
+    Returns:
+        First and second derivative of the minimum cost, shape :math:`(...)` each.
+    """
+    problem = BundleProblem(scale, offset, thresholds, weights, pose, point, fixed)
+    _, residuals = problem.residuals_at((T_cw, points))
+    weighted = 2 * residuals.weights[..., None, :] * problem.remaining(residuals, derivative, points.shape[-2])
+    return (weighted * residuals.whitened).sum(dim=(-2, -1)), (weighted * derivative).sum(dim=(-2, -1))
+
+
+class ReadoutEstimator(torch.nn.Module):
+    """:func:`estimate_readout` as a module. A standard deviation that is a `torch.nn.Parameter` can be learnt.
+
+    Args:
+        pixel_sigma: Standard deviation of u and of v, pixels.
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m.
+    """
+
+    def __init__(
+        self, pixel_sigma: Tensor | float = 1.0, inverse_depth_sigma: Tensor | float = INVERSE_DEPTH_SIGMA
+    ) -> None:
+        super().__init__()
+        self.pixel_sigma = pixel_sigma
+        self.inverse_depth_sigma = inverse_depth_sigma
+
+    def forward(
+        self,
+        seconds: Tensor | float,
+        information: Tensor | float,
+        readout_jacobian: Tensor,
+        T_cw: Tensor,
+        points: Tensor,
+        uv: Tensor,
+        pose: Tensor,
+        point: Tensor,
+        K: Tensor,
+        inverse_depth: Tensor | None = None,
+        fixed: Tensor | None = None,
+        weights: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Improve readouts, shape :math:`(*)`, by M observations; see :func:`estimate_readout`."""
+        observed = uv, pose, point, K, inverse_depth, self.pixel_sigma, self.inverse_depth_sigma
+        return estimate_readout(seconds, information, readout_jacobian, T_cw, points, *observed, fixed, weights, valid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,34 +14,52 @@ from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, p
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.silhouette import Silhouette, silhouettes
-from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.objects.track import Track
+from v3d_torch.objects.track_matching import (
+    DEPTH_TOLERANCE,
+    DetectedInstances,
+    PredictedTracks,
+    compare_lost_tracks,
+    compare_tracks,
+    detect_instances,
+    predict_tracks,
+)
+from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
 _COARSE_COLUMNS = 160
 """Number of columns of the coarse masks that are compared: the resolution of the network's own masks."""
 
-_MIN_VISIBLE_FRACTION = 0.5
-"""An object is visible at its predicted position if the depth agrees with more than this fraction of its points."""
+_DUPLICATE_COVERAGE = 0.7
+"""An unmatched instance of which a larger fraction lies within a matched one of its class is a part of that object."""
 
-_MAX_BESIDE_OVERLAP = 0.1
-"""An instance lies beside a predicted mask if their intersection is less than this fraction of the smaller area."""
+_DUPLICATE_DISTANCE = 0.5
+"""Maximum distance of the centroids of an object and a part of it, metres."""
 
-_DEPTH_TOLERANCE = 0.2
-"""Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
+_MIN_FREE_FRACTION = 0.5
+"""The predicted place of a missed object is empty if the camera sees through more than this fraction of its points."""
+
+_MAX_VACANT_TIME = 0.5
+"""A missed object whose place was observed to be empty for longer has gone, seconds."""
 
 
 class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
-    An instance continues the track of its class with the nearest predicted centroid, or the track whose last or
-    predicted mask it overlaps, in the assignment with the smallest total cost. Appearance is not used. The state
-    (tracks and next id) is part of ``state_dict()``.
+    The instances of a frame continue tracks in four stages, each an optimal assignment: first confirmed tracks, then
+    lost ones, then new ones that are not confirmed yet; instances without a class continue what is left. A track that
+    is not detected is predicted with its mask for a short time. Then it is lost: it has no mask any more, but keeps its
+    id for some seconds, in case it was hidden or out of view. The state (tracks and next id) is part of
+    ``state_dict()``.
 
     Args:
         config: Gates and times.
         camera: Camera of all frames.
         voxel_size: Spacing of the points of the clouds, metres.
+
+    Attributes:
+        tracks: Tracks that were detected in the newest frame, or missed for at most the maximum time.
+        lost: Confirmed tracks that were missed for longer.
     """
 
     def __init__(self, config: TrackerConfig, camera: PinholeCamera, voxel_size: float) -> None:
@@ -50,11 +69,18 @@ class InstanceTracker(torch.nn.Module):
         self._voxel_size = voxel_size
         self._stride = max(1, camera.width // _COARSE_COLUMNS)
         self._next_id = 1
+        self._last_stamp = -torch.inf
         self.tracks: list[Track] = []
+        self.lost: list[Track] = []
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the tracks and the next id, for ``state_dict()``."""
-        return {"tracks": list(self.tracks), "next_id": self._next_id}
+        return {
+            "tracks": list(self.tracks),
+            "lost": list(self.lost),
+            "next_id": self._next_id,
+            "last_stamp": self._last_stamp,
+        }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Replace the tracks and the next id, for ``load_state_dict()``.
@@ -62,11 +88,17 @@ class InstanceTracker(torch.nn.Module):
         Args:
             state: Result of `get_extra_state`.
         """
-        self.tracks = list(state["tracks"])
-        self._next_id = state["next_id"]
+        self.tracks, self.lost = list(state["tracks"]), list(state["lost"])
+        self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
 
     def forward(
-        self, stamp: float, instances: Instances, clouds: InstanceClouds, depth: Tensor, T_wc: Tensor
+        self,
+        stamp: float,
+        instances: Instances,
+        clouds: InstanceClouds,
+        depth: Tensor,
+        T_wc: Tensor,
+        appearance: Tensor | None = None,
     ) -> list[Track]:
         """Update the tracks with a frame.
 
@@ -76,42 +108,33 @@ class InstanceTracker(torch.nn.Module):
             clouds: Clouds of the instances, camera frame.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             T_wc: Estimated camera-to-world pose, float64, shape :math:`(4, 4)`.
+            appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
         Returns:
             Tracks that were detected, or missed for at most the maximum time, sorted by id.
         """
-        step = self._stride
-        detections = [self._detection(stamp, clouds, i, T_wc) for i in range(len(instances))]
-        coarse_masks = pack_masks(instances.masks, step)
+        camera, stride = self._camera, self._stride
+        detected = detect_instances(stamp, instances, clouds, appearance, T_wc, stride)
+        predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._voxel_size, stride)
+        matches = self._match(predicted, detected)
 
-        # Predict each track, and check whether the object is visible there.
-        predicted = self._predict_silhouettes(stamp, T_wc)
-        coarse_depth = depth[:, ::step, ::step].contiguous()
-        predicted_masks = [self._predict_mask(silhouette, coarse_depth, step) for silhouette in predicted.values()]
-        predicted_coarse = dict(zip(predicted, map(pack_masks, predicted_masks), strict=True))
-        visible = torch.tensor(
-            [s.visible_fraction(depth, _DEPTH_TOLERANCE) > _MIN_VISIBLE_FRACTION for s in predicted.values()]
-        )
-
-        # Update matched tracks, and start a track for each instance without a match.
-        matches = self._match(stamp, instances, coarse_masks, detections, predicted_coarse, visible)
-        detected = set()
-        for i, detection in enumerate(detections):
-            masks = instances.masks[i], clouds.cloud_pixels[i], coarse_masks[i]
-            track = matches.get(i) or self._start_track(stamp, masks)
+        # Update matched tracks, and start a track for each instance without a match that is not a part of another one.
+        updated: list[Track] = []
+        for i, detection in enumerate(detected.detections):
+            track = matches.get(i)
+            if track is None and self._is_part(i, matches, detected):
+                continue
+            masks = instances.masks[i], clouds.cloud_pixels[i], detected.masks[i]
+            track = track or self._start_track(stamp, masks)
             track.add_detection(detection)
             track.set_masks(*masks, missed=False)
             track.update_label(int(instances.labels[i]), float(instances.scores[i]))
-            detected.add(track.id)
+            track.update_appearance(detected.appearance[i])
+            updated.append(track)
 
-        # Predict the masks of missed tracks, and remove those that were missed for too long.
-        self.tracks = [t for t in self.tracks if stamp - t.newest.stamp <= self._config.max_missed_time]
-        has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
-        for track in self.tracks:
-            if track.id not in detected:
-                mask = self._predict_mask(predicted[track], depth)
-                track.set_masks(mask, mask & has_depth, predicted_coarse[track], missed=True)
-        self._remove_duplicates(pack_masks(has_depth, step))
+        missed = self._predict_missed_tracks(stamp, depth, predicted, updated)
+        self.tracks = sorted([*updated, *missed], key=lambda track: track.id)
+        self._last_stamp = stamp
         return list(self.tracks)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
@@ -120,14 +143,58 @@ class InstanceTracker(torch.nn.Module):
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
-        for track in self.tracks:
+        for track in (*self.tracks, *self.lost):
             track.apply_world_correction(T_new_old)
 
-    def _detection(self, stamp: float, clouds: InstanceClouds, i: int, T_wc: Tensor) -> Detection3D:
-        """Return the detection of the i-th instance in the world frame."""
-        cloud = clouds.points[i, clouds.valid[i]]
-        R, t = T_wc[:3, :3], T_wc[:3, 3]
-        return Detection3D(stamp, R @ clouds.centroid[i].to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud))
+    def _match(self, predicted: PredictedTracks, detected: DetectedInstances) -> dict[int, Track]:
+        """Match instances to tracks in stages; return the track of each instance that continues one, by its index."""
+        matches: dict[int, Track] = {}
+        if len(detected) == 0:
+            return matches
+        labelled = detected.labels != UNLABELLED
+        evidence = _compare(predicted, detected, self._config)
+        named = torch.tensor([track.label != UNLABELLED for track in self.tracks], dtype=torch.bool)
+        confirmed = named & torch.tensor([track.is_confirmed for track in self.tracks], dtype=torch.bool)
+        free_instances = torch.ones(len(detected), dtype=torch.bool)
+        free_tracks = torch.ones(len(self.tracks), dtype=torch.bool)
+
+        def assign(rows: Tensor, columns: Tensor) -> None:
+            for i, j in _assign(evidence, rows & free_tracks, columns & free_instances):
+                matches[j] = self.tracks[i]
+                free_tracks[i], free_instances[j] = False, False
+
+        assign(confirmed, labelled)
+        for track, j in self._match_lost(detected, labelled & free_instances):
+            matches[j] = track
+            free_instances[j] = False
+        assign(~confirmed, labelled)
+        assign(~named, ~labelled)
+        assign(named, ~labelled)
+        return matches
+
+    def _match_lost(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:
+        """Match instances to lost tracks, which become tracks again; return the pairs."""
+        if not self.lost or not bool(columns.any()):
+            return []
+        evidence = compare_lost_tracks(self.lost, detected, self._config)
+        found = [(self.lost[i], j) for i, j in _assign(evidence, torch.ones(len(self.lost), dtype=torch.bool), columns)]
+        for track, _ in found:
+            track.restart(detected.stamp)
+            self.lost.remove(track)
+            self.tracks.append(track)
+        return found
+
+    def _is_part(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
+        """Check whether most of an instance lies within a matched instance of the same class and place."""
+        centroid = detected.detections[i].centroid
+        mask = detected.masks[i : i + 1]
+        minimum = _DUPLICATE_COVERAGE * int(count_pixels(mask))
+        return any(
+            detected.labels[j] == detected.labels[i]
+            and int(count_common_pixels(mask, detected.masks[j : j + 1])) > minimum
+            and not float((centroid - detected.detections[j].centroid).norm()) > _DUPLICATE_DISTANCE
+            for j in matches
+        )
 
     def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor]) -> Track:
         """Add a track with the next id and return it."""
@@ -136,89 +203,61 @@ class InstanceTracker(torch.nn.Module):
         self.tracks.append(track)
         return track
 
-    def _predict_silhouettes(self, stamp: float, T_wc: Tensor) -> dict[Track, Silhouette]:
-        """Project the predicted cloud of each track into the image."""
-        T_cw = invert(T_wc)
-        clouds = [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in self.tracks]
-        return dict(zip(self.tracks, silhouettes(clouds, self._camera, self._voxel_size), strict=True))
+    def _predict_missed_tracks(
+        self, stamp: float, depth: Tensor, predicted: PredictedTracks, updated: Sequence[Track]
+    ) -> list[Track]:
+        """Predict the masks of missed tracks, except those that have gone or are lost, and return them."""
+        missed, lost = [], []
+        has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
+        covered = self._covered(predicted.tracks, predicted.masks & pack_masks(has_depth, self._stride), updated)
+        for i, track in enumerate(predicted.tracks):
+            if track in updated:
+                continue
+            seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
+            if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
+                track.vacant_time += stamp - self._last_stamp
+            if track.vacant_time > _MAX_VACANT_TIME:
+                continue
+            is_late = stamp - track.newest.stamp > self._config.max_missed_time
+            if is_late or covered[i]:
+                lost.append(track)
+                continue
+            mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
+            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
+            track.visible = bool(predicted.visible[i])
+            missed.append(track)
+        for track in lost:
+            track.lose()
+        remembered = self._config.max_missed_time + self._config.max_lost_time
+        candidates = [*self.lost, *(track for track in lost if track.is_confirmed)]
+        self.lost = [track for track in candidates if stamp - track.newest.stamp <= remembered]
+        return missed
 
-    def _predict_mask(self, silhouette: Silhouette, depth: Tensor, step: int = 1) -> Tensor:
-        """Return the pixels of a silhouette whose depth agrees or is missing, for every n-th pixel; bool, (h, w)."""
-        return silhouette.mask(depth, 0, _DEPTH_TOLERANCE, step=step, include_missing=True)
-
-    def _match(
-        self,
-        stamp: float,
-        instances: Instances,
-        masks: Tensor,
-        detections: list[Detection3D],
-        predicted_coarse: dict[Track, Tensor],
-        visible: Tensor,
-    ) -> dict[int, Track]:
-        """Match instances to tracks.
-
-        Args:
-            stamp: Timestamp, seconds.
-            instances: N instances of the frame.
-            masks: Coarse masks of the instances, packed, shape (N, B).
-            detections: Detections of the instances.
-            predicted_coarse: Predicted coarse mask of each of the T tracks, packed, shape (B,).
-            visible: Tracks that are visible at their predicted position, bool, shape (T,).
-
-        Returns:
-            Track of each instance that continues one, by the index of the instance.
-        """
-        if not self.tracks or not detections:
-            return {}
-        predicted = torch.stack([track.predict_centroid(stamp) for track in self.tracks])
-        observed = torch.stack([detection.centroid for detection in detections])
-        # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
-        last_masks = torch.stack([track.coarse_mask for track in self.tracks])
-        predicted_masks = torch.stack(list(predicted_coarse.values()))
-        last_intersection, intersection = (count_common_pixels(each, masks) for each in (last_masks, predicted_masks))
-        last_areas, predicted_areas = (count_pixels(each)[:, None] for each in (last_masks, predicted_masks))
-        areas = count_pixels(masks)
-        overlap = torch.maximum(
-            _intersection_over_union(last_intersection, last_areas, areas),
-            _intersection_over_union(intersection, predicted_areas, areas),
-        )
-        covered = intersection > self._config.min_overlap * predicted_areas
-        # A detection beside an object that is visible at its predicted position is another object.
-        beside = intersection < _MAX_BESIDE_OVERLAP * torch.minimum(predicted_areas, areas)
-        elapsed = torch.tensor([stamp - track.newest.stamp for track in self.tracks], dtype=torch.float64)
-        gate = self._config.max_jump + self._config.max_speed * elapsed
-        same_class = torch.tensor([track.label for track in self.tracks])[:, None] == instances.labels
-        matched = match_instances(
-            predicted[None],
-            observed[None],
-            overlap[None],
-            same_class[None],
-            gate[None],
-            self._config.min_overlap,
-            covered=covered[None],
-            excluded=(visible[:, None] & beside)[None],
-        )[0]
-        return {i: self.tracks[track] for i, track in enumerate(matched.tolist()) if track >= 0}
-
-    def _remove_duplicates(self, has_depth: Tensor) -> None:
-        """Remove missed tracks whose predicted mask a detected track of the same class covers: they are one object.
+    def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
+        """Check for each track whether its predicted mask belongs to a detected track of the same class.
 
         Args:
-            has_depth: Coarse pixels with depth, packed, shape (B,).
+            tracks: T tracks.
+            coarse_masks: Their predicted coarse masks where there is depth, packed, shape (T, B).
+            updated: Tracks that were detected.
         """
-        missed = [track for track in self.tracks if track.missed]
-        located = [track for track in self.tracks if not track.missed and track.newest.is_located]
-        if not missed or not located:
-            return
-        masks = torch.stack([track.coarse_mask for track in missed]) & has_depth
-        intersection = count_common_pixels(masks, torch.stack([track.coarse_mask for track in located]))
-        same_class = torch.tensor([[track.label == other.label for other in located] for track in missed])
-        covered = intersection > self._config.min_overlap * count_pixels(masks)[:, None]
-        duplicate = (same_class & covered).any(dim=1)
-        removed = {track for track, is_duplicate in zip(missed, duplicate.tolist(), strict=True) if is_duplicate}
-        self.tracks = [track for track in self.tracks if track not in removed]
+        located = [track for track in updated if track.newest.is_located]
+        if not located or not tracks:
+            return [False] * len(tracks)
+        common = count_common_pixels(coarse_masks, torch.stack([other.coarse_mask for other in located]))
+        is_over = common > self._config.min_overlap * count_pixels(coarse_masks)[:, None]
+        same_class = torch.tensor([[track.label == other.label for other in located] for track in tracks])
+        covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
+        return covered
 
 
-def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Return the intersection over union from areas of intersections (A, B) and masks (A, 1) and (B,), float64."""
-    return (intersection / (a + b - intersection).clamp(min=1)).to(torch.float64)
+def _compare(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    if not predicted.tracks:
+        return torch.zeros(0, len(detected), dtype=torch.float64)
+    return compare_tracks(predicted, detected, config)
+
+
+def _assign(evidence: Tensor, rows: Tensor, columns: Tensor) -> list[tuple[int, int]]:
+    """Assign columns to rows by their evidence; return the pairs of indices."""
+    matched = match_instances(evidence[None], rows[None], columns[None])[0]
+    return [(i, j) for j, i in enumerate(matched.tolist()) if i >= 0]

@@ -45,6 +45,20 @@ class ConstantVelocityKalmanFilter:
         """
         return self._position + self._velocity * (stamp - self._stamp)
 
+    def innovation(self, stamp: float, position: Tensor, sigma: float) -> tuple[Tensor, float]:
+        """Compare a measured position with its prediction, without an update.
+
+        Args:
+            stamp: Timestamp, seconds, not before the last one.
+            position: Measured position, world frame, metres, float64, shape :math:`(3,)`.
+            sigma: Standard deviation of each coordinate, metres.
+
+        Returns:
+            Measured minus predicted position, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
+            square metres.
+        """
+        return position - self.predict(stamp), self._predict_covariance(stamp)[0] + sigma**2
+
     def update(self, stamp: float, position: Tensor, sigma: float) -> None:
         """Update the state with a measured position.
 
@@ -63,12 +77,7 @@ class ConstantVelocityKalmanFilter:
         self._stamp = stamp
 
     def _correct(self, stamp: float, position: Tensor, sigma: float) -> None:
-        # Predict the covariance with white acceleration noise.
-        dt, noise = stamp - self._stamp, self._acceleration_noise**2
-        pp, pv, vv = self._covariance
-        pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
-        pv += dt * vv + noise * dt**2 / 2
-        vv += noise * dt
+        pp, pv, vv = self._predict_covariance(stamp)
         position_gain, velocity_gain = pp / (pp + sigma**2), pv / (pp + sigma**2)
         self._covariance = pp - position_gain * pp, pv - position_gain * pv, vv - velocity_gain * pv
         predicted = self.predict(stamp)
@@ -76,6 +85,13 @@ class ConstantVelocityKalmanFilter:
         self._position = predicted + position_gain * innovation
         velocity = self._velocity + velocity_gain * innovation
         self._velocity = velocity * min(1.0, self._max_speed / max(float(velocity.norm()), _MIN_SPEED))
+
+    def _predict_covariance(self, stamp: float) -> tuple[float, float, float]:
+        """Predict the covariance with white acceleration noise."""
+        dt, noise = stamp - self._stamp, self._acceleration_noise**2
+        pp, pv, vv = self._covariance
+        pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
+        return pp, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the state into the corrected world.

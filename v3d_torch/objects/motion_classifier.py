@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isnan
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
@@ -60,6 +63,7 @@ class MotionClassifier:
         view: DepthView,
         newly_occupied: NewlyOccupied,
         feature_support: FeatureSupport,
+        appearance: Tensor | None = None,
     ) -> FrameObjects:
         """Track and classify the objects of a frame, and update the tracks with the result.
 
@@ -69,13 +73,14 @@ class MotionClassifier:
             view: Depth of the frame, with the pose from frame-to-frame motion.
             newly_occupied: Newly occupied pixels of the frame, see `FreeSpaceCheck`.
             feature_support: Features of the frame and their agreement with the camera motion.
+            appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
         Returns:
             Objects with their motion states, and the static mask.
         """
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
-        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw))
+        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]
         pairs = detection_pairs(detected, (*config.voting.baselines, config.chamfer.baseline))
 
@@ -100,11 +105,12 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
+        detected_masks = _UnionOfMasks(detected)
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=track.mask,
+                mask=_visible_mask(track, detected_masks),
                 centroid=track.predict_centroid(stamp),
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
@@ -195,3 +201,32 @@ class MotionClassifier:
         """Check whether tracking can use the pixels of an object with this motion state."""
         deforming = motion_state is MotionState.DEFORMING and self._config.chamfer.keep_deforming_features
         return deforming or motion_state is MotionState.STATIC
+
+
+class _UnionOfMasks:
+    """Union of the masks of the tracks of each class, made when it is first asked for.
+
+    Args:
+        tracks: Tracks.
+    """
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self._tracks = tracks
+        self._unions: dict[int, NDArray[np.bool_]] = {}
+
+    def __getitem__(self, label: int) -> NDArray[np.bool_] | None:
+        """Return the union of a class, shape (H, W); None if there is no track of it."""
+        masks = [track.mask.numpy() for track in self._tracks if track.label == label]
+        if label not in self._unions and masks:
+            self._unions[label] = np.logical_or.reduce(masks)
+        return self._unions.get(label)
+
+
+def _visible_mask(track: Track, detected: _UnionOfMasks) -> Tensor:
+    """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
+    if not track.missed:
+        return track.mask
+    if not track.visible:
+        return torch.zeros_like(track.mask)
+    others = detected[track.label]
+    return track.mask if others is None else torch.from_numpy(track.mask.numpy() & ~others)

@@ -208,9 +208,22 @@ class Silhouette:
         """
         if len(self._z) == 0:
             return 0.0
+        return float((np.abs(self._measured_depth(depth) - self._z) < tolerance).mean())
+
+    def count_seen_through(self, depth: Tensor, tolerance: float) -> int:
+        """Return the number of projected points behind which a surface is measured: their place is empty.
+
+        Args:
+            depth: Measured depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+            tolerance: Minimum distance of the surface from the point, metres.
+        """
+        return 0 if len(self._z) == 0 else int((self._measured_depth(depth) - self._z > tolerance).sum())
+
+    def _measured_depth(self, depth: Tensor) -> NDArray[np.float32]:
+        """Return the measured depth at each projected point, metres, shape (P,)."""
         _, height, width = depth.shape
         u, v = np.minimum(_CELL * self._cells + _CELL // 2, (width - 1, height - 1)).T
-        return float((np.abs(depth[0].numpy()[v, u] - self._z) < tolerance).mean())
+        return depth[0].numpy()[v, u]
 
 
 def _pixels_of_cells(first: int, count: int, step: int, size: int) -> slice:

@@ -21,6 +21,15 @@ _PARTIAL_SIGMA = 0.45
 """Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
 the hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
 
+_MIN_CONFIRMED_SCORE = 0.75
+"""Sum of the scores of the detections from which an object is confirmed: one strong detection or some weak ones."""
+
+_CONFIRMING_DYNAMIC_FRAMES = 2
+"""Number of frames in which the vote classified an object as dynamic that confirm it, whatever its scores."""
+
+_APPEARANCE_RATE = 0.1
+"""Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
+
 _HISTORY = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""
 
@@ -50,7 +59,7 @@ class Detection3D:
 
 @dataclass(eq=False)  # compared by identity, so that a track can be a dictionary key
 class Track:
-    """One object with an id.
+    """One object.
 
     The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
     masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` and
@@ -61,15 +70,19 @@ class Track:
 
     Attributes:
         id: Number of the object, from 1, never reused.
-        first_stamp: Timestamp of the first detection, seconds.
+        first_stamp: Timestamp of the first detection since the object was last lost, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
+        visible: True if the object was detected in the newest frame, or the depth shows it at its predicted position.
+        is_confirmed: True if scores or motion have shown that the object exists.
         detections: Detections of the last second, newest last, at least one.
         labels: Number of detections of each class.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
         total_score: Sum of the scores of all detections.
+        appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
+        vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
@@ -82,10 +95,14 @@ class Track:
     cloud_pixels: Tensor
     coarse_mask: Tensor
     missed: bool = False
+    visible: bool = True
+    is_confirmed: bool = False
     detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
     label: int = UNLABELLED
     total_score: float = 0.0
+    appearance: Tensor | None = None
+    vacant_time: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
@@ -98,6 +115,11 @@ class Track:
     def newest(self) -> Detection3D:
         """Newest detection."""
         return self.detections[-1]
+
+    @property
+    def velocity(self) -> Tensor:
+        """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
+        return self._filter.velocity
 
     def detection_pair(self, baseline: float) -> tuple[Detection3D, Detection3D] | None:
         """Return the newest detection and an earlier one to compare it with.
@@ -114,19 +136,14 @@ class Track:
                 return (previous, current) if previous.is_located and current.is_located else None
         return None
 
-    @property
-    def velocity(self) -> Tensor:
-        """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
-        return self._filter.velocity
-
     def predict_centroid(self, stamp: float) -> Tensor:
-        """Predict the centroid with constant velocity (paper, Sec. II).
+        """Predict the position with constant velocity (paper, Sec. II).
 
         Args:
             stamp: Timestamp, seconds.
 
         Returns:
-            Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
+            Position, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
         """
         return self._filter.predict(stamp)
 
@@ -141,6 +158,18 @@ class Track:
         """
         return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
 
+    def innovation(self, detection: Detection3D) -> tuple[Tensor, float]:
+        """Compare the centroid of a detection with its prediction.
+
+        Args:
+            detection: Detection, not older than the newest one.
+
+        Returns:
+            Measured minus predicted centroid, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
+            square metres.
+        """
+        return self._filter.innovation(detection.stamp, detection.centroid, self._centroid_sigma(detection))
+
     def add_detection(self, detection: Detection3D) -> None:
         """Add a detection, update the Kalman filter, and drop detections older than the history.
 
@@ -148,25 +177,52 @@ class Track:
             detection: Detection, not older than the newest one.
         """
         self._max_points = max(self._max_points, len(detection.cloud))
-        hidden_fraction = 1 - len(detection.cloud) / self._max_points
-        sigma = _CENTROID_SIGMA + _PARTIAL_SIGMA * hidden_fraction
-        self._filter.update(detection.stamp, detection.centroid, sigma)
+        self._filter.update(detection.stamp, detection.centroid, self._centroid_sigma(detection))
+        self.vacant_time = 0.0
         self.detections.append(detection)
         oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
+
+    def lose(self) -> None:
+        """Drop the masks and all but the newest detection, which only an object in view needs."""
+        nothing = torch.zeros(0, 0, dtype=torch.bool)
+        self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True)
+        self.visible = False
+        self.detections = self.detections[-1:]
+
+    def restart(self, stamp: float) -> None:
+        """Forget the detections before an object was lost: motion is measured anew.
+
+        Args:
+            stamp: Timestamp of the first detection afterwards, seconds.
+        """
+        self.first_stamp = stamp
+        self.detections = []
 
     def update_label(self, label: int, score: float) -> None:
         """Update the class with the class of a detection.
 
         Args:
             label: Class index.
-            score: Score of the detection.
+            score: Score of the detection; 0 if it has none.
         """
         self.labels[label] += 1
         self.total_score += score
+        if self.total_score >= _MIN_CONFIRMED_SCORE:
+            self.is_confirmed = True
         named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
         self.label = (named or self.labels).most_common(1)[0][0]
+
+    def update_appearance(self, histogram: Tensor) -> None:
+        """Update the mean colour histogram.
+
+        Args:
+            histogram: Colour histogram of a detection, float32, shape :math:`(D,)`. NaN is ignored.
+        """
+        if bool(histogram[0].isnan()):
+            return
+        self.appearance = histogram if self.appearance is None else self.appearance.lerp(histogram, _APPEARANCE_RATE)
 
     def set_masks(self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool) -> None:
         """Set the masks of the newest frame.
@@ -183,6 +239,7 @@ class Track:
         """Record that the vote classified the object as dynamic in the frame at ``stamp``, seconds."""
         self.last_dynamic = stamp
         self.dynamic_frames += 1
+        self.is_confirmed = self.is_confirmed or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
 
     def mark_deforming(self, stamp: float) -> None:
         """Record that the object deforms in the frame at ``stamp``, seconds."""
@@ -199,3 +256,8 @@ class Track:
         self.detections = [
             Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
         ]
+
+    def _centroid_sigma(self, detection: Detection3D) -> float:
+        """Return the standard deviation of each coordinate of the centroid of a detection, metres."""
+        fewer, more = sorted((len(detection.cloud), self._max_points))
+        return _CENTROID_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)

@@ -8,19 +8,19 @@ whitened residual is a point-to-plane distance in units of the sensor noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from pypose import mat2SE3
-from pypose.lietensor.operation import SE3_Adj
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, orthonormalise
+from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
 from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_marquardt
+from v3d_torch.runtime.batches import common_batch
 
 _COARSE_INVERSE_DEPTH_SIGMA = 0.02
 """Minimum standard deviation of inverse depth above the finest level, 1/m. It gives brightness more weight there: depth
@@ -36,14 +36,15 @@ _TOLERANCE = 1e-3
 """Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
 
 
-@dataclass(frozen=True)
-class DenseAlignment:
+class DenseAlignment(NamedTuple):
     """Motion between two views found by dense alignment, with measures of its quality.
 
     Attributes:
-        T_ba: Maps points from the reference's camera a to the current camera b, float64, shape :math:`(4, 4)`.
+        T_ba: Maps points from the reference's camera a to the current camera b, float64, shape :math:`(*, 4, 4)`.
+        reliable: True if all measures of quality are within their limits, bool, shape :math:`(*)`. All other attributes
+            have this shape, too, if no other is given.
         overlap: Fraction of the reference points that lie on static pixels of the current view.
-        inliers: Number of points whose depth agrees in both views.
+        inliers: Number of points whose depth agrees in both views, int64.
         inlier_ratio: Inliers as a fraction of the points with depth in both views.
         correlation: Correlation of the brightness of both views at the same points, from -1 to 1.
         photometric_rms: Root mean square of the brightness residuals after gain and bias, in brightness of the current
@@ -51,27 +52,70 @@ class DenseAlignment:
         geometric_rms: Root mean square of the inverse-depth residuals, 1/m.
         information: Information matrix (inverse covariance) of the left perturbation ``exp(xi) @ T_ba``,
             ``xi = [translation, rotation]``, metres and radians, with gain and bias marginalised, float64, shape
-            :math:`(6, 6)`. It treats pixels as independent, so its scale is too large.
+            :math:`(*, 6, 6)`. It treats pixels as independent, so its scale is too large.
         observability: Ratio of the smallest to the largest eigenvalue of the information, with translation in units of
             the median depth.
     """
 
     T_ba: Tensor
-    overlap: float
-    inliers: int
-    inlier_ratio: float
-    correlation: float
-    photometric_rms: float
-    geometric_rms: float
+    reliable: Tensor
+    overlap: Tensor
+    inliers: Tensor
+    inlier_ratio: Tensor
+    correlation: Tensor
+    photometric_rms: Tensor
+    geometric_rms: Tensor
     information: Tensor
-    observability: float
+    observability: Tensor
 
 
-class DenseAligner:
-    """Estimates the motion between two views from their static pixels.
+def align_depth(
+    grey_a: Tensor,
+    depth_a: Tensor,
+    grey_b: Tensor,
+    depth_b: Tensor,
+    camera: PinholeCamera,
+    T_ba: Tensor | None = None,
+    static_a: Tensor | None = None,
+    static_b: Tensor | None = None,
+    *,
+    config: DenseOdometryConfig | None = None,
+) -> DenseAlignment:
+    """Estimate the motion between RGB-D images from all pixels: dense alignment of brightness and depth.
+
+    Brightness and inverse-depth residuals are minimised together, coarse to fine, with the weights of a t-distribution,
+    and with gain and bias between the two images. The pairs of a batch are aligned one after the other, because the
+    number of usable pixels of each differs. Without gradients.
+
+    Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Dense Visual SLAM for RGB-D
+    Cameras, IROS 2013.
 
     Args:
-        config: Pyramid levels, noise, acceptance thresholds.
+        grey_a: Brightness of the reference images, from 0 to 1, with lens distortion, floating point, shape
+            :math:`(*, 1, H, W)`; computed with in float32.
+        depth_a: Depth of the reference images, metres, shape :math:`(*, 1, H, W)`; 0 = no measurement.
+        grey_b: Brightness of the current images, shape :math:`(*, 1, H, W)`.
+        depth_b: Depth of the current images, metres, shape :math:`(*, 1, H, W)`.
+        camera: Camera of all images, with lens distortion.
+        T_ba: Predicted motion, from the reference's camera to the current one, shape :math:`(*, 4, 4)`; the identity by
+            default.
+        static_a: Pixels of the reference images to align, bool, shape :math:`(*, H, W)`; all by default.
+        static_b: Pixels of the current images to align, bool, shape :math:`(*, H, W)`; all by default.
+        config: Pyramid levels, noise, limits of the quality; the defaults if None.
+
+    Returns:
+        The motion and its quality. NaN, and not reliable, if an image has no contrast or no depth.
+    """
+    align = DenseAligner(config or DenseOdometryConfig(), camera)
+    alignment: DenseAlignment = align(grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b)
+    return alignment
+
+
+class DenseAligner(torch.nn.Module):
+    """:func:`align_depth` as a module, which computes the camera models of its pyramid once.
+
+    Args:
+        config: Pyramid levels, noise, limits of the quality.
         camera: Camera of both views, with lens distortion. Levels with fewer than 2 rows or columns are skipped.
     """
 
@@ -83,6 +127,7 @@ class DenseAligner:
     residuals heavy-tailed."""
 
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
+        super().__init__()
         size = min(camera.width, camera.height)
         self._config = config
         self._halvings = tuple(halvings for halvings in config.halvings if size >= 2 << halvings) or (0,)
@@ -93,7 +138,44 @@ class DenseAligner:
         return DenseView(grey, depth, static, self._cameras, self._config)
 
     @torch.no_grad()
-    def __call__(self, a: DenseView, b: DenseView, T_ba: Tensor) -> DenseAlignment | None:
+    def forward(
+        self,
+        grey_a: Tensor,
+        depth_a: Tensor,
+        grey_b: Tensor,
+        depth_b: Tensor,
+        T_ba: Tensor | None = None,
+        static_a: Tensor | None = None,
+        static_b: Tensor | None = None,
+    ) -> DenseAlignment:
+        """Align images :math:`(*, 1, H, W)`; see :func:`align_depth`."""
+        images = grey_a, depth_a, grey_b, depth_b
+        for image in images:
+            KORNIA_CHECK_SHAPE(image, ["*", "1", str(grey_a.shape[-2]), str(grey_a.shape[-1])])
+        batch, size = common_batch(*(image.shape[:-3] for image in images)), grey_a.shape[-2:]
+        pixels = grey_a.new_ones(size, dtype=torch.bool)
+        motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
+        columns = (
+            *(image.to(torch.float32).expand(*batch, 1, *size).reshape(-1, 1, *size) for image in images),
+            motion.expand(*batch, 4, 4).reshape(-1, 4, 4),
+            *(
+                (pixels if static is None else static).expand(*batch, *size).reshape(-1, *size)
+                for static in (static_a, static_b)
+            ),
+        )
+        alignments = [
+            self._align(self.view(grey_a, depth_a, static_a), self.view(grey_b, depth_b, static_b), T_ba)
+            for grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b in zip(*columns, strict=True)
+        ]
+        failed = _failed_alignment(
+            grey_a.device
+        )  # also the first of all, which is dropped, so that none can be stacked
+        rows = [failed, *(failed if alignment is None else alignment for alignment in alignments)]
+        stacked = (torch.stack(list(column))[1:] for column in zip(*rows, strict=True))
+        return DenseAlignment(*(column.reshape((*batch, *column.shape[1:])) for column in stacked))
+
+    @torch.no_grad()
+    def align_views(self, a: DenseView, b: DenseView, T_ba: Tensor) -> DenseAlignment | None:
         """Estimate the motion from the reference view a to the current view b.
 
         Args:
@@ -106,7 +188,7 @@ class DenseAligner:
             motion is not observable, or the views disagree at the optimum.
         """
         alignment = self._align(a, b, T_ba)
-        return alignment if alignment is not None and self._is_reliable(alignment) else None
+        return alignment if alignment is not None and bool(alignment.reliable) else None
 
     def _align(self, a: DenseView, b: DenseView, T_ba: Tensor) -> DenseAlignment | None:
         *_, finest = self._halvings
@@ -135,41 +217,58 @@ class DenseAligner:
 
     def _summarise(self, problem: AlignmentProblem, result: OptimisationResult[State, System]) -> DenseAlignment:
         T_ba, (gain, _) = orthonormalise(result.state[0]), result.state[1]
-        residuals = problem.residuals(result.state)
+        residuals, config = problem.residuals(result.state), self._config
         (brightness, inverse_depth), valid_brightness = problem.reference.values.to(torch.float64), residuals.valid[0]
-        max_difference = self._MAX_DEPTH_SIGMAS * self._config.inverse_depth_sigma
-        inliers = residuals.valid[1] & (residuals.values[1].abs() <= max_difference)
-        rms = [float(r[v].square().mean().sqrt()) for r, v in zip(residuals.values, residuals.valid, strict=True)]
+        inliers = residuals.valid[1] & (
+            residuals.values[1].abs() <= self._MAX_DEPTH_SIGMAS * config.inverse_depth_sigma
+        )
+        rms = [r[v].square().mean().sqrt() for r, v in zip(residuals.values, residuals.valid, strict=True)]
         information = problem.information(result.system, valid_brightness)
-        scale = torch.ones(6, dtype=torch.float64)
+        scale = torch.ones_like(information[0])
         scale[:3] = 1 / inverse_depth.median()
         eigenvalues = torch.linalg.eigvalsh(scale[:, None] * information * scale)
-        left_to_right = SE3_Adj(mat2SE3(invert(T_ba)).tensor())  # exp(xi) T = T exp(Ad(T^-1) xi)
+        left_to_right = adjoint(invert(T_ba))  # exp(xi) T = T exp(Ad(T^-1) xi)
+        overlap = residuals.in_view.to(torch.float64).mean()
+        inlier_ratio = (inliers.sum() / (residuals.valid[1] | residuals.occluded).sum()).to(torch.float64)
+        correlation = _correlation(
+            brightness[valid_brightness], (gain * brightness + residuals.values[0])[valid_brightness]
+        )
+        observability = eigenvalues[0] / eigenvalues[-1]
+        limits = config.min_overlap, _MIN_INLIER_RATIO, _MIN_CORRELATION, config.min_observability
+        measures = overlap, inlier_ratio, correlation, observability
         return DenseAlignment(
             T_ba=T_ba,
-            overlap=float(residuals.in_view.to(torch.float64).mean()),
-            inliers=int(inliers.sum()),
-            inlier_ratio=float(inliers.sum() / (residuals.valid[1] | residuals.occluded).sum()),
-            correlation=_correlation(
-                brightness[valid_brightness], (gain * brightness + residuals.values[0])[valid_brightness]
-            ),
+            # False for NaN.
+            reliable=torch.stack([each >= limit for each, limit in zip(measures, limits, strict=True)]).all(),
+            overlap=overlap,
+            inliers=inliers.sum(),
+            inlier_ratio=inlier_ratio,
+            correlation=correlation,
             photometric_rms=rms[0],
             geometric_rms=rms[1],
             information=left_to_right.mT @ information @ left_to_right,
-            observability=float(eigenvalues[0] / eigenvalues[-1]),
-        )
-
-    def _is_reliable(self, alignment: DenseAlignment) -> bool:
-        """Check the quality of an alignment; NaN counts as bad."""
-        return (
-            alignment.overlap >= self._config.min_overlap
-            and alignment.inlier_ratio >= _MIN_INLIER_RATIO
-            and alignment.correlation >= _MIN_CORRELATION
-            and alignment.observability >= self._config.min_observability
+            observability=observability,
         )
 
 
-def _correlation(x: Tensor, y: Tensor) -> float:
+def _failed_alignment(device: torch.device) -> DenseAlignment:
+    """Result for images that cannot be aligned."""
+    unknown = torch.tensor(torch.nan, dtype=torch.float64, device=device)
+    return DenseAlignment(
+        T_ba=unknown.expand(4, 4),
+        reliable=unknown > 0,
+        overlap=unknown,
+        inliers=torch.zeros_like(unknown, dtype=torch.int64),
+        inlier_ratio=unknown,
+        correlation=unknown,
+        photometric_rms=unknown,
+        geometric_rms=unknown,
+        information=unknown.expand(6, 6),
+        observability=unknown,
+    )
+
+
+def _correlation(x: Tensor, y: Tensor) -> Tensor:
     """Pearson correlation; NaN if either input is constant."""
     x, y = x - x.mean(), y - y.mean()
-    return float((x * y).sum() / (x.norm() * y.norm()))
+    return (x * y).sum() / (x.norm() * y.norm())

@@ -81,12 +81,12 @@ class AlignmentProblem:
         self.reference, self._current = reference.reference_points, current
         self._degrees_of_freedom = config.degrees_of_freedom
         initial = self.residuals(initial_state)
-        self._sigma = torch.tensor([[self._MIN_BRIGHTNESS_SIGMA], [inverse_depth_sigma]], dtype=torch.float64)
+        self._sigma = initial.values.new_tensor([[self._MIN_BRIGHTNESS_SIGMA], [inverse_depth_sigma]])
         for sigma, values, valid in zip(self._sigma, initial.values, initial.valid, strict=True):
             if valid.any():
                 sigma.clamp_(min=student_t_scale(values[valid].square(), config.degrees_of_freedom))
         brightness = self.reference.values[0]
-        by_gain_and_bias = torch.zeros(2, len(self.reference.points), 2, dtype=torch.float64)
+        by_gain_and_bias = initial.values.new_zeros(2, len(self.reference.points), 2)
         by_gain_and_bias[0] = -torch.stack([brightness, torch.ones_like(brightness)], dim=-1)
         gain = initial_state[1][0]
         gains = torch.stack([gain, torch.ones_like(gain)])
@@ -100,7 +100,7 @@ class AlignmentProblem:
         points = self.reference.points @ T_ba[:3, :3].T + T_ba[:3, 3]
         in_front = points[:, 2] > self._MIN_DEPTH
         pixels = camera.distort(camera.project(points.where(in_front[:, None], 1.0))).to(torch.float32)
-        last = torch.tensor([camera.width - 1, camera.height - 1])
+        last = torch.tensor([camera.width - 1, camera.height - 1], device=pixels.device)
         in_image = in_front & ((pixels >= 0) & (pixels <= last)).all(dim=1)
         sampled = grid_sample(self._current.channels[None], (2 * pixels / last - 1)[None, None], align_corners=True)
         inverse_depth = 1 / points[:, 2]
@@ -116,17 +116,18 @@ class AlignmentProblem:
             in_view=known[0],
         )
 
-    def linearise(self, state: State) -> tuple[float, System]:
+    def linearise(self, state: State) -> tuple[Tensor, System]:
         """Mean robust cost, infinite with too few valid residuals, and normal equations."""
         residuals = self.residuals(state)
         if int(residuals.valid.sum()) < self._MIN_RESIDUALS:
-            return torch.inf, (torch.zeros(8, 8, dtype=torch.float64), torch.zeros(8, dtype=torch.float64))
+            none = residuals.values.new_zeros(8, 8)
+            return none.new_tensor(torch.inf), (none, none[0])
         costs, weights = student_t((residuals.values / self._sigma).square(), self._degrees_of_freedom)
         weights = (weights * residuals.valid / self._sigma.square()).flatten()
         weighted = (self._jacobian * weights[:, None]).T
         # Occluded points keep their clamped cost; otherwise a motion could lower the cost by occluding outliers.
         counted = torch.stack([residuals.valid[0], residuals.valid[1] | residuals.occluded])
-        return float(costs[counted].mean()), (weighted @ self._jacobian, weighted @ residuals.values.flatten())
+        return costs[counted].mean(), (weighted @ self._jacobian, weighted @ residuals.values.flatten())
 
     def information(self, system: System, valid_brightness: Tensor) -> Tensor:
         """Information matrix of ``xi``, with gain and bias marginalised, shape (6, 6).
@@ -144,7 +145,7 @@ class AlignmentProblem:
         return H[:6, :6] - marginalised - self._GRADIENT_NOISE * (pixel_jacobian.T @ pixel_jacobian)
 
 
-def step(state: State, system: System, damping: float) -> State:
+def step(state: State, system: System, damping: Tensor) -> State:
     """State after a damped Gauss-Newton step."""
     H, gradient = system
     diagonal = _DAMPING_FACTOR * damping * H.diagonal() + _REGULARISATION

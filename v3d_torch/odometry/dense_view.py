@@ -106,11 +106,15 @@ class Level:
         index = index[strongest >= 0]
 
         values = self.channels.flatten(1)[:, index]
-        points = self.level_camera.camera.rays.flatten(0, 1)[index] / values[1, :, None]
+        points = self.level_camera.camera.rays.flatten(0, 1).to(index.device)[index] / values[1, :, None]
         one = torch.ones_like(values[1])
         unit = Measurements(uv=one[:, None].expand(-1, 2), inverse_depth=one, pixel_sigma=one, inverse_depth_sigma=1.0)
-        point_jacobian = reprojection_jacobian(points, unit, self.level_camera.camera)  # of (u, v, 1/z), M x 3 x 6
-        pixel_jacobian = self.level_camera.distortion_jacobian.flatten(0, 1)[index] @ point_jacobian[:, :2]
+        point_jacobian = reprojection_jacobian(
+            points, unit, self.level_camera.camera.K.to(points)
+        )  # of (u, v, 1/z), M x 3 x 6
+        pixel_jacobian = (
+            self.level_camera.distortion_jacobian.flatten(0, 1).to(index.device)[index] @ point_jacobian[:, :2]
+        )
         jacobian = (gradient.flatten(2)[:, :, index].permute(2, 0, 1) @ pixel_jacobian).transpose(0, 1)
         jacobian[1] -= point_jacobian[:, 2]  # the expected inverse depth changes with the point, too
         usable = torch.stack([jacobian[0].isfinite().all(dim=-1), same_surface.flatten()[index]])

@@ -74,7 +74,7 @@ class DepthDelayCompensation:
         """
         if not delay or not self._enabled:
             return features
-        pixel_velocity, rate = motion_field(features.uv, features.inverse_depth, velocity, self._camera)
+        pixel_velocity, rate = motion_field(features.uv, features.inverse_depth, velocity, self._camera.K)
         shifted = (features.pixel + delay * pixel_velocity).round().to(torch.int64)
         z = sample_depth(shifted, depth, self._max_depth)
         return replace(features, depth=torch.where(z > 0, z / (1 - delay * rate * z), 0.0))

@@ -116,10 +116,11 @@ class MotionEstimator:
         selected = torch.nonzero(a.depth > 0)[:, 0]
         if initial_guess is not None:
             selected = selected[select_evenly(a.pixel[selected], config.max_features, self._cell)]
-        pairs = match_descriptors(
+        matches = match_descriptors(
             a.descriptors[selected], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
         )
-        pairs = torch.stack([selected[pairs[:, 0]], pairs[:, 1]], dim=1)
+        matched = torch.nonzero(matches >= 0)[:, 0]
+        pairs = torch.stack([selected[matched], matches[matched]], dim=1)
         if pairs.shape[0] < config.min_inliers:
             return None
         epipolar = epipolar_inliers(
@@ -135,14 +136,13 @@ class MotionEstimator:
         pose = pnp_ransac(
             self._camera.back_project(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]]),
             b.uv[pairs[:, 1]],
-            self._camera,
+            self._camera.K,
+            initial_guess,
             threshold=_PNP_THRESHOLD,
             iterations=config.iterations,
             seed=self._seed,
-            initial_guess=initial_guess,
         )
-        if pose is None or int(pose[1].sum()) < config.min_inliers:
+        if int(pose.inliers.sum()) < config.min_inliers:
             return None
-        T_ba, inliers = pose
-        motion = RelativeMotion(T_ba, pairs[inliers])
+        motion = RelativeMotion(pose.T_cw, pairs[pose.inliers])
         return motion if motion.is_plausible(elapsed, config.max_speed) else None

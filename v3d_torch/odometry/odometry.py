@@ -123,7 +123,7 @@ class Odometry:
         motion = self._estimate_motion(previous.features, current.features, elapsed, T_ba)
         if motion is not None:
             return motion
-        alignment = self._align(self._dense_view(previous), self._dense_view(current), T_ba)
+        alignment = self._align.align_views(self._dense_view(previous), self._dense_view(current), T_ba)
         if alignment is None:
             return None
         motion = RelativeMotion(alignment.T_ba, torch.zeros(0, 2, dtype=torch.int64))

@@ -21,6 +21,7 @@ from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.runtime.batches import fill_padding
 
 
 @dataclass(frozen=True)
@@ -74,49 +75,135 @@ GLOBAL_SHUTTER = Readout(0.0, math.inf)
 
 
 def _compensate_compiled(
-    self: RollingShutterCompensation, features: Features, velocity: Tensor, readout: Readout
-) -> Features:
-    if velocity.dtype != torch.float64 or features.uv.requires_grad:
+    uv: Tensor,
+    row: Tensor,
+    inverse_depth: Tensor,
+    velocity: Tensor,
+    readout: Tensor | float,
+    K: Tensor,
+    height: int,
+    readout_jacobian: Tensor | None = None,
+    valid: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    is_single = uv.ndim == 2 and velocity.ndim == 1 and K.ndim == 2 and row.shape == inverse_depth.shape == uv.shape[:1]
+    if not is_single or any(each.dtype != torch.float64 for each in (uv, inverse_depth, velocity, K)):
         return NotImplemented
-    camera = self._camera
-    uv, readout_jacobian = kernels.compensate_rolling_shutter(
-        to_array(features.uv),
-        to_array(features.pixel),
-        to_array(features.inverse_depth),
-        to_array(features.readout_jacobian),
+    if isinstance(readout, Tensor) or readout_jacobian is None or valid is not None:
+        return NotImplemented
+    new_uv, new_jacobian = kernels.compensate_rolling_shutter(
+        to_array(uv),
+        to_array(row.to(torch.float64)),
+        to_array(inverse_depth),
         to_array(velocity),
-        readout.seconds,
-        camera.height,
-        (camera.fx, camera.fy, camera.cx, camera.cy),
+        to_array(K),
+        to_array(readout_jacobian),
+        readout,
+        height,
     )
-    return replace(features, uv=torch.from_numpy(uv), readout_jacobian=torch.from_numpy(readout_jacobian))
+    return torch.from_numpy(new_uv), torch.from_numpy(new_jacobian)
 
 
-class RollingShutterCompensation:
-    """Moves features to where they would have been observed at the time of the middle row.
+@compiled_by(_compensate_compiled)
+def compensate_rolling_shutter(
+    uv: Tensor,
+    row: Tensor,
+    inverse_depth: Tensor,
+    velocity: Tensor,
+    readout: Tensor | float,
+    K: Tensor,
+    height: int,
+    readout_jacobian: Tensor | None = None,
+    valid: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    r"""Move pixels to where a moving rolling-shutter camera would have observed them at the time of the middle row.
+
+    .. math::
+        u' = u + \tau j, \qquad j = - \left( \frac{v}{H - 1} - \frac{1}{2} \right) \dot u
+
+    with the readout :math:`\tau`, the row :math:`v` of an image of :math:`H` rows, and the motion field :math:`\dot u`
+    (Longuet-Higgins and Prazdny, 1980). Differentiable in all floating-point inputs.
+
+    Hedborg et al., Rolling Shutter Bundle Adjustment, CVPR 2012.
 
     Args:
-        camera: Intrinsics of the camera that observed the features.
+        uv: Undistorted pixels, as observed or compensated with ``readout_jacobian``, floating point, shape
+            :math:`(*, N, 2)`. All inputs are computed with in float64.
+        row: Row of each pixel in the recorded image, shape :math:`(*, N)`.
+        inverse_depth: Inverse depth of each pixel, 1/m, shape :math:`(*, N)`; 0 = not measured, such a pixel is moved
+            as one that is infinitely far.
+        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, shape
+            :math:`(*, 6)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
+        readout: Time from the first to the last row, seconds, a number or shape :math:`(*)`; negative if the rows are
+            read from the bottom up.
+        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        height: Number of rows of the image.
+        readout_jacobian: Earlier result for the same readout and another velocity, which is replaced; none by default.
+        valid: Pixels that are not padding, bool, shape :math:`(*, N)`; all by default.
+
+    Returns:
+        Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv`` and of shape
+        :math:`(*, N, 2)`; 0 for padding.
+    """
+    seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]
+    each = None if valid is None else valid[..., None]
+    observed = fill_padding(uv, each, 0.0)
+    if readout_jacobian is not None:
+        observed = observed - seconds * fill_padding(readout_jacobian, each, 0.0)
+    row, inverse_depth = fill_padding(row, valid, 0.0), fill_padding(inverse_depth, valid, 0.0)
+    pixel_velocity, _ = motion_field(observed, inverse_depth, velocity.to(torch.float64), K.to(torch.float64))
+    jacobian = -(row / (height - 1) - 0.5)[..., None] * pixel_velocity  # rows from -0.5 to 0.5
+    compensated = observed + seconds * jacobian
+    return fill_padding(compensated, each, 0.0).to(uv.dtype), fill_padding(jacobian, each, 0.0).to(uv.dtype)
+
+
+def compensate_features(features: Features, velocity: Tensor, readout: Readout, camera: PinholeCamera) -> Features:
+    """Compensate the rolling shutter for the features of a frame; see `compensate_rolling_shutter`.
+
+    Args:
+        features: Features as observed, or compensated with the same readout and another velocity.
+        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+            :math:`(6,)`.
+        readout: Readout of the camera.
+        camera: Camera that observed the features.
+
+    Returns:
+        The features with ``uv`` and ``readout_jacobian`` for this velocity.
+    """
+    uv, readout_jacobian = compensate_rolling_shutter(
+        *(features.uv, features.pixel[:, 1], features.inverse_depth, velocity, readout.seconds, camera.K),
+        camera.height,
+        features.readout_jacobian,
+    )
+    return replace(features, uv=uv, readout_jacobian=readout_jacobian)
+
+
+class RollingShutterCompensation(torch.nn.Module):
+    """:func:`compensate_rolling_shutter` as a module. A readout that is a `torch.nn.Parameter` can be learnt.
+
+    Args:
+        readout: Time from the first to the last row, seconds.
+        height: Number of rows of the image.
     """
 
-    def __init__(self, camera: PinholeCamera) -> None:
-        self._camera = camera
+    def __init__(self, readout: Tensor | float, height: int) -> None:
+        super().__init__()
+        self.readout = readout
+        self.height = height
 
-    @compiled_by(_compensate_compiled)
-    def __call__(self, features: Features, velocity: Tensor, readout: Readout) -> Features:
-        """Compensate the rolling shutter of a moving camera.
+    def forward(
+        self,
+        uv: Tensor,
+        row: Tensor,
+        inverse_depth: Tensor,
+        velocity: Tensor,
+        K: Tensor,
+        readout_jacobian: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Compensate pixels :math:`(*, N, 2)` for a velocity :math:`(*, 6)`.
 
-        Args:
-            features: Features as observed, or compensated with the same readout and another velocity.
-            velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
-                :math:`(6,)`.
-            readout: Readout of the camera.
-
-        Returns:
-            The features with ``uv`` and ``readout_jacobian`` for this velocity.
+        See :func:`compensate_rolling_shutter`.
         """
-        observed = features.uv - readout.seconds * features.readout_jacobian
-        pixel_velocity, _ = motion_field(observed, features.inverse_depth, velocity, self._camera)
-        row = features.pixel[:, 1:].to(torch.float64) / (self._camera.height - 1) - 0.5  # from -0.5 to 0.5
-        readout_jacobian = -row * pixel_velocity
-        return replace(features, uv=observed + readout.seconds * readout_jacobian, readout_jacobian=readout_jacobian)
+        return compensate_rolling_shutter(
+            uv, row, inverse_depth, velocity, self.readout, K, self.height, readout_jacobian, valid
+        )

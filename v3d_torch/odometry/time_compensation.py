@@ -8,7 +8,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.depth_delay import DepthDelayCompensation
-from v3d_torch.odometry.rolling_shutter import Readout, RollingShutterCompensation
+from v3d_torch.odometry.rolling_shutter import Readout, compensate_features
 
 
 class TimeCompensation:
@@ -22,7 +22,7 @@ class TimeCompensation:
     def __init__(self, config: Config, camera: PinholeCamera) -> None:
         self._depth_delay = camera.depth_delay
         self._compensate_depth_delay = DepthDelayCompensation(config, camera)
-        self._compensate_rolling_shutter = RollingShutterCompensation(camera)
+        self._camera = camera
 
     def __call__(
         self, features: Features, depth: Tensor, depth_delay: float, velocity: Tensor, readout: Readout
@@ -39,4 +39,4 @@ class TimeCompensation:
             readout: Readout of the camera.
         """
         features = self._compensate_depth_delay(features, depth, velocity, depth_delay + self._depth_delay)
-        return self._compensate_rolling_shutter(features, velocity, readout)
+        return compensate_features(features, velocity, readout, self._camera)

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
+
+from v3d_torch.kernels.compiler import can_read, is_all_true
 
 State = TypeVar("State")
 System = TypeVar("System")
@@ -37,13 +39,15 @@ def huber(squared: Tensor, threshold: Tensor | float) -> tuple[Tensor, Tensor]:
     Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics, 1964.
 
     Args:
-        squared: Squared errors :math:`s`, shape :math:`(M,)`.
-        threshold: Squared error :math:`k^2` at which the kernel turns linear, a number or shape :math:`(M,)`.
+        squared: Squared errors :math:`s`, any shape.
+        threshold: Squared error :math:`k^2` at which the kernel turns linear, a number or one for each error.
 
     Returns:
-        Costs :math:`\rho(s)` and weights :math:`d\rho / ds`, both of shape :math:`(M,)`.
+        Costs :math:`\rho(s)` and weights :math:`d\rho / ds`, both of the shape of ``squared``.
     """
-    weights = (threshold / squared.clamp(min=1e-300)).sqrt().clamp(max=1.0)
+    is_linear = squared > threshold
+    # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.
+    weights = torch.where(is_linear, threshold / torch.where(is_linear, squared, 1.0), 1.0).sqrt()
     return squared * weights * (2 - weights), weights  # beyond the threshold, squared * weights^2 equals the threshold
 
 
@@ -87,59 +91,83 @@ def student_t_scale(squared: Tensor, degrees_of_freedom: float) -> Tensor:
 
 @dataclass(frozen=True)
 class OptimisationResult(Generic[State, System]):
-    """Result of `levenberg_marquardt`.
+    """Result of `levenberg_marquardt` for a batch of problems, of any shape.
 
     Attributes:
-        state: State with the lowest cost.
+        state: States with the lowest costs.
         system: Result of ``linearise`` at ``state``.
-        cost_before: Cost of the initial state.
-        cost_after: Cost of ``state``.
-        iterations: Number of steps tried.
-        converged: True if the optimisation ended because the cost no longer changed.
+        cost_before: Costs of the initial states, shape :math:`(...)`.
+        cost_after: Costs of ``state``, shape :math:`(...)`.
+        iterations: Number of steps tried for each problem, int64, shape :math:`(...)`.
+        converged: True for problems whose cost no longer changed, bool, shape :math:`(...)`.
     """
 
     state: State
     system: System
-    cost_before: float
-    cost_after: float
-    iterations: int
-    converged: bool
+    cost_before: Tensor
+    cost_after: Tensor
+    iterations: Tensor
+    converged: Tensor
 
 
 def levenberg_marquardt(
     state: State,
-    linearise: Callable[[State], tuple[float, System]],
-    step: Callable[[State, System, float], State],
+    linearise: Callable[[State], tuple[Tensor, System]],
+    step: Callable[[State, System, Tensor], State],
     iterations: int,
     tolerance: float = 1e-6,
+    finished: Tensor | None = None,
 ) -> OptimisationResult[State, System]:
-    """Minimise a cost by damped Gauss-Newton steps.
+    """Minimise the costs of a batch of independent problems by damped Gauss-Newton steps.
 
     A step that lowers the cost is accepted and the damping reduced; otherwise the step is rejected and the damping
-    increased (Levenberg, 1944; Marquardt, 1963).
+    increased (Levenberg, 1944; Marquardt, 1963). Each problem of the batch has its own damping, and is no longer
+    changed once it has converged.
 
     Args:
-        state: Initial state.
-        linearise: Function from a state to its cost and its normal equations, in any form that ``step`` accepts.
-        step: Function from a state, its normal equations and the damping (relative to their diagonal) to the next
-            state.
+        state: Initial states: a tensor, or a tuple of tensors, whose first dimensions are those of the batch.
+        linearise: Function from states to their costs, shape :math:`(...)`, and their normal equations in any form that
+            ``step`` accepts, a tensor or a tuple of tensors.
+        step: Function from states, their normal equations and the damping (relative to their diagonal), shape
+            :math:`(...)`, to the next states.
         iterations: Maximum number of steps.
-        tolerance: Relative change of the cost below which the optimisation has converged.
+        tolerance: Relative change of the cost below which a problem has converged.
+        finished: Problems that are not changed at all, bool, shape :math:`(...)`; none by default.
 
     Returns:
-        The state with the lowest cost, and statistics.
+        The states with the lowest costs, and statistics.
     """
     cost, system = linearise(state)
-    cost_before, damping, iteration, converged = cost, _INITIAL_DAMPING, 0, False
-    while iteration < iterations and not converged:
+    cost_before, damping = cost, torch.full_like(cost, _INITIAL_DAMPING)
+    converged = torch.zeros_like(cost, dtype=torch.bool) if finished is None else finished
+    count = torch.zeros_like(cost, dtype=torch.int64)
+    for _ in range(iterations):
+        if is_all_true(converged):
+            break
         candidate = step(state, system, damping)
         new_cost, new_system = linearise(candidate)
-        iteration += 1
+        is_lower = new_cost < cost
         # A heavily damped step changes the cost little anyway and does not indicate convergence.
-        converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
-        if new_cost < cost:
-            state, cost, system = candidate, new_cost, new_system
-            damping = max(damping / _DAMPING_FACTOR, _MIN_DAMPING)
-        else:
-            damping = min(damping * _DAMPING_FACTOR, _MAX_DAMPING)
-    return OptimisationResult(state, system, cost_before, cost, iteration, converged)
+        is_small = (damping < 1) & ((cost - new_cost).abs() <= tolerance * (cost + tolerance))
+        accepted, count = is_lower & ~converged, count + ~converged
+        state, system, cost = select(accepted, (candidate, new_system, new_cost), (state, system, cost))
+        lower, higher = damping / _DAMPING_FACTOR, damping * _DAMPING_FACTOR
+        damping = torch.where(is_lower, lower.clamp(min=_MIN_DAMPING), higher.clamp(max=_MAX_DAMPING))
+        converged = converged | is_small
+    return OptimisationResult(state, system, cost_before, cost, count, converged)
+
+
+def select(mask: Tensor, new: Any, old: Any) -> Any:
+    """Select the elements of a batch from two values of the same form.
+
+    Args:
+        mask: True for elements of ``new``, false for those of ``old``, bool, shape :math:`(...)`.
+        new: A tensor of shape :math:`(..., *)`, or a tuple of such.
+        old: The same.
+    """
+    if mask.ndim == 0 and can_read(mask):  # a single problem: nothing to copy
+        return new if mask else old
+    if isinstance(new, Tensor):
+        return torch.where(mask.reshape(mask.shape + (1,) * (new.ndim - mask.ndim)), new, old)
+    parts = [select(mask, a, b) for a, b in zip(new, old, strict=True)]
+    return type(new)(*parts) if hasattr(new, "_fields") else tuple(parts)

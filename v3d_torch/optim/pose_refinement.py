@@ -8,19 +8,28 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
-from v3d_torch.optim.reprojection import MIN_DEPTH, Measurements, chi_square, perspective, perspective_jacobian, whiten
+from v3d_torch.kernels.compiler import compiled_by, is_all_true
+from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt, select
+from v3d_torch.optim.reprojection import (
+    INVERSE_DEPTH_SIGMA,
+    MIN_DEPTH,
+    chi_square,
+    perspective,
+    perspective_jacobian,
+    prepare_measurements,
+    whiten,
+)
+from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
 _TOLERANCE = 1e-3
 """Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
@@ -29,118 +38,301 @@ _REGULARISATION = 1e-9
 """Added to the diagonal of the normal equations, which are singular without measurements."""
 
 
-@dataclass(frozen=True)
-class _Linearisation:
-    """A camera pose and the residuals of N measurements there."""
-
-    T_cw: Tensor  # (4, 4)
-    in_camera: Tensor  # (3, N), landmarks in the camera frame, metres
-    projected: Tensor  # (3, N), as returned by `perspective`
-    residuals: Tensor  # (3, N), whitened
-    squared: Tensor  # (N,), sum of squared residuals
-
-
-@dataclass(frozen=True)
-class PoseRefinement:
+class PoseRefinement(NamedTuple):
     """Result of a pose refinement.
 
     Attributes:
-        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-        inliers: Mask of the measurements below their chi-square threshold, bool, shape :math:`(N,)`.
-        chi2: Squared whitened residual of each measurement, float64, shape :math:`(N,)`; infinite for landmarks behind
-            the camera.
+        T_cw: World-to-camera poses, shape :math:`(*, 4, 4)`.
+        inliers: Mask of the measurements below their chi-square threshold, bool, shape :math:`(*, N)`.
+        chi2: Squared whitened residual of each measurement, shape :math:`(*, N)`; infinite for landmarks behind the
+            camera, and for padding.
+        information: Information matrix (inverse covariance) of the left perturbation of the pose, shape
+            :math:`(*, 6, 6)`.
     """
 
     T_cw: Tensor
     inliers: Tensor
     chi2: Tensor
-    _information: Callable[[], Tensor]
-
-    @property
-    def information(self) -> Tensor:
-        """Information matrix (inverse covariance) of the pose's left perturbation, float64, shape :math:`(6, 6)`."""
-        return self._information()
+    information: Tensor
 
 
-def _refine_pose_compiled(
-    T_cw: Tensor, points: Tensor, measured: Measurements, camera: PinholeCamera, *, rounds: int = 4, iterations: int = 5
-) -> PoseRefinement:
-    if T_cw.dtype != torch.float64 or points.dtype != torch.float64 or points.shape[1:] != (3,):
-        return NotImplemented
-    target = whiten(measured, camera)
-    refined = kernels.refine_pose(
-        to_array(T_cw),
-        to_array(points),
-        to_array(target.scale),
-        to_array(target.offset),
-        to_array(measured.chi2_threshold),
-        rounds,
-        iterations,
-        _TOLERANCE,
-        _REGULARISATION,
-        MIN_DEPTH,
-        DAMPING_SCHEDULE,
-    )
-    T, inliers, chi2, H = map(torch.from_numpy, refined)
-    return PoseRefinement(orthonormalise(T), inliers, chi2, lambda: H)
+class _Residuals(NamedTuple):
+    """A camera pose and the residuals of N measurements there."""
+
+    T_cw: Tensor  # (..., 4, 4)
+    in_camera: Tensor  # (..., 3, N), landmarks in the camera frame, metres
+    projected: Tensor  # (..., 3, N), as returned by `perspective`
+    whitened: Tensor  # (..., 3, N)
+    squared: Tensor  # (..., N), sum of squared residuals
 
 
-@torch.no_grad()
-@compiled_by(_refine_pose_compiled)
+class _Problem(NamedTuple):
+    """N landmarks measured by one camera; the measurements are whitened."""
+
+    points: Tensor  # (..., N, 3), landmarks in the world frame, metres
+    scale: Tensor  # (..., 3, N)
+    offset: Tensor  # (..., 3, N)
+    thresholds: Tensor  # (..., N), chi-square threshold of an inlier
+    weights: Tensor  # (..., N)
+    valid: Tensor  # (..., N), bool
+
+    def residuals_at(self, T_cw: Tensor) -> _Residuals:
+        in_camera = T_cw[..., :3, :3] @ self.points.mT + T_cw[..., :3, 3:]
+        projected = perspective(in_camera)
+        whitened = torch.addcmul(self.offset, self.scale, projected)
+        return _Residuals(T_cw, in_camera, projected, whitened, (whitened * whitened).sum(dim=-2))
+
+    def chi2(self, at: _Residuals) -> Tensor:
+        return torch.where(self.valid, chi_square(at.in_camera.mT, at.whitened.mT), torch.inf)
+
+    def robust_cost(self, at: _Residuals, active: Tensor, *, robust: bool) -> tuple[Tensor, Tensor]:
+        """Cost of the active measurements, (...), and the weights of all in the normal equations, (..., N)."""
+        costs, weights = huber(at.squared, self.thresholds if robust else torch.inf)
+        influence = self.weights * active
+        return (costs * influence).sum(dim=-1), weights * influence
+
+    def normal_equations(self, at: _Residuals, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Halves of the Hessian, in the approximation of Gauss-Newton, and of the gradient: (..., 6, 6), (..., 6)."""
+        J, weighted = perspective_jacobian(at.projected).flatten(-2), weights[..., None, :] * self.scale
+        H = (J * (weighted * self.scale).flatten(-2)[..., None, :]) @ J.mT
+        return H, (J @ (weighted * at.whitened).flatten(-2)[..., None])[..., 0]
+
+    def step(self, at: _Residuals, weights: Tensor, damping: Tensor) -> _Residuals:
+        H, gradient = self.normal_equations(at, weights)
+        damped = H + torch.diag_embed(H.diagonal(dim1=-2, dim2=-1) * damping[..., None] + _REGULARISATION)
+        return self.residuals_at(se3_exp(-torch.linalg.solve(damped, gradient)) @ at.T_cw)
+
+    def differentiate(self, T_cw: Tensor, active: Tensor, *, robust: bool) -> Tensor:
+        """The optimum ``T_cw`` of the active measurements, with its derivatives by points, measurements and weights."""
+
+        def gradient(xi: Tensor, problem: _Problem) -> Tensor:
+            at = problem.residuals_at(se3_exp(xi) @ T_cw)
+            return problem.normal_equations(at, problem.robust_cost(at, active, robust=robust)[1])[1]
+
+        zero = T_cw.new_zeros(*T_cw.shape[:-2], 6)
+        H = jacobian(partial(gradient, problem=self.detach()), zero)
+        H = H + _REGULARISATION * torch.eye(6, dtype=H.dtype, device=H.device)
+        step = -torch.linalg.solve(H, gradient(zero, self))
+        return se3_exp(zero_with_gradient(step)) @ T_cw
+
+    def expand(self, batch: torch.Size) -> _Problem:
+        dimensions = (2, 2, 2, 1, 1, 1)  # of each column, without those of the batch
+        columns = zip(self, dimensions, strict=True)
+        return _Problem(*(column.expand(*batch, *column.shape[column.ndim - count :]) for column, count in columns))
+
+    def detach(self) -> _Problem:
+        return _Problem(*(column.detach() for column in self))
+
+
 def refine_pose(
     T_cw: Tensor,
     points: Tensor,
-    measured: Measurements,
-    camera: PinholeCamera,
+    uv: Tensor,
+    K: Tensor,
+    inverse_depth: Tensor | None = None,
+    pixel_sigma: Tensor | float = 1.0,
+    inverse_depth_sigma: Tensor | float = INVERSE_DEPTH_SIGMA,
+    weights: Tensor | None = None,
+    valid: Tensor | None = None,
     *,
     rounds: int = 4,
     iterations: int = 5,
+    tolerance: float = _TOLERANCE,
 ) -> PoseRefinement:
-    """Refine a predicted pose, and classify the measurements into inliers and outliers.
+    r"""Refine predicted poses, and classify the measurements into inliers and outliers.
 
-    Each round optimises the pose on the current inliers, then classifies all measurements anew. The first half of the
-    rounds uses Huber's kernel; the other half uses plain least squares.
+    Each pose minimises the weighted robust reprojection errors of its landmarks,
+
+    .. math::
+        \sum_k w_k\, \rho\left( \frac{\|u_k - \pi(T_{cw} X_k)\|^2}{\sigma_k^2}
+            + \frac{(1 / z_k - 1 / \hat z_k)^2}{\sigma_d^2} \right)
+
+    in rounds: each round optimises the pose on the current inliers, then classifies all measurements anew. The first
+    half of the rounds uses Huber's kernel; the other half uses plain least squares. With one round, all measurements
+    take part in the robust optimum, without classification.
+
+    The result is differentiable in all inputs except the prediction, by the implicit function theorem: memory does
+    not grow with the iterations. The Hessian is that of the robust cost of the last round, with the dependence of the
+    robust weights on the residuals. The classification is constant. The derivatives are as accurate as the optimum:
+    train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
+
+    Mur-Artal and Tardos, ORB-SLAM2, T-RO 2017, Sec. III-C; Gould et al., On Differentiating Parameterized Argmin and
+    Argmax Problems, 2016.
 
     Args:
-        T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
-        points: Landmark of each measurement, world frame, metres, float64, shape :math:`(N, 3)`.
-        measured: Measured pixels and inverse depths of the landmarks.
-        camera: Intrinsics.
-        rounds: Maximum number of rounds.
+        T_cw: Predicted world-to-camera poses, shape :math:`(*, 4, 4)`. All inputs are floating point, and computed with
+            in float64.
+        points: Landmark of each measurement, world frame, metres, shape :math:`(*, N, 3)`.
+        uv: Measured pixels, undistorted, shape :math:`(*, N, 2)`.
+        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0 = not measured, as it is by default.
+        pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, N)`.
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, N)`.
+        weights: Weight of each measurement, not negative, shape :math:`(*, N)`; 1 by default.
+        valid: Measurements that are not padding, bool, shape :math:`(*, N)`; all by default.
+        rounds: Maximum number of rounds, at least 1.
         iterations: Maximum number of Levenberg-Marquardt steps in a round.
+        tolerance: Relative change of the cost that ends a round.
 
     Returns:
-        The refined pose and its inliers. Without measurements, the prediction.
+        The refined poses and their inliers, with the dtype of ``T_cw``. Without measurements, the predictions.
+
+    Example:
+        Learn the weights of features through the poses of 32 frames:
+
+        >>> import torch, v3d_torch as v3d
+        >>> T_cw, K = torch.eye(4).repeat(32, 1, 1), torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        >>> points = torch.rand(32, 50, 3) * 2 + torch.tensor([-1.0, -1.0, 2.0])
+        >>> quality = torch.rand(32, 50, 1)  # something known about each feature
+        >>> noise = 5 * (1 - quality) * torch.randn(32, 50, 2)
+        >>> uv = 500 * points[..., :2] / points[..., 2:] + K[:2, 2] + noise
+        >>> network = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.Softplus())
+        >>> optimiser = torch.optim.Adam(network.parameters(), lr=0.1)
+        >>> for _ in range(10):
+        ...     refined = v3d.refine_pose(T_cw, points, uv, K, weights=network(quality)[..., 0], rounds=1)
+        ...     loss = v3d.se3_log(refined.T_cw).square().sum()  # the true poses are the identity
+        ...     optimiser.zero_grad()
+        ...     loss.backward()
+        ...     optimiser.step()
     """
-    target, thresholds = whiten(measured, camera), measured.chi2_threshold
+    KORNIA_CHECK_SHAPE(T_cw, ["*", "4", "4"])
+    KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
+    KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
+    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
+    scale, offset = whiten(measured, K.to(torch.float64))
+    thresholds = measured.chi2_threshold
+    problem = _Problem(
+        points=fill_padding(points, None if valid is None else valid[..., None], 0.0),
+        scale=scale,
+        offset=offset,
+        thresholds=thresholds,
+        weights=fill_padding(torch.ones_like(thresholds) if weights is None else weights, valid, 0.0),
+        valid=torch.ones_like(thresholds, dtype=torch.bool) if valid is None else valid,
+    )
+    initial = T_cw.detach().to(torch.float64)
+    batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2])
+    if batch:
+        initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
+    if not needs_gradient(*problem):
+        return _cast(_minimise(initial, *problem, rounds, iterations, tolerance)[0], T_cw.dtype)
+    found, active = _minimise(initial, *problem.detach(), rounds, iterations, tolerance)
+    robust = _is_robust(rounds - 1, rounds)
+    at = problem.residuals_at(problem.differentiate(found.T_cw, active, robust=robust))
+    information, _ = problem.normal_equations(at, problem.robust_cost(at, active, robust=robust)[1])
+    return _cast(PoseRefinement(at.T_cw, found.inliers, problem.chi2(at), information), T_cw.dtype)
 
-    def linearise(T_cw: Tensor) -> _Linearisation:
-        in_camera = torch.addmm(T_cw[:3, 3:], T_cw[:3, :3], points.T)
-        projected = perspective(in_camera)
-        residuals = target.residuals(projected)
-        return _Linearisation(T_cw, in_camera, projected, residuals, (residuals * residuals).sum(dim=0))
 
-    def robust_cost(at: _Linearisation, active: Tensor, threshold: Tensor | float) -> tuple[float, Tensor]:
-        costs, weights = huber(at.squared, threshold)
-        return float(costs @ active), weights * active
+def _is_robust(index: int, rounds: int) -> bool:
+    """Check whether a round uses Huber's kernel: the first half of the rounds does."""
+    return 2 * index < rounds
 
-    def normal_equations(at: _Linearisation, weights: Tensor) -> tuple[Tensor, Tensor]:
-        J, weighted = perspective_jacobian(at.projected).flatten(1), weights * target.scale
-        return (J * (weighted * target.scale).flatten()) @ J.T, J @ (weighted * at.residuals).flatten()
 
-    def step(at: _Linearisation, weights: Tensor, damping: float) -> _Linearisation:
-        H, gradient = normal_equations(at, weights)
-        H.diagonal().mul_(1 + damping).add_(_REGULARISATION)
-        return linearise(se3_exp(-torch.linalg.solve(H, gradient)) @ at.T_cw)
+def _cast(refined: PoseRefinement, dtype: torch.dtype) -> PoseRefinement:
+    if refined.T_cw.dtype == dtype:
+        return refined
+    return PoseRefinement(
+        refined.T_cw.to(dtype), refined.inliers, refined.chi2.to(dtype), refined.information.to(dtype)
+    )
 
-    at, inliers = linearise(T_cw), torch.ones(points.shape[0], dtype=torch.bool)
+
+def _minimise_compiled(
+    T_cw: Tensor,
+    points: Tensor,
+    scale: Tensor,
+    offset: Tensor,
+    thresholds: Tensor,
+    weights: Tensor,
+    valid: Tensor,
+    rounds: int,
+    iterations: int,
+    tolerance: float,
+) -> tuple[PoseRefinement, Tensor]:
+    batch, problem = T_cw.shape[:-2], (points, scale, offset, thresholds, weights, valid)
+    if 0 in batch:
+        return NotImplemented
+    settings = rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
+    rows = zip(*(to_rows(column, batch) for column in (T_cw, *problem)), strict=True)
+    results = [kernels.refine_pose(*(*row, *settings)) for row in rows]
+    T, inliers, active, chi2, H = from_rows(results, batch)
+    return PoseRefinement(orthonormalise(T), inliers, chi2, H), active
+
+
+@torch.no_grad()
+@compiled_by(_minimise_compiled)
+def _minimise(
+    T_cw: Tensor,
+    points: Tensor,
+    scale: Tensor,
+    offset: Tensor,
+    thresholds: Tensor,
+    weights: Tensor,
+    valid: Tensor,
+    rounds: int,
+    iterations: int,
+    tolerance: float,
+) -> tuple[PoseRefinement, Tensor]:
+    """Refine poses, and return the mask of the measurements that took part in the last round, bool, (..., N), too."""
+    problem = _Problem(points, scale, offset, thresholds, weights, valid)
+    at, inliers, active = problem.residuals_at(T_cw), valid, valid
+    finished = torch.zeros(T_cw.shape[:-2], dtype=torch.bool, device=T_cw.device)
     for index in range(rounds):
-        robust = 2 * index < rounds
-        problem = partial(robust_cost, active=inliers.to(points.dtype), threshold=thresholds if robust else torch.inf)
-        result = levenberg_marquardt(at, problem, step, iterations, tolerance=_TOLERANCE)
-        at, previous = result.state, inliers
-        chi2 = chi_square(at.in_camera.T, at.residuals.T)
-        inliers = chi2 <= thresholds
-        if not robust and torch.equal(inliers, previous):
+        active, robust = select(finished, active, inliers), _is_robust(index, rounds)
+        cost = partial(problem.robust_cost, active=active, robust=robust)
+        result = levenberg_marquardt(at, cost, problem.step, iterations, tolerance, finished)
+        at, previous, inliers = result.state, inliers, problem.chi2(result.state) <= thresholds
+        if not robust:
+            finished = finished | (inliers == previous).all(dim=-1)
+        if is_all_true(finished):
             break
-    return PoseRefinement(orthonormalise(at.T_cw), inliers, chi2, lambda: normal_equations(at, result.system)[0])
+    information, _ = problem.normal_equations(at, result.system)
+    return PoseRefinement(orthonormalise(at.T_cw), inliers, problem.chi2(at), information), active
+
+
+class PoseRefiner(torch.nn.Module):
+    """:func:`refine_pose` as a module. A standard deviation that is a `torch.nn.Parameter` can be learnt.
+
+    Args:
+        pixel_sigma: Standard deviation of u and of v, pixels.
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m.
+        rounds: Maximum number of rounds, at least 1.
+        iterations: Maximum number of Levenberg-Marquardt steps in a round.
+        tolerance: Relative change of the cost that ends a round.
+    """
+
+    def __init__(
+        self,
+        pixel_sigma: Tensor | float = 1.0,
+        inverse_depth_sigma: Tensor | float = INVERSE_DEPTH_SIGMA,
+        *,
+        rounds: int = 4,
+        iterations: int = 5,
+        tolerance: float = _TOLERANCE,
+    ) -> None:
+        super().__init__()
+        self.pixel_sigma = pixel_sigma
+        self.inverse_depth_sigma = inverse_depth_sigma
+        self.rounds = rounds
+        self.iterations = iterations
+        self.tolerance = tolerance
+
+    def forward(
+        self,
+        T_cw: Tensor,
+        points: Tensor,
+        uv: Tensor,
+        K: Tensor,
+        inverse_depth: Tensor | None = None,
+        weights: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> PoseRefinement:
+        """Refine poses :math:`(*, 4, 4)` by landmarks :math:`(*, N, 3)` at pixels :math:`(*, N, 2)`.
+
+        See :func:`refine_pose`.
+        """
+        return refine_pose(
+            *(T_cw, points, uv, K, inverse_depth, self.pixel_sigma, self.inverse_depth_sigma, weights, valid),
+            rounds=self.rounds,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+        )

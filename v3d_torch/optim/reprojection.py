@@ -14,13 +14,15 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.config import TrackingConfig
 from v3d_torch.kernels import whitening as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.runtime.batches import fill_padding
 
 CHI2_THRESHOLD_2D = 5.991
 """95 % quantile of the chi-square distribution with 2 degrees of freedom: inlier threshold for (u, v)."""
@@ -33,156 +35,190 @@ MIN_DEPTH = 0.05
 optimisation step moves behind the camera."""
 
 
+INVERSE_DEPTH_SIGMA = TrackingConfig().inverse_depth_sigma
+"""Default standard deviation of inverse depth, 1/m: that of the configuration."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
     """Measured pixels and inverse depths of landmarks.
 
     Attributes:
-        uv: Undistorted pixels, float64, shape :math:`(M, 2)`.
-        inverse_depth: Inverse of the measured depth along z, 1/m, float64, shape :math:`(M,)`; 0 = not measured.
-        pixel_sigma: Standard deviation of u and of v, pixels, shape :math:`(M,)`.
-        inverse_depth_sigma: Standard deviation of inverse depth, 1/m. It is constant, like the disparity noise of any
-            stereo or structured-light camera; the depth noise is this times z^2 (Khoshelham and Elberink, Sensors
-            2012).
+        uv: Undistorted pixels, shape :math:`(..., M, 2)`.
+        inverse_depth: Inverse of the measured depth along z, 1/m, shape :math:`(..., M)`; 0 = not measured.
+        pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`. It is about
+            constant, like the disparity noise of any stereo or structured-light camera; the depth noise is this times
+            z^2 (Khoshelham and Elberink, Sensors 2012).
     """
 
     uv: Tensor
     inverse_depth: Tensor
-    pixel_sigma: Tensor
-    inverse_depth_sigma: float
+    pixel_sigma: Tensor | float
+    inverse_depth_sigma: Tensor | float
 
     @property
     def chi2_threshold(self) -> Tensor:
-        """Chi-square threshold of an inlier, at 95 %, for each measurement, shape :math:`(M,)`."""
-        thresholds = torch.full_like(self.inverse_depth, CHI2_THRESHOLD_2D)
-        return thresholds.masked_fill_(self.inverse_depth > 0, _CHI2_THRESHOLD_3D)
+        """Chi-square threshold of an inlier, at 95 %, for each measurement, shape :math:`(..., M)`."""
+        threshold = torch.full_like(self.inverse_depth, CHI2_THRESHOLD_2D)
+        return threshold.masked_fill(self.inverse_depth > 0, _CHI2_THRESHOLD_3D)
 
 
-@dataclass(frozen=True)
-class WhitenedMeasurements:
+def prepare_measurements(
+    uv: Tensor,
+    inverse_depth: Tensor | None,
+    pixel_sigma: Tensor | float,
+    inverse_depth_sigma: Tensor | float,
+    valid: Tensor | None,
+) -> Measurements:
+    """Convert measurements to float64, and replace padding by numbers that spread neither NaN nor gradients.
+
+    Args:
+        uv: Undistorted pixels, shape :math:`(..., M, 2)`.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(..., M)`; None = not measured.
+        pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`.
+        valid: Measurements that are not padding, bool, shape :math:`(..., M)`; None = all.
+    """
+    if inverse_depth is None:
+        inverse_depth = torch.zeros_like(uv[..., 0])
+    return Measurements(
+        uv=fill_padding(uv, None if valid is None else valid[..., None], 0.0),
+        inverse_depth=fill_padding(inverse_depth, valid, 0.0),
+        pixel_sigma=fill_padding(pixel_sigma, valid, 1.0) if isinstance(pixel_sigma, Tensor) else pixel_sigma,
+        inverse_depth_sigma=fill_padding(inverse_depth_sigma, valid, 1.0)
+        if isinstance(inverse_depth_sigma, Tensor)
+        else inverse_depth_sigma,
+    )
+
+
+class WhitenedMeasurements(NamedTuple):
     """Measurements in whitened form: residual = ``scale * (x/z, y/z, 1/z) + offset``.
 
     Attributes:
-        scale: Focal lengths, and 1 for 1/z, divided by the standard deviations, float64, shape :math:`(3, M)`; 0 for
-            depth that was not measured.
-        offset: Principal point (0 for 1/z) minus measurement, divided by the standard deviations, float64, shape
-            :math:`(3, M)`.
+        scale: Focal lengths, and 1 for 1/z, divided by the standard deviations, shape :math:`(..., 3, M)`; 0 for depth
+            that was not measured.
+        offset: Principal point (0 for 1/z) minus measurement, divided by the standard deviations, shape
+            :math:`(..., 3, M)`.
     """
 
     scale: Tensor
     offset: Tensor
 
     def residuals(self, projected: Tensor) -> Tensor:
-        """Whitened residuals of points given by `perspective`, both of shape :math:`(3, M)`."""
+        """Whitened residuals of points given by `perspective`, both of shape :math:`(..., 3, M)`."""
         return torch.addcmul(self.offset, self.scale, projected)
 
 
-def _whiten_compiled(measured: Measurements, camera: PinholeCamera) -> WhitenedMeasurements:
-    columns = measured.uv, measured.inverse_depth, measured.pixel_sigma
-    if any(column.dtype != torch.float64 or column.requires_grad for column in columns) or measured.uv.ndim != 2:
+def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
+    uv, inverse_depth, sigma = measured.uv, measured.inverse_depth, measured.pixel_sigma
+    if uv.ndim != 2 or K.shape != (3, 3) or isinstance(measured.inverse_depth_sigma, Tensor):
         return NotImplemented
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
-    uv, inverse_depth, pixel_sigma = map(to_array, columns)
-    whitened = kernels.whiten(uv, inverse_depth, pixel_sigma, measured.inverse_depth_sigma, intrinsics)
-    return WhitenedMeasurements(*map(torch.from_numpy, whitened))
+    if not isinstance(sigma, Tensor):
+        sigma = torch.full_like(inverse_depth, sigma)
+    if any(each.requires_grad or each.dtype != torch.float64 for each in (uv, inverse_depth, sigma, K)):
+        return NotImplemented
+    if not len(uv) == len(inverse_depth) == sigma.numel():
+        return NotImplemented
+    arrays = to_array(uv), to_array(inverse_depth), to_array(sigma)
+    return WhitenedMeasurements(
+        *map(torch.from_numpy, kernels.whiten(*arrays, measured.inverse_depth_sigma, to_array(K)))
+    )
 
 
 @compiled_by(_whiten_compiled)
-def whiten(measured: Measurements, camera: PinholeCamera) -> WhitenedMeasurements:
+def whiten(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
     """Precompute the parts of the residuals that do not depend on the pose.
 
     Args:
         measured: Measured pixels and inverse depths.
-        camera: Intrinsics.
+        K: Camera matrix, shape :math:`(..., 3, 3)`.
     """
     u, v = measured.uv.unbind(-1)
+    fx, fy, cx, cy = (K[..., row, column, None] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     has_depth, sigma = measured.inverse_depth > 0, measured.pixel_sigma
     inverse_depth = torch.where(has_depth, measured.inverse_depth, 0)
-    return WhitenedMeasurements(
-        scale=torch.stack([camera.fx / sigma, camera.fy / sigma, has_depth.to(u.dtype) / measured.inverse_depth_sigma]),
-        offset=torch.stack(
-            [(camera.cx - u) / sigma, (camera.cy - v) / sigma, inverse_depth / -measured.inverse_depth_sigma]
-        ),
-    )
+    scale = fx * (1 / sigma), fy * (1 / sigma), has_depth.to(u.dtype) / measured.inverse_depth_sigma
+    offset = (cx - u) / sigma, (cy - v) / sigma, inverse_depth / -measured.inverse_depth_sigma
+    parts = torch.broadcast_tensors(*scale, *offset)
+    return WhitenedMeasurements(torch.stack(parts[:3], dim=-2), torch.stack(parts[3:], dim=-2))
 
 
 def perspective(points: Tensor) -> Tensor:
     """Normalised image coordinates and inverse depth (x/z, y/z, 1/z) of points.
 
     Args:
-        points: Points in the camera frame, metres, shape :math:`(3, M)`.
+        points: Points in the camera frame, metres, shape :math:`(..., 3, M)`.
 
     Returns:
-        Shape :math:`(3, M)`.
+        Shape :math:`(..., 3, M)`.
     """
-    w = 1 / points[2:].clamp(min=MIN_DEPTH)
-    return torch.cat([points[:2] * w, w])
-
-
-# With (a, b, w) = (x/z, y/z, 1/z), the derivatives of (a, b, w) by the six components of xi are
-#   (w, 0, 0), (0, w, 0), -w (a, b, w), -b (a, b, w) - (0, 1, 0), a (a, b, w) + (1, 0, 0), (-b, a, 0):
-# a constant part, a part linear in (a, b, w), and the products of (a, b, w) with (-w, -b, a).
-_CONSTANT, _LINEAR = torch.zeros(6, 3, 1, dtype=torch.float64), torch.zeros(6, 3, 3, dtype=torch.float64)
-_CONSTANT[3, 1], _CONSTANT[4, 0] = -1.0, 1.0
-_LINEAR[0, 0, 2], _LINEAR[1, 1, 2], _LINEAR[5, 0, 1], _LINEAR[5, 1, 0] = 1.0, 1.0, -1.0, 1.0
-_CONSTANT, _LINEAR = _CONSTANT.flatten(0, 1), _LINEAR.flatten(0, 1)
-_QUADRATIC = torch.tensor([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    w = 1 / points[..., 2:, :].clamp(min=MIN_DEPTH)
+    return torch.cat([points[..., :2, :] * w, w], dim=-2)
 
 
 def perspective_jacobian(projected: Tensor) -> Tensor:
     """Derivatives of `perspective` by the left perturbation of ``T_cw``.
 
     Args:
-        projected: Points given by `perspective`, shape :math:`(3, M)`.
+        projected: Points given by `perspective`, shape :math:`(..., 3, M)`.
 
     Returns:
-        Derivatives by translation, then rotation, shape :math:`(6, 3, M)`.
+        Derivatives by translation, then rotation, shape :math:`(..., 6, 3, M)`; those by the translation are also the
+        derivatives by the points.
     """
-    constant, linear, quadratic = (part.to(projected.dtype) for part in (_CONSTANT, _LINEAR, _QUADRATIC))
-    jacobian = torch.addmm(constant, linear, projected).unflatten(0, (6, 3))
-    jacobian[2:5].addcmul_((quadratic @ projected)[:, None], projected)
-    return jacobian
+    a, b, w = projected.unbind(dim=-2)  # (x/z, y/z, 1/z)
+    o = torch.zeros_like(w)
+    rows = (
+        *(w, o, o),
+        *(o, w, o),
+        *(-w * a, -w * b, -w * w),
+        *(-b * a, -b * b - 1, -b * w),
+        *(a * a + 1, a * b, a * w),
+        *(-b, a, o),
+    )
+    return torch.stack(rows, dim=-2).unflatten(-2, (6, 3))
 
 
-def reprojection_residuals(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
+def reprojection_residuals(points: Tensor, measured: Measurements, K: Tensor) -> Tensor:
     """Whitened reprojection residuals of (u, v, 1/z).
 
     Args:
-        points: Landmark of each measurement in the camera frame, metres, float64, shape :math:`(M, 3)`.
+        points: Landmark of each measurement in the camera frame, metres, shape :math:`(..., M, 3)`.
         measured: Measured pixels and inverse depths.
-        camera: Intrinsics.
+        K: Camera matrix, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Residuals in standard deviations, shape :math:`(M, 3)`; the third is 0 if depth was not measured. A transposed
-        view: the measurements are contiguous in memory.
+        Residuals in standard deviations, shape :math:`(..., M, 3)`; the third is 0 if depth was not measured. A
+        transposed view: the measurements are contiguous in memory.
     """
-    return whiten(measured, camera).residuals(perspective(points.T)).T
+    return whiten(measured, K).residuals(perspective(points.mT)).mT
 
 
-def reprojection_jacobian(points: Tensor, measured: Measurements, camera: PinholeCamera) -> Tensor:
+def reprojection_jacobian(points: Tensor, measured: Measurements, K: Tensor) -> Tensor:
     """Jacobian of the whitened reprojection residuals by the left perturbation of ``T_cw``.
 
     Args:
-        points: Landmark of each measurement in the camera frame, metres, float64, shape :math:`(M, 3)`.
+        points: Landmark of each measurement in the camera frame, metres, shape :math:`(..., M, 3)`.
         measured: Measured pixels and inverse depths.
-        camera: Intrinsics.
+        K: Camera matrix, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Shape :math:`(M, 3, 6)`; the first three columns are the Jacobian by ``points``, too. A transposed view: the
-        measurements are contiguous in memory.
+        Shape :math:`(..., M, 3, 6)`; the first three columns are the Jacobian by ``points``, too. A transposed view:
+        the measurements are contiguous in memory.
     """
-    scale = whiten(measured, camera).scale
-    return (perspective_jacobian(perspective(points.T)) * scale).permute(2, 1, 0)
+    scale = whiten(measured, K).scale
+    return (perspective_jacobian(perspective(points.mT)) * scale[..., None, :, :]).movedim(-1, -3).mT
 
 
 def chi_square(points: Tensor, residuals: Tensor) -> Tensor:
     """Squared whitened residuals; infinite for points that are not in front of the camera.
 
     Args:
-        points: Landmark of each measurement in the camera frame, metres, shape :math:`(M, 3)`.
-        residuals: Whitened residuals, shape :math:`(M, 3)`.
+        points: Landmark of each measurement in the camera frame, metres, shape :math:`(..., M, 3)`.
+        residuals: Whitened residuals, shape :math:`(..., M, 3)`.
 
     Returns:
-        Shape :math:`(M,)`.
+        Shape :math:`(..., M)`.
     """
-    return torch.where(points[:, 2] > MIN_DEPTH, (residuals * residuals).sum(dim=-1), torch.inf)
+    return torch.where(points[..., 2] > MIN_DEPTH, (residuals * residuals).sum(dim=-1), torch.inf)

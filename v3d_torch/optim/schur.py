@@ -6,14 +6,13 @@ With the free poses first and the points second, :math:`H = J^T W J` has the blo
     \begin{pmatrix} U & W^T \\ W & V \end{pmatrix}
     \begin{pmatrix} \xi \\ \delta \end{pmatrix} = - \begin{pmatrix} g_{pose} \\ g_{point} \end{pmatrix}
 
-for one or several right-hand sides, with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points
-are eliminated; the reduced camera system, 6 unknowns per pose, is solved densely (Triggs et al., Bundle Adjustment - A
-Modern Synthesis, 2000).
+with block-diagonal :math:`U` (6x6 blocks) and :math:`V` (3x3 blocks). The points are eliminated; the reduced camera
+system, 6 unknowns per pose, is solved densely (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,99 +22,128 @@ REGULARISATION = 1e-6
 which is 1e4 per square metre and more."""
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    r"""Blocks of the normal equations of F free poses, P points, N observations by free poses and C right-hand sides.
+class NormalEquations(NamedTuple):
+    r"""Blocks of the normal equations of F free poses, P points and M observations.
 
     Attributes:
-        U: Diagonal blocks of the poses, followed by the columns :math:`g_{pose}`, shape :math:`(F, 6, 6 + C)`.
-        V: Diagonal blocks of the points, followed by the columns :math:`g_{point}`, shape :math:`(3, 3 + C, P)`.
-        W: Point-by-pose block of each observation, shape :math:`(3, 6, N)`.
-        pose: Index of the free pose of each observation, int64, shape :math:`(N,)`.
-        point: Index of the point of each observation, int64, shape :math:`(N,)`.
+        U: Diagonal blocks of the poses, shape :math:`(..., 6, 6, F)`.
+        V: Diagonal blocks of the points, shape :math:`(..., 3, 3, P)`.
+        W: Point-by-pose block of each observation, shape :math:`(..., 3, 6, M)`.
+        pose_gradient: Gradient :math:`g_{pose}`, shape :math:`(*, ..., 6, F)`; there can be several for each matrix.
+        point_gradient: Gradient :math:`g_{point}`, shape :math:`(*, ..., 3, P)`.
+        pose: Index of the free pose of each observation, F for fixed poses, int64, shape :math:`(..., M)`.
+        point: Index of the point of each observation, int64, shape :math:`(..., M)`.
     """
 
     U: Tensor
     V: Tensor
     W: Tensor
+    pose_gradient: Tensor
+    point_gradient: Tensor
     pose: Tensor
     point: Tensor
 
 
 def gather_columns(rows: Tensor, index: Tensor) -> Tensor:
-    """Gather columns of a matrix; faster than indexing.
+    """Gather columns of matrices; faster than indexing.
 
     Args:
-        rows: Matrix, shape :math:`(n, K)`.
-        index: Indices of the columns, int64, shape :math:`(M,)`.
+        rows: Matrices, shape :math:`(..., n, K)`.
+        index: Indices of the columns, int64, shape :math:`(..., M)`.
 
     Returns:
-        Shape :math:`(n, M)`.
+        Shape :math:`(..., n, M)`.
     """
-    return rows.gather(1, index.expand(len(rows), -1))
+    return rows.gather(-1, index[..., None, :].expand(*rows.shape[:-1], index.shape[-1]))
 
 
-def solve_normal_equations(system: NormalEquations, damping: float) -> tuple[Tensor, Tensor]:
+def sum_columns(columns: Tensor, index: Tensor, count: int) -> Tensor:
+    """Sum the columns of matrices that have the same index, the inverse of `gather_columns`.
+
+    Args:
+        columns: Matrices, shape :math:`(..., n, M)`.
+        index: Index of the sum that each column belongs to, int64, shape :math:`(..., M)`; columns with the index
+            ``count`` belong to none.
+        count: Number of sums K.
+
+    Returns:
+        Shape :math:`(..., n, K)`.
+    """
+    sums = columns.new_zeros(*columns.shape[:-1], count + 1)
+    return sums.scatter_add(-1, index[..., None, :].expand_as(columns), columns)[..., :count]
+
+
+def solve_normal_equations(system: NormalEquations, damping: Tensor | float) -> tuple[Tensor, Tensor]:
     r"""Solve damped normal equations by the Schur complement.
 
-    With :math:`V = L L^T` and :math:`Y = L^{-1} W`, elimination of the points gives the reduced camera system
-    :math:`(U - Y^T Y)\, \xi = -g_{pose} + Y^T L^{-1} g_{point}`.
+    With :math:`V = L D L^T` and :math:`Y = L^{-1} W`, elimination of the points gives the reduced camera system
+    :math:`(U - Y^T D^{-1} Y)\, \xi = -g_{pose} + Y^T D^{-1} L^{-1} g_{point}`.
 
     Args:
-        system: Normal equations of F poses, P points and C right-hand sides.
-        damping: Factor :math:`\lambda`; :math:`\lambda` times the diagonal is added. The damping keeps unobservable
-            directions in place, such as the depth of a point that was observed once without depth.
+        system: Normal equations of F poses and P points.
+        damping: Factor :math:`\lambda`, a number or shape :math:`(...)`; :math:`\lambda` times the diagonal is added.
+            The damping keeps unobservable directions in place, such as the depth of a point that was observed once
+            without depth.
 
     Returns:
-        Steps of the poses, shape :math:`(F, 6, C)`, and of the points, shape :math:`(P, 3, C)`.
+        Steps of the poses, shape :math:`(*, ..., 6, F)`, and of the points, shape :math:`(*, ..., 3, P)`.
     """
-    F, P, C = system.U.shape[0], system.V.shape[-1], system.V.shape[1] - 3
-    U, V = _damp(system.U[..., :6].permute(1, 2, 0), damping), _damp(system.V[:, :3], damping)
-    L = _cholesky(V)
-    h = _forward(L, system.V[:, 3:])  # (3, C, P)
-    blocks = _forward(gather_columns(L.flatten(0, 1), system.point).unflatten(0, (3, 3)), system.W)
-    # Y is dense: a local map is small, and most of its poses observe many of its points. It is stored transposed, poses
-    # by points, with the points ordered by coordinate first, like h.
-    index = (
-        (18 * P * system.pose + system.point) + P * torch.arange(3)[:, None, None] + 3 * P * torch.arange(6)[:, None]
-    )
-    Yt = blocks.new_zeros(18 * F * P).scatter_add_(0, index.flatten(), blocks.flatten()).view(6 * F, 3 * P)
-    S = -(Yt @ Yt.T)
-    S.view(F, 6, F, 6).diagonal(dim1=0, dim2=2).add_(U)
-    xi = torch.linalg.solve(S, Yt @ h.transpose(1, 2).reshape(3 * P, C) - system.U[..., 6:].flatten(0, 1))
-    delta = _backward(L, -(h + (Yt.T @ xi).view(3, P, C).transpose(1, 2)))
-    return xi.view(F, 6, C), delta.permute(2, 0, 1)
+    F, P = system.U.shape[-1], system.V.shape[-1]
+    L, D = _factorise(_damp(system.V, damping))
+    h = _forward(L, system.point_gradient[..., None, :])
+    Yt = _gather_dense(_forward(gather_columns(L, system.point), system.W), system.pose, system.point, F, P)
+    scaled = Yt / D.flatten(-2)[..., None, :]
+    U = torch.diag_embed(_damp(system.U, damping)).movedim(-2, -4).transpose(-1, -2)  # F x 6 x F x 6
+    S = U.flatten(-2).flatten(-3, -2) - scaled @ Yt.mT
+    right = (scaled @ h.flatten(-3)[..., None])[..., 0] - system.pose_gradient.mT.flatten(-2)
+    xi = torch.linalg.solve(S, right[..., None])[..., 0]
+    rest = h + (Yt.mT @ xi[..., None])[..., 0].unflatten(-1, (3, 1, P))
+    delta = _backward(L, -rest / D[..., None, :])
+    return xi.unflatten(-1, (F, 6)).mT, delta[..., 0, :]
 
 
-def _damp(blocks: Tensor, damping: float) -> Tensor:
-    """Blocks (n, n, count) with damped diagonals."""
-    blocks = blocks.clone()
-    diagonal = blocks.diagonal(dim1=0, dim2=1)
-    diagonal.mul_(1 + damping).add_(REGULARISATION)
-    return blocks
+def _gather_dense(blocks: Tensor, pose: Tensor, point: Tensor, F: int, P: int) -> Tensor:
+    """Dense matrix, transposed, of one 3x6 block for each observation: (..., 3, 6, M) to (..., 6 F, 3 P).
+
+    A local map is small, and most of its poses observe many of its points. The points are ordered by coordinate first.
+    """
+    coordinate, parameter = torch.arange(3, device=pose.device), torch.arange(6, device=pose.device)
+    first = (18 * P * pose + point)[..., None, None, :]
+    index = first + P * coordinate[:, None, None] + 3 * P * parameter[:, None]
+    dense = blocks.new_zeros(*blocks.shape[:-3], 18 * (F + 1) * P)  # one more pose for the blocks of fixed poses
+    dense = dense.scatter_add(-1, index.flatten(-3), blocks.flatten(-3))
+    return dense[..., : 18 * F * P].unflatten(-1, (6 * F, 3 * P))
 
 
-def _cholesky(V: Tensor) -> Tensor:
-    """Cholesky factors L of positive definite 3x3 blocks, both (3, 3, P); faster than LAPACK for small blocks."""
-    L = torch.zeros_like(V)
-    for row in range(3):
-        for column in range(row + 1):
-            rest = V[row, column] - (L[row, :column] * L[column, :column]).sum(dim=0)
-            L[row, column] = rest.sqrt() if row == column else rest / L[column, column]
-    return L
+def _damp(blocks: Tensor, damping: Tensor | float) -> Tensor:
+    """Blocks (..., n, n, count) with damped diagonals."""
+    diagonal = torch.eye(blocks.shape[-2], dtype=blocks.dtype, device=blocks.device)[..., None]
+    factor = torch.as_tensor(damping, dtype=blocks.dtype, device=blocks.device)[..., None, None, None]
+    return blocks + diagonal * (factor * blocks + REGULARISATION)
+
+
+def _factorise(V: Tensor) -> tuple[Tensor, Tensor]:
+    """Factors L D L^T of symmetric 3x3 blocks (..., 3, 3, N); faster than LAPACK for small blocks.
+
+    Returns:
+        The entries (1, 0), (2, 0) and (2, 1) of L, whose diagonal is 1, and the diagonal of D, both (..., 3, N).
+    """
+    d0, l10, l20 = V[..., 0, 0, :], V[..., 1, 0, :] / V[..., 0, 0, :], V[..., 2, 0, :] / V[..., 0, 0, :]
+    d1 = V[..., 1, 1, :] - l10 * V[..., 1, 0, :]
+    l21 = (V[..., 2, 1, :] - l20 * V[..., 1, 0, :]) / d1
+    d2 = V[..., 2, 2, :] - l20 * V[..., 2, 0, :] - l21 * l21 * d1
+    return torch.stack([l10, l20, l21], dim=-2), torch.stack([d0, d1, d2], dim=-2)
 
 
 def _forward(L: Tensor, b: Tensor) -> Tensor:
-    """Solve L x = b for each block, with L of shape (3, 3, N) and b of shape (3, ..., N)."""
-    x = torch.empty_like(b)
-    for row in range(3):
-        x[row] = b[row]
-        for column in range(row):
-            x[row].addcmul_(L[row, column], x[column], value=-1)
-        x[row] /= L[row, row]
-    return x
+    """Solve L x = b for each block, with L (..., 3, N) as `_factorise` returns it, and b (..., 3, n, N)."""
+    (l10, l20, l21), (x, y, z) = L[..., None, :].unbind(-3), b.unbind(-3)
+    y = y - l10 * x
+    return torch.stack([x, y, z - l20 * x - l21 * y], dim=-3)
 
 
 def _backward(L: Tensor, b: Tensor) -> Tensor:
     """Solve L^T x = b for each block, with shapes as in `_forward`."""
-    return _forward(L.transpose(0, 1).flip(0, 1), b.flip(0)).flip(0)
+    (l10, l20, l21), (x, y, z) = L[..., None, :].unbind(-3), b.unbind(-3)
+    y = y - l21 * z
+    return torch.stack([x - l10 * y - l20 * z, y, z], dim=-3)

@@ -94,7 +94,7 @@ class FramePrefetcher:
             return None
         frame, times = read
         segmentation = self._slam.segment_instances(frame, prediction)
-        return PreprocessedFrame(frame, segmentation, self._slam.extract_features(frame), times)
+        return PreprocessedFrame(frame, self._slam.extract_features(frame), lambda: segmentation, times)
 
     def _read(self) -> ReadFrame:
         timer = StageTimer()
@@ -121,4 +121,4 @@ def _combine(
     frame, segmented, extracted = read.result(), segmentation.result(), extraction.result()
     if frame is None or segmented is None or extracted is None:
         return None
-    return PreprocessedFrame(frame[0], segmented, extracted, frame[1])
+    return PreprocessedFrame(frame[0], extracted, lambda: segmented, frame[1])

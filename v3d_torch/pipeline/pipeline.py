@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,16 +14,18 @@ import torch
 
 from v3d_torch.calibration.colour_order import check_colour_order
 from v3d_torch.calibration.plausibility import check_plausibility
-from v3d_torch.datasets.base import HasMotionMasks, RGBDSequence, RGBDStream
+from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError, OutputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
+from v3d_torch.live.live_slam import LiveSLAM
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.pipeline.run_record import RunRecord, Snapshot
+from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 from v3d_torch.runtime.process import trim_memory
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
@@ -59,11 +61,12 @@ class Viewer(Protocol):
             stage_times: Time that each stage spent on the frame.
         """
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Show the final map and trajectory, and close files and connections.
 
         Args:
             slam: SLAM system after the last frame.
+            point_map: Point map of the static scene.
 
         Raises:
             OutputError: If the recording cannot be written.
@@ -78,12 +81,45 @@ class NullViewer:
     ) -> None:
         """Do nothing."""
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Do nothing."""
 
 
 NULL_VIEWER = NullViewer()
 """Viewer of a run that is not shown."""
+
+
+class ViewerGroup:
+    """Several viewers of one run.
+
+    Args:
+        viewers: Viewers.
+    """
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
+
+    def show(
+        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
+    ) -> None:
+        """Show a tracked frame in all viewers."""
+        for viewer in self._viewers:
+            viewer.show(frame, objects, slam, stage_times)
+
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
+        """Finish all viewers, also if one of them fails.
+
+        Raises:
+            OutputError: The errors of all viewers, in one line.
+        """
+        errors = []
+        for viewer in self._viewers:
+            try:
+                viewer.finish(slam, point_map)
+            except OutputError as error:
+                errors.append(str(error))
+        if errors:
+            raise OutputError("; ".join(errors))
 
 
 class Pipeline:
@@ -92,7 +128,9 @@ class Pipeline:
     Args:
         sequence: Frames, stored or live.
         slam: System; frames of a stored sequence that it has processed already are skipped.
-        masks: Folder for an image of the masked pixels per frame; None for no images.
+        masks: Folder for an image per frame of the pixels that tracking excludes; None for no images.
+        map_masks: Folder for an image per frame of the pixels that maps exclude, which are those of `masks` and all
+            people; None for no images.
         viewer: Viewer that is shown each frame.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
@@ -101,6 +139,9 @@ class Pipeline:
     Attributes:
         record: Records of the run.
         between_frames: False while a frame is processed, and if the processing of a frame failed.
+
+    Raises:
+        ConfigError: If the sequence is live, and the configuration allows no threads.
     """
 
     def __init__(
@@ -111,6 +152,7 @@ class Pipeline:
         viewer: Viewer = NULL_VIEWER,
         views: StaticViews | None = None,
         *,
+        map_masks: Path | None = None,
         evaluate_masks: bool = True,
         skip_broken: bool = False,
     ) -> None:
@@ -119,7 +161,8 @@ class Pipeline:
         self.views = StaticViews(sequence.camera, slam.config.dense_map.stride) if views is None else views
         self.record = RunRecord()
         self.between_frames = True
-        self._masks = masks
+        self._mask_folders = masks, map_masks
+        self._live = LiveSLAM(sequence, slam) if isinstance(sequence, LiveStream) else None
         self._viewer = viewer
         self._with_mask_evaluation = evaluate_masks
         self._skip_broken = skip_broken
@@ -127,8 +170,9 @@ class Pipeline:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames of the sequence; of a live stream, the number processed so far."""
-        return len(self.sequence) if isinstance(self.sequence, Sized) else len(self.slam.poses)
+        """Number of frames of the sequence; of a stream, the number so far, with those that were left out."""
+        so_far = len(self.slam.poses) + self.record.live.dropped
+        return len(self.sequence) if isinstance(self.sequence, Sized) else so_far
 
     def __call__(self, on_frame: FrameCallback | None = None) -> RunRecord:
         """Process all frames. If a frame cannot be read or the user interrupts, the results so far are kept.
@@ -144,14 +188,10 @@ class Pipeline:
         record = self.record
         record.failure, record.interrupted = None, False
         previous_seconds, start = record.seconds, time.perf_counter()
-        frames = self._remaining_frames()
         try:
-            prefetcher = FramePrefetcher(frames, self.slam, ahead=self.slam.config.prefetch)
-            with torch.inference_mode(), closing(prefetcher):
-                for preprocessed in prefetcher:
-                    self._record_broken(frames, before=preprocessed.frame.index)
-                    self.between_frames = False
-                    frame, result = preprocessed.frame, self.slam.track(preprocessed)
+            tracked = self._track_frames() if self._live is None else self._track_live(self._live)
+            with torch.inference_mode(), closing(tracked):
+                for frame, result in tracked:
                     times = self.slam.timer.lap()
                     record.times.append(frame, times)
                     self._record_frame(frame, result)
@@ -159,9 +199,6 @@ class Pipeline:
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
-                    if len(record.times) % _TRIM_INTERVAL == 0:
-                        trim_memory()
-            self._record_broken(frames, before=math.inf)
         except V3DError as error:
             record.failure = str(error)
         except Exception as error:  # an error of the program must not cost the results so far
@@ -177,17 +214,25 @@ class Pipeline:
         return record
 
     @torch.inference_mode()
-    def flush(self) -> None:
-        """Apply the pending result of the back end, check the camera and show the final state, after the last frame."""
+    def flush(self) -> PointMap:
+        """Apply the pending results of the back end, check the camera and show the final state, after the last frame.
+
+        Returns:
+            Point map of the static scene, fused from all views.
+        """
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
         with self.slam.timer("plausibility"):
             self._warn(check_colour_order(self.views, self.slam.segment))
+        if self.slam.occupancy is not None:
+            self.slam.occupancy.correct(self.slam.poses)
+        point_map = fuse_points(self.views, self.slam.config)
         try:
-            self._viewer.finish(self.slam)
+            self._viewer.finish(self.slam, point_map)
         except V3DError as error:
             self.record.failure = self.record.failure or str(error)
+        return point_map
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the run between two frames: system, records and views."""
@@ -198,6 +243,27 @@ class Pipeline:
         self.slam.load_state_dict(state["slam"])
         self.record = state["record"]
         self.views.load_state_dict(state["views"])
+
+    def _track_frames(self) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
+        """Track the frames of a sequence, and yield each with its result."""
+        frames = self._remaining_frames()
+        with closing(FramePrefetcher(frames, self.slam, ahead=self.slam.config.prefetch)) as prefetcher:
+            for preprocessed in prefetcher:
+                self._record_broken(frames, before=preprocessed.frame.index)
+                self.between_frames = False
+                yield preprocessed.frame, self.slam.track(preprocessed)
+                if len(self.slam.poses) % _TRIM_INTERVAL == 0:
+                    trim_memory()
+        self._record_broken(frames, before=math.inf)
+
+    def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
+        """Track the frames of a live stream, and yield each with its result."""
+        with closing(iter(live)) as results:
+            for result in results:
+                self.between_frames = False
+                self.record.live.append_result(result)
+                self.record.rejected = live.rejected
+                yield result.frame, result
 
     def _remaining_frames(self) -> Iterator[RGBDFrame]:
         """Iterate over the frames that are later than the last tracked one."""
@@ -218,11 +284,12 @@ class Pipeline:
             self.record.broken.append(frames.broken.popleft())
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
+        self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result.objects)
         self._evaluate_masks(frame, result)
-        if self._masks is not None:
-            masked = (~result.static_mask).to(torch.uint8) * 255
-            write_png(self._masks / f"{frame.stamp:.6f}.png", masked.numpy())
+        for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
+            if folder is not None:
+                write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)
         keyframes = self.slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             static = result.static_without_people

@@ -12,12 +12,16 @@ from torch import Tensor
 from v3d_torch.datasets.readable_frames import BrokenFrame
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.live.live_slam import LiveResult
 from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
 from v3d_torch.runtime.stage_timer import StageTime
-from v3d_torch.types import RGBDFrame
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.types import RGBDFrame, TrackingStatus
 
 _MOTION_STATES = tuple(MotionState)
+
+_STATUSES = tuple(TrackingStatus)
 
 
 @dataclass(frozen=True)
@@ -128,12 +132,68 @@ class ObjectTable(TensorTable):
         return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
 
 
+class StateTable(TensorTable):
+    """States of the camera as they were known at each frame, one row per frame; see `CameraState` for the columns."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            stamp=((), torch.float64),
+            status=((), torch.int64),
+            T_wc=((3, 4), torch.float64),
+            covariance=((6, 6), torch.float32),
+            twist=((6,), torch.float32),
+        )
+
+    def append_state(self, state: CameraState) -> None:
+        """Append the state at a frame."""
+        self.append(
+            stamp=torch.tensor([state.stamp], dtype=torch.float64),
+            status=torch.tensor([_STATUSES.index(state.status)]),
+            T_wc=state.T_wc[None, :3],
+            covariance=state.covariance[None].to(torch.float32),
+            twist=state.twist[None].to(torch.float32),
+        )
+
+    @property
+    def statuses(self) -> list[str]:
+        """Status of each frame when it was tracked."""
+        return [_STATUSES[code].value for code in self["status"].tolist()]
+
+
+class LiveTable(TensorTable):
+    """Latency of each frame of a live run, seconds, and number of frames that were left out before it."""
+
+    def __init__(self) -> None:
+        super().__init__(latency=((), torch.float64), dropped=((), torch.int64))
+
+    @property
+    def dropped(self) -> int:
+        """Number of frames that were left out."""
+        return int(self["dropped"].sum())
+
+    def append_result(self, result: LiveResult) -> None:
+        """Append a live frame."""
+        latency = torch.tensor([result.latency], dtype=torch.float64)
+        self.append(latency=latency, dropped=torch.tensor([result.dropped]))
+
+    def latency_statistics(self) -> dict[str, float] | None:
+        """Return median, 95th percentile and maximum of the latency, seconds; None without frames."""
+        if not len(self):
+            return None
+        latency = self["latency"]
+        median, p95 = latency.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
+        return {"median": median, "p95": p95, "max": float(latency.max())}
+
+
 @dataclass
 class RunRecord:
     """Records of a run in addition to the trajectory.
 
     Attributes:
         times: Time spent on each frame.
+        states: State of the camera at each frame.
+        live: Latency of each frame of a live run; empty for a stored sequence.
+        rejected: Number of live frames that were late, doubled or out of order.
         dynamics: Objects of all frames.
         snapshots: Frames for the figure of masks.
         most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
@@ -149,6 +209,9 @@ class RunRecord:
     """
 
     times: FrameTimes = field(default_factory=FrameTimes)
+    states: StateTable = field(default_factory=StateTable)
+    live: LiveTable = field(default_factory=LiveTable)
+    rejected: int = 0
     dynamics: ObjectTable = field(default_factory=ObjectTable)
     snapshots: list[Snapshot] = field(default_factory=list)
     most_dynamic_snapshot: Snapshot | None = None

@@ -16,7 +16,7 @@ from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.objects.free_space_check import DepthView, is_free_space
 
-_BATCH = 1_000_000
+_BATCH = 200_000
 """Points that are collected before they are fused. Batches bound the memory, and are as fast as a single fusion."""
 
 

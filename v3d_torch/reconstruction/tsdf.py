@@ -13,13 +13,11 @@ from torch import Tensor
 
 from v3d_torch.config import DenseMapConfig
 from v3d_torch.geometry.camera import back_project
+from v3d_torch.geometry.cell_keys import cell_keys, cells_of_keys
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 
 BLOCK = 8
 """Voxels along a side of a block: large enough for tensor operations, small enough to stay near the surface."""
-
-_MAX_COORDINATE = 2**20
-"""Bound of block coordinates, so that three of them fit into 63 bits: 160 km from the origin at 2 cm per voxel."""
 
 _BLOCKS_PER_STEP = 1024
 """Blocks that are projected into a view together; half a million voxels fit into the processor's cache."""
@@ -43,14 +41,8 @@ def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
         offset = config.mesh.truncation * points / points.norm(dim=1, keepdim=True)
         points = torch.cat([points - offset, points, points + offset]) @ view.T_wc[:3, :3].T + view.T_wc[:3, 3]
         blocks = (points / (BLOCK * config.mesh.voxel_size)).floor().to(torch.int64)
-        x, y, z = (blocks + _MAX_COORDINATE).unbind(dim=1)
-        found.append(((x * 2 * _MAX_COORDINATE + y) * 2 * _MAX_COORDINATE + z).unique())
-    keys = torch.cat(found).unique()
-    x, y = (
-        keys.div(4 * _MAX_COORDINATE**2, rounding_mode="floor"),
-        keys.div(2 * _MAX_COORDINATE, rounding_mode="floor"),
-    )
-    return torch.stack([x, y, keys], dim=1) % (2 * _MAX_COORDINATE) - _MAX_COORDINATE
+        found.append(cell_keys(blocks).unique())
+    return cells_of_keys(torch.cat(found).unique())
 
 
 def integrate(blocks: Tensor, views: StaticViews, config: DenseMapConfig) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,6 @@ from v3d_torch.errors import OutputError
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, write_checkpoint
 from v3d_torch.runs.request import RunRequest
-from v3d_torch.runs.results import write_intermediate_results
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,6 +38,8 @@ class Autosave:
         start = time.perf_counter()
         if start < self._due:
             return
+        from v3d_torch.runs.results import write_intermediate_results  # pyarrow would delay the first frame
+
         try:
             write_intermediate_results(self._folder, self._pipeline)
             self._write_checkpoint()

@@ -22,10 +22,10 @@ from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.static_views import StaticView
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.pipeline.run_record import FrameTimes, ObjectTable, RunRecord, Snapshot
+from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable, RunRecord, Snapshot, StateTable
+from v3d_torch.runs.metrics_file import read_metrics, suggest_folder
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.state import STATE_CLASSES
-from v3d_torch.runs.stored_run import read_metrics, suggest_folder
 
 CHECKPOINT = "checkpoint.v3d"
 """Name of the checkpoint file. It exists from the first checkpoint of a run to its end."""
@@ -36,7 +36,9 @@ _CLASSES = (
         RunRecord,
         BrokenFrame,
         FrameTimes,
+        LiveTable,
         ObjectTable,
+        StateTable,
         Snapshot,
         FrameObjects,
         FrameResult,

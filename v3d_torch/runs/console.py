@@ -170,9 +170,9 @@ class TrackingBar:
 
     Args:
         progress: Progress bars of the console.
-        frames: Number of frames; None for a live stream.
+        frames: Number of frames; None if it is not known.
         interrupted: Event that ends the run after the current frame.
-        done: Number of frames processed earlier.
+        done: Number of frames that are tracked already.
         description: Text to the left of the bar.
     """
 
@@ -189,7 +189,7 @@ class TrackingBar:
         """Update the bar after a frame.
 
         Raises:
-            KeyboardInterrupt: If the run was interrupted.
+            KeyboardInterrupt: If the run is interrupted.
         """
         now, note = time.perf_counter(), f"{result.status.value}  {describe_motion(result)}"
         if self._start is None:

@@ -23,8 +23,11 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_NOT_STAGES = frozenset({"camera", "config", "timer", "map", "poses", "motion_model", "predictions"})
-"""Public attributes of `V3DSLAM` that are not stages."""
+_NOT_STAGES = frozenset(
+    {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions", "occupancy"}
+)
+"""Public attributes of `V3DSLAM` that are not stages. The occupancy map is a result of whole numbers, in whose queries
+NaN is unknown space."""
 
 MAY_BE_NAN = frozenset(
     {
@@ -124,14 +127,16 @@ class CheckedSLAM(V3DSLAM):
             check_finite("the input", frame)
         super().check(frame)
 
-    def segment_instances(self, frame: RGBDFrame, prediction: PosePrediction | None) -> Segmentation:
+    def segment_instances(
+        self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
+    ) -> Segmentation:
         """Run `V3DSLAM.segment_instances`.
 
         Raises:
             NumericsError: If the result of the segmenter is not finite.
         """
         with _frame_in_message(frame):
-            return super().segment_instances(frame, prediction)
+            return super().segment_instances(frame, prediction, is_due)
 
     def extract_features(self, frame: RGBDFrame) -> Extraction:
         """Run `V3DSLAM.extract_features`.

@@ -26,6 +26,7 @@ from v3d_torch.viz.trajectory_figure import draw_trajectory
 _FIGURES = {
     "masks.png": "Frames with the mask of each object in the colour of its motion state.",
     "voting.png": "Frame with the most votes for dynamic objects: a line joins two objects if one voted for the other.",
+    "occupancy.png": "Occupancy map from above: free and occupied floor, and the distance to obstacles.",
     "clusters.png": "Point clouds of the objects in the same frame, before and after outlier rejection.",
 }
 """Caption of each picture in the folder ``figures`` of a run."""

@@ -5,12 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
 from v3d_torch.config import Config
+from v3d_torch.config.validation import first_error
 from v3d_torch.datasets import SourceOptions
 from v3d_torch.datasets.cameras import PRESETS
+from v3d_torch.errors import InputError
+from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import expand_user
+from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.text import read_text
+
+_FILE = "request.yaml"
 
 CHANGEABLE = ("seq", "data_root", "skip_broken")
 """Names of the options that can change when a run is resumed."""
@@ -36,6 +47,7 @@ class RunRequest:
         load_map: Map file in which the camera is localised; None to start a new map.
         save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
+        realtime: True to play the sequence at its own rate, like a live camera.
         skip_broken: True to pass over broken frames, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
     """
 
@@ -52,6 +64,7 @@ class RunRequest:
     load_map: str | None = None
     save_map: str | None = None
     save_masks: bool = False
+    realtime: bool = False
     skip_broken: bool = False
 
     @property
@@ -99,6 +112,41 @@ class RunRequest:
     def _options(self) -> dict[str, Any]:
         """Return everything but the configuration."""
         return {name: value for name, value in vars(self).items() if name != "config"}
+
+
+def write_request(folder: Path, request: RunRequest) -> None:
+    """Write the options of a run, with absolute paths and without the configuration, to ``request.yaml``.
+
+    Args:
+        folder: Folder of the results.
+        request: Request of the run.
+
+    Raises:
+        OutputError: If the file cannot be written.
+    """
+    write_text(folder / _FILE, yaml.safe_dump(request.absolute()._options(), sort_keys=False))
+
+
+def read_request(folder: Path) -> RunRequest:
+    """Read the options of a run, with the default configuration.
+
+    Args:
+        folder: Folder of the results.
+
+    Raises:
+        InputError: If the file is missing or damaged.
+    """
+    path = folder / _FILE
+    text = read_text(path, "it is written by a run")
+    try:
+        options = parse_yaml(text)
+        if not isinstance(options, dict):
+            raise ValueError("it is not a mapping")
+        return TypeAdapter(RunRequest).validate_python({**options, "config": Config()})
+    except ValidationError as error:
+        raise InputError(f"{path}: {first_error(error)}; run the sequence again") from error
+    except ValueError as error:
+        raise InputError(f"{path}: is not the request of a run ({error}); run the sequence again") from error
 
 
 def _absolute_if_exists(name: str) -> str:

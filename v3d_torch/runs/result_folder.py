@@ -13,13 +13,16 @@ _LOG = "run.log"
 """Every run writes its log first, so this file marks the other files as results of a run."""
 
 _RESULTS = (
-    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json", "report.html"),
-    *("checkpoint.v3d", "frames.parquet", "dynamics.parquet", "map.ply", "mesh.ply", "trajectory.ply"),
-    *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png", "masks/*.png"),
+    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json"),
+    *("report.html", "checkpoint.v3d", "frames.parquet", "states.parquet", "dynamics.parquet"),
+    *("map.ply", "mesh.ply", "trajectory.ply"),
+    *("occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml", "figures/occupancy.png"),
+    *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png"),
+    *("masks/*.png", "map_masks/*.png"),
 )
 """Files that a run, or the report of a run, writes in addition to the log."""
 
-_UNFINISHED = (".*.part*", "figures/.*.part*", "masks/.*.part*")
+_UNFINISHED = (".*.part*", "figures/.*.part*", "masks/.*.part*", "map_masks/.*.part*")
 """Temporary files of a run that was killed while it wrote."""
 
 
@@ -79,7 +82,7 @@ def clear_earlier_results(folder: Path) -> None:
             raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
         for path in earlier:
             path.unlink()
-        for subfolder in (folder / "figures", folder / "masks"):
+        for subfolder in (folder / "figures", folder / "masks", folder / "map_masks"):
             with suppress(OSError):  # missing, or with other files in it
                 subfolder.rmdir()
     except OSError as error:

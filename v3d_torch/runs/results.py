@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import platform
 import re
 import sys
@@ -26,10 +27,16 @@ from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import MotionState
+from v3d_torch.occupancy.map_server import write_map_server_files
+from v3d_torch.occupancy.occupancy_grid import occupancy_grid
+from v3d_torch.occupancy.occupancy_io import save_occupancy
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
-from v3d_torch.reconstruction.point_map import fuse_points
+from v3d_torch.reconstruction.point_map import PointMap
+from v3d_torch.runs.state_table import make_state_table
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -37,6 +44,8 @@ from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
     import resource
+
+_LOG = logging.getLogger(__name__)
 
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
@@ -57,12 +66,13 @@ _DYNAMICS = pa.schema(
 )
 
 
-def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
+def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Evaluation | None:
     """Write all results of a run, ``metrics.json`` last, so that its presence shows that they are complete.
 
     Args:
         folder: Folder of the results; made if it is missing.
         pipeline: Pipeline that has run, to the end or not.
+        point_map: Point map of the static scene, from `Pipeline.flush`.
 
     Returns:
         The scores, if there is ground truth.
@@ -71,7 +81,7 @@ def write_results(folder: Path, pipeline: Pipeline) -> Evaluation | None:
         OutputError: If the folder cannot be written or the disk is full.
     """
     trajectory, evaluation = _write_tables(folder, pipeline)
-    _write_maps(folder, pipeline, trajectory)
+    _write_maps(folder, pipeline, trajectory, point_map)
     draw_run(folder / "figures", pipeline, trajectory)
     _write_metrics(folder, pipeline, evaluation, pipeline.record.failure)
     return evaluation
@@ -108,6 +118,7 @@ def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluat
         with suppress(InputError):  # too few poses for scores
             evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frame_count)
     _write_table(folder / "frames.parquet", _frame_table(pipeline))
+    _write_table(folder / "states.parquet", make_state_table(pipeline.record))
     _write_table(folder / "dynamics.parquet", _object_table(pipeline.record.dynamics))
     return trajectory, evaluation
 
@@ -183,7 +194,11 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
         "warnings": run.warnings,
+        "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "failure": failure,
+        "latency": run.live.latency_statistics(),
+        "dropped": run.live.dropped,
+        "rejected": run.rejected,
         "fps": frames / run.seconds if run.seconds else None,
         "seconds": run.seconds,
         "seconds_per_stage": dict(slam.timer.seconds),
@@ -209,13 +224,14 @@ def _peak_memory_mb() -> float | None:
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
+def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:
     slam, views = pipeline.slam, pipeline.views
-    cloud = fuse_points(views, slam.config)
-    write_ply(folder / "map.ply", cloud.points, cloud.colours, normals=cloud.normals)
+    write_ply(folder / "map.ply", point_map.points, point_map.colours, normals=point_map.normals)
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(views, slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+    if slam.occupancy is not None:
+        _write_occupancy(folder, slam.occupancy)
     keyframes = slam.map.active_keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
@@ -223,3 +239,14 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> Non
     statuses = [status.value for status in slam.poses.statuses]
     path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)
+
+
+def _write_occupancy(folder: Path, mapper: OccupancyMapper) -> None:
+    """Write the occupancy map, and its 2D grid if a floor is visible."""
+    floor = mapper.find_floor()
+    save_occupancy(folder / "occupancy.npz", mapper.map, floor)
+    write_octomap(folder / "occupancy.bt", mapper.map)
+    if floor is None:
+        _LOG.warning("occupancy map: no floor is visible; no 2D grid was written")
+    else:
+        write_map_server_files(folder / "map.yaml", occupancy_grid(mapper.map, floor))

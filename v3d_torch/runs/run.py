@@ -21,9 +21,8 @@ from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
-from v3d_torch.runs.results import write_results
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.slam import V3DSLAM
@@ -66,6 +65,7 @@ class Run:
     ) -> None:
         config = request.config
         write_text(folder / "config.yaml", dump_config(config))  # fails before the first frame if the disk is full
+        write_request(folder, request)
         set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         system = CheckedSLAM if config.check_numerics else V3DSLAM
@@ -77,6 +77,7 @@ class Run:
             folder / "masks" if request.save_masks else None,
             viewer,
             None if known_map is None else known_map.views,
+            map_masks=folder / "map_masks" if request.save_masks else None,
             skip_broken=request.skip_broken,
         )
         if checkpoint is not None:
@@ -110,8 +111,10 @@ class Run:
 
         record = self.pipeline(log_and_save)
         self._autosave.end()
-        self.pipeline.flush()
-        evaluation = write_results(self._folder, self.pipeline)
+        point_map = self.pipeline.flush()
+        from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
+
+        evaluation = write_results(self._folder, self.pipeline, point_map)
         self._autosave.discard()
         if record.failure:
             _LOG.error(record.failure)

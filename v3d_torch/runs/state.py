@@ -18,18 +18,20 @@ from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.tracking.pose_history import PoseEntry
 from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus),
+    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus, CameraState),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
-    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig),
+    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView),
 )
 """Classes of the package that a saved state can contain; others are not read."""
 

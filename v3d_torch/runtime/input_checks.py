@@ -13,6 +13,9 @@ from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Instances, RGBDFrame
 
+_MAX_NORM_ERROR = 1e-3
+"""Largest difference of the length of a unit vector from 1."""
+
 TensorSpec = tuple[torch.dtype, tuple[int | str, ...]]
 """Dtype and shape of a tensor; dimensions with the same name have the same size."""
 
@@ -64,6 +67,11 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
     for name, seconds in (("stamp", frame.stamp), ("depth delay", frame.depth_delay)):
         if not math.isfinite(seconds):
             raise InputError(f"frame {frame.index}: the {name} is {seconds}; give a finite number of seconds")
+    gravity = frame.gravity
+    if gravity is not None and (gravity.shape != (3,) or not abs(float(gravity.norm()) - 1) < _MAX_NORM_ERROR):
+        raise InputError(
+            f"frame {frame.index}: the gravity is {gravity.tolist()}; give a unit vector in the camera frame"
+        )
     if frame.camera is not None and frame.camera != camera:
         raise InputError(
             f"frame {frame.index}: its camera differs from that of the V3DSLAM; make one V3DSLAM for each camera"

@@ -36,10 +36,15 @@ _SEARCH_CALLS = 128
 because a search takes four times as long as a plain call."""
 
 
+_GRAVITY_WEIGHT = 2 * _CONFIDENT_WEIGHT
+"""Weight of a measured gravity, in detections of score 1: no search is needed then."""
+
+
 class UprightSegmenter:
     """Segments images of a rolled camera after rotating them upright by quarter turns.
 
-    All four turns are segmented in some of the first calls, until the up direction is settled, and rarely afterwards.
+    A measured gravity gives the up direction. Without one, all four turns are segmented in some of the first calls,
+    until the up direction is settled, and rarely afterwards.
 
     Args:
         segment: Segmenter of frames of any size.
@@ -55,22 +60,25 @@ class UprightSegmenter:
         self._up = torch.tensor([0.0, -_PRIOR_WEIGHT, 0.0], dtype=torch.float64)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Segment a frame without a pose, in the orientation that it has."""
-        return self.segment(frame)
+        """Segment a frame without a pose: upright if its gravity was measured, else in the orientation that it has."""
+        return self.segment(frame) if frame.gravity is None else self._segment_rotated(frame, _turns(-frame.gravity))
 
     def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
         """Segment a frame in upright orientation.
 
         Args:
             frame: Frame to segment.
-            T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None segments the frame in
-                the orientation that it has.
+            T_cw: Predicted world-to-camera pose of the frame, float64, shape :math:`(4, 4)`; None if it is not known,
+                see `__call__`.
 
         Returns:
             Instances of the frame in its own orientation.
         """
         if T_cw is None:
             return self(frame)
+        if frame.gravity is not None:
+            self._up = _GRAVITY_WEIGHT * T_cw[:3, :3].T @ -frame.gravity
+            self._calls = max(self._calls, _SEARCH_CALLS + 1)
         is_search = self._is_search_due()
         self._calls += 1
         if not is_search:
@@ -97,8 +105,7 @@ class UprightSegmenter:
 
     def _upright_turns(self, T_cw: Tensor) -> int:
         """Number of counterclockwise quarter turns that bring an image upright."""
-        x, y, _ = (T_cw[:3, :3] @ self._up).tolist()
-        return round(math.atan2(x, -y) / (math.pi / 2)) % 4
+        return _turns(T_cw[:3, :3] @ self._up)
 
     def _segment_rotated(self, frame: RGBDFrame, turns: int) -> Instances:
         """Segment a frame after counterclockwise quarter turns; the instances are rotated back."""
@@ -109,6 +116,25 @@ class UprightSegmenter:
         for _ in range(turns):
             instances = _rotate_clockwise(instances)
         return instances
+
+
+def _turns(up: Tensor) -> int:
+    """Number of counterclockwise quarter turns that bring an image upright, for an up direction (3,), camera frame."""
+    x, y, _ = up.tolist()
+    return round(math.atan2(x, -y) / (math.pi / 2)) % 4
+
+
+def up_votes(state: Mapping[str, Any] | None) -> Tensor | None:
+    """Sum of the votes for the up direction in the state of a segmenter.
+
+    Args:
+        state: State of a segmenter; None if it has none.
+
+    Returns:
+        Sum of the votes, in detections of score 1, world frame, float64, shape :math:`(3,)`; None if the segmenter is
+        no `UprightSegmenter`.
+    """
+    return state["up"] if state is not None and state.keys() == {"calls", "up"} else None
 
 
 def _up_in_camera(turns: int) -> Tensor:

@@ -74,7 +74,7 @@ class CameraTracker:
                 tracking = None if match is None else match.tracking
             if tracking is not None:
                 self._map.count_matches(tracking.found, tracking.visible)
-                return FramePose(TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks)
+                return FramePose(TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks, tracking.information)
         known = motion.is_measured and poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
         status = TrackingStatus.ODOMETRY if known else TrackingStatus.LOST
         return FramePose(status, T_cw, torch.full((len(features),), -1, dtype=torch.int64))

@@ -32,11 +32,13 @@ class MapTracking:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
         visible: IDs of the landmarks that the frame should have observed, int64, shape :math:`(V,)`.
+        information: Information matrix of the left perturbation of ``T_cw``, float64, shape :math:`(6, 6)`.
     """
 
     T_cw: Tensor
     landmarks: Tensor
     visible: Tensor
+    information: Tensor
 
     @property
     def found(self) -> Tensor:
@@ -102,7 +104,7 @@ class MapTracker:
         ids = torch.full((len(features),), -1, dtype=torch.int64)
         ids[feature[refined.inliers]] = local_map.ids[landmark[refined.inliers]]
         visible = projected.indices if depth is None else projected.indices[~self._is_occluded(projected, depth)]
-        return MapTracking(refined.T_cw, ids, local_map.ids[visible])
+        return MapTracking(refined.T_cw, ids, local_map.ids[visible], refined.information)
 
     def refine(self, T_cw: Tensor, points: Tensor, features: Features, *, rounds: int) -> PoseRefinement | None:
         """Refine a pose from matches of landmarks and features, some of which can be outliers.
@@ -119,9 +121,8 @@ class MapTracker:
         config = self._config
         if len(features) < config.min_inliers:
             return None
-        refined = refine_pose(
-            T_cw, points, to_measurements(features, config, self._pyramid), self._camera, rounds=rounds
-        )
+        measured = to_measurements(features, config, self._pyramid)
+        refined = refine_pose(T_cw, points, K=self._camera.K, **vars(measured), rounds=rounds)
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
     def _is_occluded(self, projected: ProjectedLandmarks, depth: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -43,11 +43,13 @@ class PoseHistory:
     """Poses of all frames in the order of time.
 
     Attributes:
+        last_found: Time of the last frame that was found, seconds; minus infinity if there is none.
         observed_landmarks: IDs of the landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
     """
 
     def __init__(self) -> None:
         self._entries: list[PoseEntry] = []
+        self.last_found = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
 
     def __len__(self) -> int:
@@ -75,6 +77,11 @@ class PoseHistory:
         return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
 
     @property
+    def keyframe(self) -> Keyframe | None:
+        """Keyframe that the pose of the last frame is relative to; None if there is none."""
+        return self._entries[-1].keyframe if self._entries else None
+
+    @property
     def has_motion(self) -> bool:
         """True if the motion between the last frame and the one before it was measured."""
         return bool(self._entries) and self._entries[-1].has_motion
@@ -83,12 +90,6 @@ class PoseHistory:
     def is_located(self) -> bool:
         """True if any frame was found so far."""
         return self.last_found > -torch.inf
-
-    @property
-    def last_found(self) -> float:
-        """Time of the last frame that was found, seconds; minus infinity if there is none."""
-        found = (entry.stamp for entry in reversed(self._entries) if entry.status is not TrackingStatus.LOST)
-        return next(found, -torch.inf)
 
     def append(
         self, stamp: float, pose: FramePose, motion: CameraMotion, reference: Keyframe | None, new: Keyframe | None
@@ -130,12 +131,28 @@ class PoseHistory:
             entry = PoseEntry(stamp, status, new, torch.eye(4, dtype=torch.float64), motion.is_measured)
             self.observed_landmarks = new.observed_landmarks
         self._entries.append(entry)
+        if status is not TrackingStatus.LOST:
+            self.last_found = stamp
         return T_new_old
 
     def replace_last(self, T_cw: Tensor) -> None:
         """Replace the pose of the last frame by a refined one, world to camera, float64, shape :math:`(4, 4)`."""
         last = self._entries[-1]
         self._entries[-1] = replace(last, T_ck=_relative(T_cw, last.keyframe))
+
+    def poses_of(self, frames: Sequence[int]) -> Tensor:
+        """World-to-camera poses of some frames in the current map.
+
+        Args:
+            frames: Positions of the frames in the history, from 0.
+
+        Returns:
+            Poses, float64, shape :math:`(N, 4, 4)`.
+        """
+        entries = [self._entries[frame] for frame in frames]
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)
+        T_ck, T_kw = [entry.T_ck[None] for entry in entries], [_pose(entry.keyframe)[None] for entry in entries]
+        return torch.cat([none, *T_ck]) @ torch.cat([none, *T_kw])
 
     def trajectory(self) -> Trajectory:
         """Poses of all frames in the current map; lost frames are interpolated between the nearest found ones."""
@@ -146,11 +163,16 @@ class PoseHistory:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the poses of all frames."""
-        return {"entries": self._entries, "observed_landmarks": self.observed_landmarks}
+        return {
+            "entries": self._entries,
+            "last_found": self.last_found,
+            "observed_landmarks": self.observed_landmarks,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
-        self._entries, self.observed_landmarks = list(state["entries"]), state["observed_landmarks"]
+        self._entries, self.last_found = list(state["entries"]), state["last_found"]
+        self.observed_landmarks = state["observed_landmarks"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end: those linked to the new frame by measured motions, or all of them."""

@@ -1,4 +1,4 @@
-"""Figures written by every run: trajectory, masks, votes and clusters."""
+"""Figures written by a run: trajectory, masks, occupancy map, votes and clusters."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure
+from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.object_overlay import Overlay, save_mask_figure
+from v3d_torch.viz.occupancy_figure import draw_occupancy
 from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 from v3d_torch.viz.voting import save_voting_figure
 
 
 def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
-    """Draw the trajectory, the masks, and the votes and clouds of the most dynamic frame, if there are any.
+    """Draw trajectory, masks, occupancy map, and the votes and clouds of the most dynamic frame, if there are any.
 
     Args:
         folder: Folder of the images.
@@ -35,6 +37,10 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
         images = [snapshot.frame.image for snapshot in record.snapshots]
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
         save_mask_figure(images, overlays, folder / "masks.png")
+    mapper = pipeline.slam.occupancy
+    if mapper is not None and not mapper.map.is_empty:
+        up, floor = mapper.up.direction, mapper.find_floor()
+        save_figure(draw_occupancy(mapper.map, trajectory, up, floor, sequence.name), folder / "occupancy.png")
     snapshot = record.most_dynamic_snapshot
     if snapshot is not None and snapshot.result.vote_pairs:
         _draw_votes(folder / "voting.png", pipeline, snapshot)

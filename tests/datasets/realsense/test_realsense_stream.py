@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,11 +33,16 @@ from typer.testing import CliRunner
 
 from v3d_torch.cli import record, run
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
-from v3d_torch.datasets.realsense import RealSenseStream
+from v3d_torch.datasets.base import LiveStream
+from v3d_torch.datasets.realsense import RealSenseCamera, RealSenseStream
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.live import LiveSLAM
+from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import TrackingStatus
 
-OPEN_LIVE_DEVICE = "v3d_torch.datasets.realsense.realsense_stream.open_live_device"
+OPEN_LIVE_DEVICE = "v3d_torch.datasets.realsense.realsense_camera.open_live_device"
 
 
 def take_frames(stream: RGBDStream, count: int) -> list[Any]:
@@ -108,6 +114,92 @@ def test_ctrl_c_releases_the_camera() -> None:
             if frame.index == 1:
                 raise KeyboardInterrupt
     assert camera.stopped.wait(5)
+
+
+def test_live_camera_is_a_live_stream_with_times_of_capture() -> None:
+    camera = SimulatedDevice()
+    stream = RealSenseCamera("simulated", lambda: camera)
+    assert isinstance(stream, LiveStream)
+    frames = iter(stream)
+    arrivals = []
+    for _ in range(3):
+        frame = next(frames)
+        captured_at = stream.captured_at(frame)
+        arrivals.append(captured_at)
+        stamp = time.monotonic() - time.time() + frame.stamp  # of the simulated clock, which is that of the computer
+        assert captured_at == pytest.approx(stamp, abs=0.01) and captured_at <= time.monotonic()
+    stream.stop()
+    assert list(frames) == [] and camera.stopped.is_set()
+    assert arrivals == sorted(arrivals)
+
+
+@pytest.mark.parametrize("clock_restarts", [False, True])
+def test_camera_continues_after_it_was_unplugged(monkeypatch: pytest.MonkeyPatch, clock_restarts: bool) -> None:
+    """The camera is missing at first, then there again, in one case with a clock that starts at zero."""
+    monkeypatch.setattr("v3d_torch.datasets.realsense.realsense_camera._RETRY_INTERVAL", 0.05)
+    first, second = SimulatedDevice(), SimulatedDevice()
+    if clock_restarts:
+        second.first_stamp = 0.0
+    attempts: list[bool] = []
+
+    def open_device() -> SimulatedDevice:
+        if not first.unplugged.is_set():
+            return first
+        attempts.append(True)
+        if len(attempts) < 3:
+            raise InputError("no camera is connected")
+        return second
+
+    frames = iter(RealSenseCamera("simulated", open_device))
+    before = [next(frames) for _ in range(3)]
+    unplugged_at = time.monotonic()
+    first.unplugged.set()
+    after = [next(frames) for _ in range(3)]
+    missing = time.monotonic() - unplugged_at
+    frames.close()  # type: ignore[attr-defined]
+    assert len(attempts) == 3 and first.stopped.is_set() and second.stopped.is_set()
+    assert [frame.index for frame in (*before, *after)] == list(range(6))
+    stamps = [frame.stamp for frame in (*before, *after)]
+    assert stamps == sorted(set(stamps))
+    assert 0.1 < after[0].stamp - before[-1].stamp < missing + 0.5
+
+
+def test_other_camera_after_an_interruption_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = SimulatedDevice(), SimulatedDevice()
+    second.serial = "2"
+    frames = iter(RealSenseCamera("simulated", lambda: second if first.unplugged.is_set() else first))
+    next(frames)
+    first.unplugged.set()
+    with pytest.raises(InputError, match="simulated: another camera was plugged in, 2; start again to use it"):
+        list(frames)
+
+
+def test_unplugged_camera_is_tracked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole system, from the device to the pose."""
+    monkeypatch.setattr("v3d_torch.datasets.realsense.realsense_camera._RETRY_INTERVAL", 0.05)
+    first, second = SimulatedDevice(scale=5, still=True), SimulatedDevice(scale=5, still=True)
+    stream = RealSenseCamera("simulated", lambda: second if first.unplugged.is_set() else first)
+    results = []
+    with closing(iter(LiveSLAM(stream, V3DSLAM(stream.camera, NoSegmentation())))) as live:
+        for result in live:
+            results.append(result)
+            if len(results) == 3:
+                first.unplugged.set()
+            if second.sent_count and len(results) >= 6:
+                break
+    assert second.stopped.is_set()
+    assert all(result.status is TrackingStatus.TRACKED for result in results)
+    assert results[-1].T_wc[:3, 3].norm() < 0.01
+
+
+def test_first_live_frame_has_the_gravity_of_the_accelerometer() -> None:
+    """The camera is tilted down by 30 degrees: an accelerometer at rest measures the opposite of gravity."""
+    up = np.array([0.0, -np.cos(np.pi / 6), -np.sin(np.pi / 6)])
+    device = SimulatedDevice(accelerations=9.8 * up + np.random.default_rng(0).normal(0, 0.2, (50, 3)))
+    first, second = take_frames(RealSenseCamera("simulated", lambda: device), 2)
+    assert float(first.gravity @ torch.from_numpy(-up)) > np.cos(np.radians(1)) and second.gravity is None
+    (frame,) = take_frames(RealSenseCamera("simulated", SimulatedDevice), 1)
+    assert frame.gravity is None
 
 
 def test_silent_camera_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,7 +288,10 @@ def test_run_command_on_a_live_camera_ends_with_ctrl_c_and_results(
     assert done.exit_code == 0, done.output
     metrics = json.loads((out / "metrics.json").read_text())
     assert (metrics["sequence"], metrics["failure"]) == ("realsense", None)
-    assert metrics["frames"] == metrics["processed"] == metrics["tracked"] >= 3
+    assert metrics["frames"] == metrics["processed"] + metrics["dropped"]
+    assert metrics["processed"] == metrics["tracked"] >= 3
+    assert 0 <= metrics["latency"]["median"] <= metrics["latency"]["p95"] <= metrics["latency"]["max"]
+    assert "latency" in done.output and "left out" in done.output
     assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.datasets.realsense.accelerometer import measure_accelerations
 from v3d_torch.datasets.realsense.camera import import_librealsense
 from v3d_torch.errors import InputError
 
@@ -21,10 +26,19 @@ class Device(Protocol):
     Attributes:
         intrinsics: ``rs.intrinsics`` of the colour stream.
         depth_unit: Length of one unit of depth, metres.
+        serial: Serial number of the camera; empty for a file.
     """
 
     intrinsics: Any
     depth_unit: float
+    serial: str
+
+    def measure_accelerations(self) -> NDArray[np.float64]:
+        """Measure for a short time before `start`.
+
+        Returns:
+            Accelerations in the frame of the colour camera, m/s^2, shape :math:`(N, 3)`; N = 0 without accelerometer.
+        """
 
     def start(self) -> None:
         """Start streaming; a recording starts from its beginning."""
@@ -34,6 +48,9 @@ class Device(Protocol):
 
     def is_over(self) -> bool:
         """Check whether the source has ended for good."""
+
+    def is_connected(self) -> bool:
+        """Check whether the camera is connected; always True for a file."""
 
     def stop(self) -> None:
         """Stop streaming and release the camera or file."""
@@ -59,13 +76,21 @@ class PipelineDevice:
         except RuntimeError as error:
             raise InputError(f"{source}: {failure} ({str(error).splitlines()[0]})") from error
         device = profile.get_device()
-        self.intrinsics = profile.get_stream(rs.stream.color).as_video_stream_profile().intrinsics
+        colour = profile.get_stream(rs.stream.color)
+        self.intrinsics = colour.as_video_stream_profile().intrinsics
         self.depth_unit: float = device.first_depth_sensor().get_depth_scale()
         self._source = source
+        self._device = device
+        self._colour = colour
         self._pipeline = pipeline
         self._config = config
         self._playback = device.as_playback() if device.is_playback() else None
+        self.serial: str = "" if self._playback is not None else device.get_info(rs.camera_info.serial_number)
         self._stopped = rs.playback_status.stopped
+
+    def measure_accelerations(self) -> NDArray[np.float64]:
+        """Measure for a short time, see `measure_accelerations`."""
+        return measure_accelerations(self._source, self._device, self._colour)
 
     def start(self) -> None:
         """Start the camera, or play the file from its beginning.
@@ -98,9 +123,14 @@ class PipelineDevice:
         """Check whether a file has been played to its end; always False for a camera."""
         return self._playback is not None and self._playback.current_status() == self._stopped
 
+    def is_connected(self) -> bool:
+        """Check whether the camera is connected; always True for a file."""
+        return self._playback is not None or bool(self._device.is_connected())
+
     def stop(self) -> None:
         """Stop streaming and release the camera or file."""
-        self._pipeline.stop()
+        with suppress(RuntimeError):  # a camera that was unplugged has stopped already
+            self._pipeline.stop()
 
 
 def open_live_device(name: str, serial: str, fps: float | None) -> PipelineDevice:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.realsense.camera import camera_from_intrinsics, depth_scale_from, import_librealsense
-from v3d_torch.datasets.realsense.device import Device, open_live_device, open_recorded_device
+from v3d_torch.datasets.realsense.device import Device, open_recorded_device
 from v3d_torch.datasets.ros import read_topic_types
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS, convert_to_rgb
 from v3d_torch.errors import InputError
@@ -30,7 +31,7 @@ _SILENCE_TIMEOUT = 5.0
 class RealSenseStream:
     """RGB-D frames of a RealSense camera: depth aligned to colour, stamps from the clock of the camera.
 
-    The camera runs only while the stream is iterated. If frames are consumed more slowly than they arrive, a live
+    The device runs only while the stream is iterated. If frames are consumed more slowly than they arrive, a live
     camera drops some of them; a recording drops none.
 
     Args:
@@ -58,27 +59,32 @@ class RealSenseStream:
         Raises:
             InputError: If the camera stops sending frames or sends an unsupported format.
         """
+        device = self._open_device()
+        with closing(self._images(device)) as images:
+            for index, (stamp, colour, depth) in enumerate(images):
+                yield self._convert_frame(index, stamp, colour, depth, device)
+
+    def _images(self, device: Device) -> Generator[tuple[float, Any, Any], None, None]:
+        """Start the device and yield stamp, colour and depth image of each frame; stop the device at the end."""
         rs = import_librealsense(self.name)
         align = rs.align(rs.stream.color)
-        device = self._open_device()
         device.start()
         try:
-            index, previous_stamp = 0, -math.inf
+            previous_stamp = -math.inf
             for frames in self._wait_for_frames(device):
                 aligned = align.process(frames)
                 colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
                 stamp = colour.get_timestamp() / 1000
-                if stamp <= previous_stamp:  # the same colour image, paired with a newer depth image
-                    continue
-                yield self._convert_frame(index, stamp, colour, depth, depth_scale_from(device.depth_unit))
-                index, previous_stamp = index + 1, stamp
+                if stamp > previous_stamp:  # else the same colour image, paired with a newer depth image
+                    yield stamp, colour, depth
+                    previous_stamp = stamp
         finally:
             device.stop()
 
     def _wait_for_frames(self, device: Device) -> Iterator[Any]:
         """Yield frame sets with a colour and a depth image until the device ends."""
         last_arrival = time.monotonic()
-        while True:
+        while not self._is_stopped():
             frames = device.wait(_WAIT_MS)
             if frames is not None:
                 last_arrival = time.monotonic()
@@ -86,10 +92,14 @@ class RealSenseStream:
                     yield frames
             elif device.is_over():
                 return
-            elif time.monotonic() - last_arrival > _SILENCE_TIMEOUT:
+            elif not device.is_connected() or time.monotonic() - last_arrival > _SILENCE_TIMEOUT:
                 raise InputError(f"{self.name}: sends no images; plug the camera into a USB 3 port and start again")
 
-    def _convert_frame(self, index: int, stamp: float, colour: Any, depth: Any, depth_scale: float) -> RGBDFrame:
+    def _is_stopped(self) -> bool:
+        """Check whether another thread ended the iteration."""
+        return False
+
+    def _convert_frame(self, index: int, stamp: float, colour: Any, depth: Any, device: Device) -> RGBDFrame:
         encoding = colour.get_profile().format().name
         if encoding not in COLOUR_ENCODINGS:
             raise InputError(f"{self.name}: sends colour in the unsupported format {encoding}; record it as rgb8")
@@ -101,24 +111,9 @@ class RealSenseStream:
             )
         # librealsense reuses the memory of both images: convert_to_rgb and depth_to_metres copy it.
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOUR_ENCODINGS[encoding][0])
-        metres = self.camera.correct_depth(depth_to_metres(np.asanyarray(depth.get_data()), depth_scale))
+        units = np.asanyarray(depth.get_data())
+        metres = self.camera.correct_depth(depth_to_metres(units, depth_scale_from(device.depth_unit)))
         return RGBDFrame(index, stamp, convert_to_rgb(encoding, pixels), metres, camera=self.camera)
-
-
-def open_realsense_camera(name: str, camera: CameraChoice = None, *, fps: float | None = None) -> RealSenseStream:
-    """Open a connected camera as a stream.
-
-    Args:
-        name: ``realsense:`` for any camera, ``realsense:SERIAL`` for one of several.
-        camera: Camera chosen by the user; None for the calibration of the device.
-        fps: Frame rate to request, Hz; None for the default.
-
-    Raises:
-        InputError: If the camera cannot be opened, see `open_live_device`.
-    """
-    serial = name.partition(":")[2]
-    label = f"realsense_{serial}" if serial else "realsense"  # without a colon: valid as a folder name
-    return RealSenseStream(label, partial(open_live_device, label, serial, fps), camera)
 
 
 def open_realsense_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:

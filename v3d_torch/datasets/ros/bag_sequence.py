@@ -16,6 +16,7 @@ from v3d_torch.datasets.camera_fields import camera_from_fields
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
+from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
 from v3d_torch.datasets.stored import Cursor
@@ -70,7 +71,8 @@ class BagSequence(ImageSequence):
         progress: Progress | None = None,
     ) -> None:
         self.path = path
-        self.topics = topics = choose_topics(path, read_topic_types(path), rgb_topic, depth_topic, info_topic)
+        types = read_topic_types(path)
+        self.topics = topics = choose_topics(path, types, rgb_topic, depth_topic, info_topic)
         chosen = choose_camera(
             camera,
             path,
@@ -106,6 +108,7 @@ class BagSequence(ImageSequence):
             Cursor(partial(_read_messages, path, topic)) for topic in (topics.rgb, topics.depth)
         )
         self._read(0)  # raise errors that concern every frame now
+        self.gravity = read_gravity(path, types, partial(_read_messages, path), colour_frame, float(self.stamps[0]))
 
     def _sources(self, index: int) -> tuple[str, str]:
         return f"{self.path}: {self.topics.rgb}", f"{self.path}: {self.topics.depth}"
@@ -143,13 +146,15 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
     try:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise InputError(f"{path}: reading a bag needs rosbags ({error}); run pip install rosbags") from error
     # All versions of ROS 1, and all of ROS 2, define images and cameras alike. The definitions in the bag are not
     # parsed, so that a malformed definition of an unrelated topic cannot fail.
     is_ros1 = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
+    if is_ros1:  # the message of transforms is missing
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     try:
         reader = Reader1(path) if is_ros1 else Reader2(path)
         reader.open()

@@ -19,11 +19,13 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
 from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 from v3d_torch.viz.rerun.layout import layout
 from v3d_torch.viz.rerun.objects import format_objects, log_objects, motion_state_classes, rgba
+from v3d_torch.viz.rerun.occupancy import log_floor, log_voxels
 
 _LOG = logging.getLogger("v3d_torch")
 
@@ -44,7 +46,9 @@ class RerunViewer:
     ``world/camera/image``                    pinhole; below it ``rgb``, ``depth``, ``masks`` and boxes of ``objects``
     ``world/objects``, ``world/centroids``    clouds and centroids of the objects; their class is the motion state
     ``world/votes``                           lines of votes for dynamic objects; other votes: ``without_effect``
-    ``world/map``                             ``landmarks`` and ``keyframes``, logged again after each new keyframe
+    ``world/map``                             ``landmarks`` and ``keyframes``, logged again after each new keyframe;
+                                              ``points`` of the static scene, at the end
+    ``world/occupancy``                       occupied voxels, logged with the map; ``floor``: free cells, at the end
     ``world/trajectory``                      all poses, logged again after each new keyframe; ``newest``: poses since
     ``world/groundtruth``                     ground truth, aligned at the first pose that has one
     ``seconds``, ``votes``, ``chamfer``       curves, by stage and by object id
@@ -106,13 +110,17 @@ class RerunViewer:
                 self._stream.log(f"seconds/{stage}", rr.Scalars(spent.wall))
             self._log_text(frame, objects, slam, is_keyframe)
 
-    def finish(self, slam: V3DSLAM) -> None:
+    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Log the final map and poses, and close the file and the connection.
 
         Raises:
             OutputError: If the file could not be written completely.
         """
         self._log_map(slam)
+        if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
+            log_floor(self._stream, grid)
+        points = rr.Points3D(point_map.points.numpy(), colors=point_map.colours.numpy())
+        self._stream.log("world/map/points", points)
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT)
         except RuntimeError as error:
@@ -143,6 +151,8 @@ class RerunViewer:
         self._stream.log("world/map/landmarks", grey)
         frustums = _frustums(self._camera, invert(stack_poses(slam.map.active_keyframes)))
         self._stream.log("world/map/keyframes", _lines(frustums, "tab:cyan", width=0.7))
+        if slam.occupancy is not None:
+            log_voxels(self._stream, slam.occupancy.map)
         positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
         self._stream.log("world/trajectory", _lines([positions], "tab:blue"))
         self._newest = list(positions[-1:])

@@ -1,13 +1,16 @@
-"""Poses and points with noisy observations, for bundle adjustment."""
+"""Random scenes for bundle adjustment: true poses and points, their observations, and an inaccurate estimate."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.mapping.bundle_adjustment import Observations
+from v3d_torch.mapping.bundle_adjustment import BundleAdjustment, bundle_adjust
+from v3d_torch.optim.reprojection import Measurements, reprojection_residuals
 
 CAMERA = PinholeCamera(fx=535.4, fy=539.2, cx=320.1, cy=247.6)
 DEPTH_SIGMA = 0.0025
@@ -45,15 +48,28 @@ class Scene:
         sigma = 1.2 ** torch.randint(0, 8, (count,), generator=generator).to(torch.float64)
         inverse_depth = 1 / in_camera[:, 2] + noise * DEPTH_SIGMA * normal(count)
         inverse_depth[uniform(count) < 0.3] = 0.0
-        self.observations = Observations(
-            pose=pose,
-            point=point,
+        self.measured = Measurements(
             uv=CAMERA.project(in_camera) + noise * sigma[:, None] * normal(count, 2),
             inverse_depth=inverse_depth,
             pixel_sigma=sigma,
             inverse_depth_sigma=DEPTH_SIGMA,
         )
+        self.pose, self.point = pose, point
         self.fixed = torch.arange(poses) == 0
         error = 0.02 * normal(poses, 6)
         self.start = torch.where(self.fixed[:, None, None], self.T_cw, se3_exp(error) @ self.T_cw)
         self.start_points = self.points + 0.02 * normal(points, 3)
+
+    @property
+    def observations(self) -> dict[str, Any]:
+        """Arguments of `bundle_adjust` beside the initial poses and points."""
+        return {**vars(self.measured), "pose": self.pose, "point": self.point, "K": CAMERA.K, "fixed": self.fixed}
+
+    def adjust(self, **arguments: Any) -> BundleAdjustment:
+        """Adjust the initial estimate; arguments replace those of the scene."""
+        return bundle_adjust(**({"T_cw": self.start, "points": self.start_points} | self.observations | arguments))
+
+    def residuals(self, T_cw: Tensor, points: Tensor) -> Tensor:
+        T = T_cw[self.pose]
+        in_camera = (T[:, :3, :3] @ points[self.point, :, None])[..., 0] + T[:, :3, 3]
+        return reprojection_residuals(in_camera, self.measured, CAMERA.K)

@@ -1,0 +1,1 @@
+"""Evaluation of people's tracks against true masks."""

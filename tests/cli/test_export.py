@@ -1,0 +1,214 @@
+"""Command ``v3d-torch export``: a run with saved masks in the formats of other tools, and errors."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import chdir
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.colmap_reader import read_model
+from helpers.commands import assert_error_line, files_in
+from typer.testing import CliRunner, Result
+
+from v3d_torch.cli import export, run
+from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.demo.sequence import write_sequence
+from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.io.ply import read_ply_points
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sequence") / "walk"
+    write_sequence(folder, range(45, 45 + FRAMES))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def results(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of a run with masks and map, called from another folder with relative paths."""
+    folder = tmp_path_factory.mktemp("run")
+    shutil.copytree(sequence, folder / "walk")
+    arguments = "--seq walk --segmenter masks --masks walk/masks --save-masks --save-map room.npz --out out"
+    with chdir(folder):
+        done = CliRunner().invoke(run.app, [*arguments.split(), "--set", "mapping.max_keyframe_interval=4"])
+    assert (done.exit_code, done.stderr) == (0, "")
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def colmap(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("colmap") / "out"
+    done = call(results, "--format", "colmap", "--out", out, "--keyframes")
+    assert (done.exit_code, done.stderr, done.stdout) == (
+        0,
+        "",
+        f"{len(list((out / 'images').iterdir()))} images: {out}\n",
+    )
+    return out
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(export.app, list(map(str, arguments)), env={"COLUMNS": "200"})
+
+
+def test_request_of_the_run_has_absolute_paths(results: Path) -> None:
+    text = (results / "request.yaml").read_text()
+    assert f"seq: {results.parent / 'walk'}\n" in text and f"save_map: {results.parent / 'room.npz'}\n" in text
+
+
+def test_nerfstudio_export_has_all_frames_with_poses_masks_and_depth(
+    results: Path, sequence: Path, tmp_path: Path
+) -> None:
+    done = call(results, "--format", "nerfstudio", "--out", tmp_path / "out [b]")
+    assert (done.exit_code, done.stderr, done.stdout) == (0, "", f"{FRAMES} images: {tmp_path / 'out [b]'}\n")
+    transforms = json.loads((tmp_path / "out [b]" / "transforms.json").read_text())
+    poses, frames = read_trajectory(results / "trajectory.txt"), load_sequence(str(sequence))
+    assert len(transforms["frames"]) == FRAMES
+    for entry, T_wc, frame in zip(transforms["frames"], poses.T_wc, frames, strict=True):
+        np.testing.assert_allclose(np.array(entry["transform_matrix"])[:3, 3], T_wc[:3, 3], atol=1e-9)
+        image = cv2.imread(str(tmp_path / "out [b]" / entry["file_path"]))[..., ::-1]
+        np.testing.assert_array_equal(image, frame.image.permute(1, 2, 0))
+        mask = cv2.imread(str(tmp_path / "out [b]" / entry["mask_path"]), cv2.IMREAD_UNCHANGED)
+        depth = cv2.imread(str(tmp_path / "out [b]" / entry["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        assert (depth[mask == 0] == 0).all() and (depth[mask == 255] > 0).mean() > 0.9
+        people = frames.motion_mask(frame.index)
+        assert people is not None and (mask[people.numpy() > 0] == 0).mean() > 0.95
+    assert (tmp_path / "out [b]" / "points.ply").read_bytes() == (results / "map.ply").read_bytes()
+
+
+def test_convention_map_points_have_their_colours_in_the_images_of_a_colmap_export(results: Path, colmap: Path) -> None:
+    points, colours = read_ply_points(results / "map.ply")
+    model = read_model(colmap / "sparse" / "0", points[::200].double().numpy())
+    for name, image in model.images.items():
+        picture = cv2.imread(str(colmap / "images" / name))[..., ::-1].astype(float)
+        mask = cv2.imread(str(colmap / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+        differences = []
+        for uv, colour in zip(image["projections"], colours[::200].tolist(), strict=True):
+            if uv is not None and 0 <= uv[0] < 640 and 0 <= uv[1] < 480:
+                u, v = np.floor(uv).astype(int)
+                if mask[v, u]:
+                    differences.append(np.abs(picture[v, u] - colour).mean())
+        assert len(differences) > 100 and np.median(differences) < 12
+
+
+def test_colmap_landmarks_are_those_of_the_saved_map(results: Path, colmap: Path) -> None:
+    model = read_model(colmap / "sparse" / "0")
+    landmarks = [point for point in model.points.values() if point["track"]]
+    assert len(landmarks) > 100 and all(len(point["track"]) >= 2 for point in landmarks)
+    assert np.mean([point["error"] for point in landmarks]) < 1.5
+    assert len(model.points) - len(landmarks) == len(read_ply_points(results / "map.ply")[0])
+    T_wc = read_trajectory(results / "keyframes.txt").T_wc
+    written = [image["T_cw"] for _, image in sorted(model.images.items())]
+    np.testing.assert_allclose(written, invert(T_wc)[:, :3], atol=1e-7)
+
+
+def test_tum_export_is_a_sequence_without_what_moves(results: Path, sequence: Path, tmp_path: Path) -> None:
+    done = call(results, "--format", "tum", "--out", tmp_path / "static", "--every", "3")
+    assert (done.exit_code, done.stderr, done.stdout) == (0, "", f"4 images: {tmp_path / 'static'}\n")
+    original, static = load_sequence(str(sequence)), load_sequence(str(tmp_path / "static"))
+    estimate = read_trajectory(tmp_path / "static" / "estimated_trajectory.txt")
+    assert estimate.stamps.tolist() == static.stamps.tolist() == original.stamps.tolist()[::3]
+    for frame, source in zip(static, (original[index] for index in range(0, FRAMES, 3)), strict=True):
+        assert torch.equal(frame.image, source.image)
+        mask = cv2.imread(str(results / "map_masks" / f"{source.stamp:.6f}.png"), cv2.IMREAD_UNCHANGED)
+        assert torch.equal(frame.depth[0], torch.where(torch.from_numpy(mask == 0), source.depth[0], 0.0))
+    assert static.groundtruth is not None  # of the source, in a file of its own
+
+
+def test_undistort_and_no_masks(results: Path, tmp_path: Path) -> None:
+    done = call(results, "--format", "nerfstudio", "--out", tmp_path, "--every", "6", "--undistort", "--no-masks")
+    assert done.exit_code == 0, done.stderr
+    assert len(files_in(tmp_path)) == 2 * 3 + 2
+    mask = cv2.imread(str(tmp_path / "masks" / "frame_000006.png"), cv2.IMREAD_UNCHANGED)
+    assert (mask == 255).all()  # the demo has no lens distortion
+
+
+def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(results, copy)
+    moved = (copy / "request.yaml").read_text().replace("/walk", "/gone")
+    (copy / "request.yaml").write_text(moved)
+    arguments = (copy, "--format", "nerfstudio", "--every", "6", "--out")
+    assert_error_line(call(*arguments, tmp_path / "a"), "gone")
+    assert call(*arguments, tmp_path / "b", "--seq", sequence).exit_code == 0
+    assert len(list((tmp_path / "b" / "images").iterdir())) == 2
+    write_sequence(tmp_path / "other", range(5))
+    for name, words in (("other", "fewer than the run"), ("later", "pass the sequence of this run with --seq")):
+        if name == "later":
+            write_sequence(tmp_path / "later", range(60, 60 + FRAMES))
+        assert_error_line(call(*arguments, tmp_path / f"to_{name}", "--seq", tmp_path / name), words)
+
+
+def test_broken_frames_that_the_run_passed_over_are_left_out(sequence: Path, tmp_path: Path) -> None:
+    shutil.copytree(sequence, tmp_path / "walk")
+    broken = sorted((tmp_path / "walk" / "rgb").iterdir())[2]
+    broken.write_bytes(b"")
+    arguments = f"--seq {tmp_path / 'walk'} --segmenter none --skip-broken --save-masks --out {tmp_path / 'run'}"
+    assert CliRunner().invoke(run.app, arguments.split()).exit_code == 0
+    done = call(tmp_path / "run", "--format", "tum", "--out", tmp_path / "out")
+    assert (done.exit_code, done.stderr) == (0, "")
+    original, static = load_sequence(str(sequence)), load_sequence(str(tmp_path / "out"))
+    assert static.stamps.tolist() == [stamp for index, stamp in enumerate(original.stamps.tolist()) if index != 2]
+
+
+def test_map_without_common_landmarks_gives_a_note(results: Path, tmp_path: Path) -> None:
+    arguments = ("--format", "colmap", "--out", tmp_path / "out", "--every", "11")
+    copy = tmp_path / "copy"
+    shutil.copytree(results, copy)
+    (copy / "request.yaml").write_text((results / "request.yaml").read_text().replace("room.npz", "gone.npz"))
+    done = call(copy, *arguments)
+    assert done.exit_code == 0 and "note: no image points are written: " in done.stdout and "gone.npz" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("map_masks", "has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"),
+        ("request.yaml", "request.yaml: cannot be read"),
+        ("metrics.json", "has no results of a run"),
+        ("map.ply", "map.ply: is missing, because the run did not end"),
+    ],
+)
+def test_missing_file_is_an_error_and_nothing_is_written(file: str, words: str, results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(results, copy)
+    shutil.rmtree(copy / file) if (copy / file).is_dir() else (copy / file).unlink()
+    assert_error_line(call(copy, "--format", "nerfstudio", "--out", tmp_path / "out"), words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_unsuitable_options_and_folders_are_errors(results: Path, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "diary.txt").write_text("")
+    done = call(results, "--format", "colmap", "--out", tmp_path / "full")
+    assert_error_line(done, "already exists and is not an empty folder; choose another folder with --out")
+    done = call(results, "--format", "tum", "--out", tmp_path / "out", "--no-masks")
+    assert_error_line(done, "--format tum: has masks and the images as recorded; remove --no-masks and --undistort")
+    copy = tmp_path / "live"
+    shutil.copytree(results, copy)
+    (copy / "request.yaml").write_text(
+        (results / "request.yaml").read_text().replace(f"seq: {results.parent}/walk", "seq: 'realsense:'")
+    )
+    assert_error_line(
+        call(copy, "--format", "tum", "--out", tmp_path / "out"), "images of a live camera are not stored"
+    )
+    (copy / "request.yaml").write_text("seq: 7\n")
+    assert_error_line(call(copy, "--format", "tum", "--out", tmp_path / "out"), "request.yaml: seq: input should be")
+
+
+def test_damaged_mask_is_an_error_that_names_the_file(results: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(results, copy)
+    mask = sorted((copy / "map_masks").iterdir())[0]
+    mask.write_bytes(b"")
+    done = call(copy, "--format", "nerfstudio", "--out", tmp_path / "out")
+    assert_error_line(done, str(mask), "run the sequence again with --save-masks")

@@ -1,0 +1,71 @@
+"""Playback of a stored sequence at its own rate, with a simulated clock."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import pytest
+from helpers.wall_run import FRAMES, Wall
+
+from v3d_torch.datasets.base import LiveStream
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.errors import InputError
+
+
+class SimulatedClock:
+    """Clock that shows the sum of all waits."""
+
+    def __init__(self) -> None:
+        self.time = 50.0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += max(seconds, 0.0)
+
+
+class StoredWall(Wall):
+    """Wall that can be iterated."""
+
+    def __iter__(self):  # type: ignore[no-untyped-def]
+        return (self[index] for index in range(FRAMES))
+
+
+def test_frames_come_when_they_are_due() -> None:
+    clock = SimulatedClock()
+    playback = RealtimePlayback(StoredWall(), clock)
+    for index, frame in enumerate(playback):
+        assert frame.index == index
+        assert clock.time == pytest.approx(50 + index / 10)
+        assert playback.captured_at(frame) == pytest.approx(clock.time)
+        clock.time += 0.03  # of the consumer, which does not delay the next frame
+    assert index == FRAMES - 1
+
+
+def test_frame_that_is_read_too_late_counts_as_captured_when_it_was_due() -> None:
+    clock = SimulatedClock()
+    playback = RealtimePlayback(StoredWall(), clock)
+    frames = iter(playback)
+    next(frames)
+    clock.time += 5
+    frame = next(frames)
+    assert clock.time == 55 and playback.captured_at(frame) == pytest.approx(50.1)
+
+
+def test_stop_ends_the_iteration_and_the_next_one_starts_again() -> None:
+    playback = RealtimePlayback(StoredWall(), SimulatedClock())
+    frames = iter(playback)
+    assert [frame.index for frame in islice(frames, 3)] == [0, 1, 2]
+    playback.stop()
+    assert list(frames) == []
+    assert len(list(playback)) == FRAMES
+
+
+def test_playback_has_name_camera_and_ground_truth_of_its_source_and_is_live() -> None:
+    wall = StoredWall()
+    playback = RealtimePlayback(wall)
+    assert isinstance(playback, LiveStream)
+    assert (playback.name, playback.camera, playback.groundtruth) == (wall.name, wall.camera, wall.groundtruth)
+    with pytest.raises(InputError, match="wall: is a live camera, which always has its own rate; remove --realtime"):
+        RealtimePlayback(playback)

@@ -1,0 +1,88 @@
+"""Least-squares alignment against evo, known transforms and SciPy; weights, padding, gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from evo.core.geometry import umeyama_alignment
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama
+from v3d_torch.geometry.se3 import se3_exp
+
+
+def normal(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("with_scale", [False, True])
+def test_transform_equals_evo(with_scale: bool) -> None:
+    p, q = normal(30, 3), normal(30, 3, seed=1)
+    R, t, scale = umeyama_alignment(p.numpy().T, q.numpy().T, with_scale)
+    found = umeyama(p, q, with_scale=with_scale)
+    np.testing.assert_allclose(found[:3, :3], (scale if with_scale else 1) * R, atol=1e-12)
+    np.testing.assert_allclose(found[:3, 3], t, atol=1e-12)
+
+
+def test_convention_transform_maps_p_to_q() -> None:
+    T_qp = se3_exp(normal(4, 6))
+    T_qp[:, :3, :3] *= 1.7
+    p = normal(4, 10, 3, seed=1)
+    q = p @ T_qp[:, :3, :3].mT + T_qp[:, None, :3, 3]
+    torch.testing.assert_close(umeyama(p, q, with_scale=True), T_qp)
+    single = umeyama(p.float(), q.float(), with_scale=True)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), T_qp, rtol=0, atol=1e-5)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(st.integers(0, 3), min_size=12, max_size=12).filter(lambda counts: sum(map(bool, counts)) > 3))
+def test_weights_count_pairs_and_padding_does_not(counts: list[int]) -> None:
+    p, q = normal(12, 3), normal(12, 3, seed=1)
+    weights = torch.tensor(counts)
+    valid = weights > 0
+    repeats = torch.arange(12).repeat_interleave(weights)
+    expected = umeyama(p[repeats], q[repeats], with_scale=True)
+    torch.testing.assert_close(umeyama(p, q, weights, with_scale=True), expected)
+    padded = torch.where(valid[:, None], p, torch.nan)
+    torch.testing.assert_close(umeyama(padded, q, weights, valid, with_scale=True), expected)
+
+
+def test_without_points_the_transform_is_the_identity() -> None:
+    eye, p = torch.eye(4, dtype=torch.float64), normal(2, 5, 3)
+    assert torch.equal(umeyama(p[:, :0], p[:, :0]), eye.expand(2, 4, 4))
+    assert torch.equal(umeyama(p, p, valid=torch.zeros(2, 5, dtype=torch.bool)), eye.expand(2, 4, 4))
+
+
+def test_nearest_rotation_equals_scipy() -> None:
+    M = normal(20, 3, 3)
+    for one, other in zip(nearest_rotation(M), M, strict=True):
+        # The rotation that maps the columns of the identity best to those of M.
+        expected = Rotation.align_vectors(other.T.numpy(), np.eye(3))[0].as_matrix()
+        np.testing.assert_allclose(one, expected, atol=1e-9)
+        assert torch.linalg.det(one) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("shape", ["room", "plane", "mirrored"])
+@pytest.mark.parametrize("with_scale", [False, True])
+def test_gradients_equal_finite_differences(shape: str, with_scale: bool) -> None:
+    """In a plane, the gradients of the singular vectors are not finite."""
+    p, q = normal(7, 3), normal(7, 3, seed=1)
+    if shape == "plane":
+        p[:, 2] = q[:, 2] = 0
+    if shape == "mirrored":
+        q = p * torch.tensor([1.0, 1.0, -1.0]) + 0.01 * q
+    weights = 0.5 + torch.rand(7, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    arguments = [each.requires_grad_() for each in (p, q, weights)]
+    assert torch.autograd.gradcheck(lambda *args: umeyama(*args, with_scale=with_scale), arguments)
+
+
+def test_gradients_of_points_on_a_line_or_at_one_place_are_finite() -> None:
+    for scale in (torch.tensor([1.0, 0.0, 0.0]), torch.zeros(3)):
+        p = (normal(6, 3) * scale).requires_grad_()
+        umeyama(p, p.detach() + 1.0).sum().backward()
+        assert p.grad is not None and p.grad.isfinite().all()

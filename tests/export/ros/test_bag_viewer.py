@@ -1,0 +1,269 @@
+"""Bags of whole runs, read back by two libraries and compared with the run; bags that cannot be written."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.bag_messages import (
+    Messages,
+    lookup,
+    matrix_of,
+    points_of,
+    read_with_mcap,
+    read_with_rosbags,
+    stamp_of,
+)
+from helpers.squares import squares
+from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+
+from v3d_torch.config.loading import load_config
+from v3d_torch.errors import OutputError
+from v3d_torch.export.ros.bag_file import BagFile
+from v3d_torch.export.ros.bag_viewer import BagViewer
+from v3d_torch.export.ros.frames import camera_in_map, points_in_map
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.reconstruction.point_map import PointMap
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.types import RGBDFrame
+
+CONFIG = load_config(overrides=["mapping.max_keyframe_interval=5"])
+EVERY_FRAME = ("/tf", "/odom", "/camera/color/camera_info", "/objects")
+
+
+class Recorded:
+    """Run along the wall, recorded in a bag, with the pose of each frame when it was tracked."""
+
+    def __init__(self, path: Path, sequence: Wall | None = None) -> None:
+        self.path = path
+        self.T_wc: list[torch.Tensor] = []
+        self.keyframes = 0
+        self.states: list[CameraState] = []
+        slam = V3DSLAM(CAMERA, squares, CONFIG)
+        self.pipeline = Pipeline(sequence or Wall(), slam, viewer=BagViewer(path, CAMERA))
+        self.pipeline(self._on_frame)
+        self.point_map: PointMap = self.pipeline.flush()
+
+    def _on_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
+        self.T_wc.append(result.T_wc)
+        self.states.append(self.pipeline.slam.states.at(frame.stamp))
+        self.keyframes = len(self.pipeline.slam.map.keyframes)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    run = Recorded(tmp_path_factory.mktemp("bag") / "new" / "run.mcap")
+    assert run.pipeline.record.failure is None
+    return run
+
+
+@pytest.fixture(scope="module", params=[read_with_mcap, read_with_rosbags])
+def messages(recorded: Recorded, request: pytest.FixtureRequest) -> Messages:
+    read: Any = request.param
+    return read(recorded.path)
+
+
+def test_file_states_profile_schemas_and_encodings_of_ros2(recorded: Recorded) -> None:
+    with recorded.path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None and reader.get_header().profile == "ros2"
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            assert (channel.message_encoding, schema.encoding) == ("cdr", "ros2msg")
+            assert schema.name.split("/")[1] == "msg" and b"MSG: std_msgs/Header" in schema.data
+        assert summary.statistics is not None and summary.chunk_indexes
+    with Reader(recorded.path) as reader2:
+        assert {each.topic: each.msgcount for each in reader2.connections} == {
+            **dict.fromkeys(EVERY_FRAME, FRAMES),
+            "/cloud": recorded.keyframes,
+            "/path": recorded.keyframes + 1,
+            "/cloud_map": 1,
+        }
+
+
+def test_times_are_those_of_the_frames_and_never_decrease(messages: Messages) -> None:
+    for topic in EVERY_FRAME:
+        times = [time for time, _ in messages[topic]]
+        assert times == [round(1e8 * index) for index in range(FRAMES)]
+    for topic in ("/odom", "/camera/color/camera_info", "/cloud", "/path", "/cloud_map"):
+        times = [time for time, _ in messages[topic]]
+        assert times == sorted(times)
+        assert [stamp_of(message.header) for _, message in messages[topic]] == pytest.approx([1e-9 * t for t in times])
+    stamps = [stamp_of(each.header) for _, tf in messages["/tf"] for each in tf.transforms]
+    assert stamps == pytest.approx([index / 10 for index in range(FRAMES) for _ in range(3)])
+
+
+def test_convention_tf_tree_gives_the_pose_of_each_frame(messages: Messages, recorded: Recorded) -> None:
+    for (_, tf), T_wc in zip(messages["/tf"], recorded.T_wc, strict=True):
+        np.testing.assert_allclose(lookup(tf, "map", "camera_link"), camera_in_map(T_wc), atol=1e-9)
+        # A point 2 m in front of the optical frame, 1 m right of its centre, is in map where the world has it.
+        point = torch.tensor([1.0, 0.0, 2.0, 1.0], dtype=torch.float64)
+        in_map = lookup(tf, "map", "camera_color_optical_frame") @ point.numpy()
+        np.testing.assert_allclose(in_map[:3], points_in_map((T_wc @ point)[:3]), atol=1e-9)
+
+
+def test_odometry_agrees_with_tf_and_moves_to_the_right(messages: Messages) -> None:
+    for (_, odom), (_, tf) in zip(messages["/odom"], messages["/tf"], strict=True):
+        assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "camera_link")
+        np.testing.assert_allclose(matrix_of(odom.pose.pose), lookup(tf, "odom", "camera_link"), atol=1e-12)
+    speed = 10 * 4 * WALL / CAMERA.fx  # STEP pixels of the wall per frame, to the right
+    linear = [odom.twist.twist.linear for _, odom in messages["/odom"]]
+    assert linear[0].y == 0
+    assert np.median([velocity.y for velocity in linear]) == pytest.approx(-speed, rel=0.05)
+
+
+def test_convention_covariances_of_pose_and_twist_are_along_the_axes_of_ros(
+    messages: Messages, recorded: Recorded
+) -> None:
+    for (_, odom), (_, tf), state in zip(messages["/odom"], messages["/tf"], recorded.states, strict=True):
+        # An error along one axis of the optical frame has its variance along the same direction in odom.
+        R = lookup(tf, "odom", "camera_color_optical_frame")[:3, :3]
+        pose, twist = (np.reshape(each.covariance, (6, 6)) for each in (odom.pose, odom.twist))
+        for rows in (slice(0, 3), slice(3, 6)):
+            along_axes = R.T @ pose[rows, rows] @ R
+            np.testing.assert_allclose(along_axes, state.covariance[rows, rows], atol=1e-12)
+        x, y, z = twist.diagonal()[:3]  # x forward, y left, z up
+        np.testing.assert_allclose([y, z, x], state.twist_covariance.diagonal()[:3])
+        linear = odom.twist.twist.linear
+        np.testing.assert_allclose([-linear.y, -linear.z, linear.x], state.twist[:3], atol=1e-12)
+
+
+def test_path_has_all_frames_at_the_end(messages: Messages, recorded: Recorded) -> None:
+    trajectory = recorded.pipeline.slam.poses.trajectory()
+    poses = messages["/path"][-1][1].poses
+    assert [stamp_of(each.header) for each in poses] == pytest.approx(trajectory.stamps.tolist())
+    written = np.array([matrix_of(each.pose) for each in poses])
+    np.testing.assert_allclose(written, camera_in_map(trajectory.T_wc), atol=1e-9)
+    assert [len(message.poses) for _, message in messages["/path"][:2]] == [1, 2]
+
+
+def test_clouds_lie_on_the_wall_without_people(messages: Messages, recorded: Recorded) -> None:
+    points, colours = points_of(messages["/cloud_map"][0][1])
+    np.testing.assert_array_equal(points, points_in_map(recorded.point_map.points))
+    np.testing.assert_array_equal(colours, recorded.point_map.colours)
+    assert np.abs(points[:, 0] - WALL).max() < 0.02
+    for _, cloud in messages["/cloud"]:
+        assert cloud.header.frame_id == "camera_color_optical_frame"
+        xyz, _ = points_of(cloud)
+        assert len(xyz) > 1000 and np.allclose(xyz[:, 2], WALL)
+    index = round(messages["/cloud"][0][0] / 1e8)
+    first = Wall()[index]
+    pixels = np.rint(xyz_to_pixels(points_of(messages["/cloud"][0][1])[0])).astype(int)
+    expected = first.image.permute(1, 2, 0).numpy()[pixels[:, 1], pixels[:, 0]]
+    np.testing.assert_array_equal(points_of(messages["/cloud"][0][1])[1], expected)
+
+
+def xyz_to_pixels(points: Any) -> Any:
+    return points[:, :2] / points[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+
+
+def test_objects_have_markers_in_every_frame(messages: Messages) -> None:
+    namespaces = [{marker.ns for marker in message.markers} for _, message in messages["/objects"]]
+    assert all({"boxes", "names"} <= each for each in namespaces)
+
+
+def test_same_run_writes_the_same_bytes(recorded: Recorded, tmp_path: Path) -> None:
+    again = Recorded(tmp_path / "run.mcap")
+    assert again.path.read_bytes() == recorded.path.read_bytes()
+
+
+def test_poses_are_the_same_with_and_without_a_bag(recorded: Recorded) -> None:
+    pipeline = Pipeline(Wall(), V3DSLAM(CAMERA, squares, CONFIG))
+    pipeline()
+    assert torch.equal(pipeline.flush().points, recorded.point_map.points)
+    trajectory = recorded.pipeline.slam.poses.trajectory()
+    assert torch.equal(pipeline.slam.poses.trajectory().T_wc, trajectory.T_wc)
+
+
+def test_correction_of_the_map_changes_map_to_odom_only(tmp_path: Path) -> None:
+    """The map is moved as by a loop correction, before the last frame is written again."""
+    slam = V3DSLAM(CAMERA, squares, CONFIG)
+    viewer = BagViewer(tmp_path / "run.mcap", CAMERA)
+
+    def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
+        if frame.index == FRAMES - 1:
+            T_new_old = se3_exp(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.3, 0.0], dtype=torch.float64))
+            slam.map.move_keyframes(slam.map.T_cw @ invert(T_new_old))
+            viewer.show(frame, result, slam, {})
+
+    pipeline = Pipeline(Wall(), slam, viewer=viewer)
+    pipeline(on_frame)
+    pipeline.flush()
+    before, after = (tf for _, tf in read_with_mcap(tmp_path / "run.mcap")["/tf"][-2:])
+    np.testing.assert_allclose(lookup(after, "odom", "camera_link"), lookup(before, "odom", "camera_link"), atol=1e-9)
+    moved = np.linalg.norm(lookup(after, "map", "odom")[:3, 3] - lookup(before, "map", "odom")[:3, 3])
+    assert moved > 0.4
+    expected = camera_in_map(invert(slam.poses.T_cw))
+    np.testing.assert_allclose(lookup(after, "map", "camera_link"), expected, atol=1e-9)
+
+
+def test_lost_camera_has_camera_info_only(tmp_path: Path) -> None:
+    class Dark(Wall):
+        def __getitem__(self, index: int) -> RGBDFrame:
+            frame = super().__getitem__(index)
+            return RGBDFrame(index, frame.stamp, frame.image * 0, frame.depth * 0) if index >= 8 else frame
+
+    run = Recorded(tmp_path / "run.mcap", Dark())
+    messages = read_with_mcap(run.path)
+    lost = run.pipeline.slam.poses.statuses.count("lost")
+    assert lost > 0
+    assert len(messages["/camera/color/camera_info"]) == FRAMES
+    assert len(messages["/tf"]) == len(messages["/odom"]) == FRAMES - lost
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("run.bag", "choose a name that ends in .mcap"), ("taken.mcap", "exists already"), ("file/run.mcap", "file")],
+)
+def test_unsuitable_file_is_an_error_before_the_run(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / "taken.mcap").write_text("precious")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=words):
+        BagViewer(tmp_path / name, CAMERA)
+    assert (tmp_path / "taken.mcap").read_text() == "precious"
+
+
+def test_no_file_is_left_by_a_run_without_frames(tmp_path: Path) -> None:
+    run = Recorded(tmp_path / "run.mcap", Wall(broken=0))
+    assert not run.path.exists()
+
+
+def test_full_disk_is_a_failure_after_all_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original, count = BagFile.write, 0
+
+    def write(self: BagFile, *arguments: Any) -> None:
+        nonlocal count
+        count += 1
+        if count > 10:
+            raise self._error(OSError(errno.ENOSPC, "No space left on device"))
+        original(self, *arguments)
+
+    monkeypatch.setattr(BagFile, "write", write)
+    run = Recorded(tmp_path / "run.mcap")
+    failure = run.pipeline.record.failure
+    assert failure is not None and "run.mcap: the bag cannot be written (No space left on device)" in failure
+    assert len(run.pipeline.slam.poses) == FRAMES and count == 11
+    assert len(read_with_mcap(run.path)["/tf"]) == 2  # what was written before is readable
+
+
+def test_frames_before_the_end_of_time_are_recorded_and_the_error_names_the_cause(tmp_path: Path) -> None:
+    class Future(Wall):
+        def __init__(self) -> None:
+            super().__init__()
+            self.stamps = self.stamps + 2.0**31 - 0.45
+
+    run = Recorded(tmp_path / "run.mcap", Future())
+    failure = run.pipeline.record.failure
+    assert failure is not None and "messages of ROS hold 0 to 2^31 s" in failure
+    assert len(run.pipeline.slam.poses) == FRAMES
+    assert len(read_with_mcap(run.path)["/tf"]) == 5

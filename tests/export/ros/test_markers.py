@@ -1,0 +1,76 @@
+"""Markers of objects: boxes, names, velocities, and removal of the markers of the frame before."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from v3d_torch.export.ros.markers import Marker, object_markers
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
+
+MASK = torch.zeros(2, 2, dtype=torch.bool)
+CLOUD = torch.tensor([[1.0, -0.5, 4.0], [2.0, 0.5, 4.5], [1.2, 1.5, 4.1]])
+"""Points right of the camera, 2 m high: x from 1 to 2, y (down) from -0.5 to 1.5, z from 4 to 4.5."""
+
+
+def make_object(state: MotionState, cloud: Tensor = CLOUD, centroid: Tensor | None = None, **other: Any) -> Any:
+    centroid = cloud.mean(dim=0).to(torch.float64) if centroid is None else centroid
+    values = {"id": 7, "label": 0, "mask": MASK, "votes": 0, "chamfer": 0.0, "missed": False, **other}
+    return TrackedObject(motion_state=state, cloud=cloud, centroid=centroid, **values)
+
+
+def markers_of(*objects: TrackedObject, velocity: Tensor | None = None) -> dict[str, Any]:
+    velocities = {} if velocity is None else {7: velocity}
+    first, *others = object_markers(2.5, FrameObjects(list(objects), ~MASK, ~MASK, []), velocities).markers
+    assert first.action == Marker.DELETEALL
+    assert all(each.action == Marker.ADD and each.header.frame_id == "map" for each in others)
+    return {each.ns: each for each in others}
+
+
+def components(vector: Any) -> list[float]:
+    return [vector.x, vector.y, vector.z]
+
+
+def test_convention_box_encloses_the_cloud_in_map() -> None:
+    box = markers_of(make_object(MotionState.STATIC))["boxes"]
+    assert (box.type, box.id) == (Marker.CUBE, 7)
+    assert components(box.pose.position) == pytest.approx([4.25, -1.5, -0.5])  # forward, left, up
+    assert components(box.scale) == pytest.approx([0.5, 1.0, 2.0])
+    assert box.pose.orientation.w == 1
+
+
+def test_box_of_missed_object_is_at_its_predicted_centroid() -> None:
+    centroid = CLOUD.mean(dim=0).to(torch.float64) + torch.tensor([1.0, 0.0, 0.0])
+    box = markers_of(make_object(MotionState.DYNAMIC, centroid=centroid, missed=True))["boxes"]
+    assert components(box.pose.position) == pytest.approx([4.25, -2.5, -0.5])
+
+
+def test_name_is_above_the_box_in_the_colour_of_the_motion_state() -> None:
+    markers = markers_of(make_object(MotionState.DYNAMIC))
+    name, box = markers["names"], markers["boxes"]
+    assert (name.type, name.text) == (Marker.TEXT_VIEW_FACING, "person 7, dynamic")
+    assert name.pose.position.z > box.pose.position.z + box.scale.z / 2
+    assert (name.color.r, name.color.a, box.color.a) == (pytest.approx(0xD6 / 255), 1.0, pytest.approx(0.4))
+
+
+def test_velocity_of_dynamic_object_is_an_arrow_to_its_place_a_second_later() -> None:
+    velocity = torch.tensor([-1.0, 0.0, 0.5], dtype=torch.float64)  # to the left and away
+    markers = markers_of(make_object(MotionState.DYNAMIC), velocity=velocity)
+    start, end = markers["velocities"].points
+    assert components(start) == pytest.approx([4.2, -1.4, -0.5])
+    assert [b - a for a, b in zip(components(start), components(end), strict=True)] == pytest.approx([0.5, 1.0, 0.0])
+    assert "velocities" not in markers_of(make_object(MotionState.STATIC), velocity=velocity)
+
+
+def test_objects_without_centroid_or_cloud_have_no_markers() -> None:
+    nowhere = make_object(MotionState.UNKNOWN, centroid=torch.full((3,), torch.nan, dtype=torch.float64))
+    empty = make_object(MotionState.UNKNOWN, cloud=torch.zeros(0, 3), centroid=torch.zeros(3, dtype=torch.float64))
+    assert markers_of(nowhere, empty) == {}
+
+
+def test_flat_object_has_a_box_with_volume() -> None:
+    box = markers_of(make_object(MotionState.STATIC, cloud=CLOUD[:1]))["boxes"]
+    assert min(components(box.scale)) > 0

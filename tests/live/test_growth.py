@@ -1,0 +1,53 @@
+"""Size of the state in a long live run in one place: only poses and culled keyframes are added."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from io import BytesIO
+
+import torch
+from helpers.paced_frames import paced
+from helpers.walk_run import CAMERA, CONFIG, FORWARD, Walk, segment_red
+
+from v3d_torch.live import LiveSLAM
+from v3d_torch.segmentation import UprightSegmenter
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame
+
+TURN = 2 * (len(FORWARD) - 1)
+"""Number of frames in which the camera walks along the wall and back."""
+
+TURNS = 4
+GROWING = {"poses", "map"}
+
+
+def forth_and_back() -> Iterator[RGBDFrame]:
+    walk = Walk()
+    for index in range(TURNS * TURN):
+        position = min(index % TURN, TURN - index % TURN)
+        yield replace(walk[position], index=index, stamp=index / 10)
+
+
+def test_state_of_a_long_run_in_one_place_stays_bounded() -> None:
+    slam = V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG)
+    sizes: list[dict[str, int]] = []
+    for result in LiveSLAM(paced(forth_and_back(), slam), slam):
+        if (result.frame.index + 1) % TURN == 0:
+            size = {name: stored_size(state) for name, state in slam.state_dict().items()}
+            size["landmarks"], size["observations"] = len(slam.map.landmarks), len(slam.map.observations)
+            size["keyframes"] = len(slam.map.active_keyframes)
+            sizes.append(size)
+    assert len(sizes) == TURNS
+    for name in sizes[0].keys() - GROWING:
+        assert sizes[-1][name] <= 1.3 * max(size[name] for size in sizes[:-1]) + 50_000, name
+    assert sizes[-1]["poses"] - sizes[-2]["poses"] < 2000 * TURN
+    culled = len(slam.map.keyframes) - sizes[-1]["keyframes"]
+    assert culled > sizes[-1]["keyframes"]
+
+
+def stored_size(state: object) -> int:
+    """Size of a state in a file, bytes."""
+    file = BytesIO()
+    torch.save(state, file)
+    return file.tell()

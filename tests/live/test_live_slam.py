@@ -1,0 +1,131 @@
+"""SLAM on live frames: equality with an offline run, frames left out, latency, and ends of a run."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from queue import Queue
+from typing import Any
+
+import pytest
+import torch
+from helpers.wall_run import CAMERA, FRAMES, Wall, square
+
+from v3d_torch.config import Config
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.live import LiveResult, LiveSLAM
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
+
+
+def feed(wall: Wall | None = None) -> tuple[Iterator[RGBDFrame], Any]:
+    """Return a source of the frames along the wall, each of which comes when the returned function is called."""
+    queue: Queue[RGBDFrame | None] = Queue()
+    frames = iter([(wall or Wall())[index] for index in range(FRAMES)])
+
+    def send(*_: object) -> None:
+        queue.put(next(frames, None))
+
+    send()
+    return iter(queue.get, None), send
+
+
+def test_results_of_a_slow_camera_equal_those_of_an_offline_run() -> None:
+    source, send = feed()
+    live, offline = LiveSLAM(source, V3DSLAM(CAMERA, square)), V3DSLAM(CAMERA, square)
+    results = []
+    for result in live:
+        results.append(result)
+        send()
+    for index, result in enumerate(results):
+        expected = offline(Wall()[index])
+        assert torch.equal(result.T_wc, expected.T_wc) and torch.equal(result.covariance, expected.covariance)
+        assert torch.equal(result.twist, expected.twist) and torch.equal(result.static_mask, expected.static_mask)
+        assert (result.stamp, result.status, result.dropped) == (expected.stamp, expected.status, 0)
+    assert len(results) == FRAMES and live.dropped == live.rejected == 0
+
+
+def test_each_result_has_state_and_times() -> None:
+    source, send = feed()
+    results: list[LiveResult] = []
+    start = time.monotonic()
+    live = LiveSLAM(source, V3DSLAM(CAMERA, square))
+    live(lambda result: (results.append(result), send()))
+    assert len(results) == FRAMES
+    for index, result in enumerate(results):
+        assert result.frame.index == index and result.stamp == pytest.approx(index / 10)
+        assert result.status is TrackingStatus.TRACKED
+        assert start < result.captured_at < result.finished_at < time.monotonic()
+        assert result.latency == result.finished_at - result.captured_at
+        assert torch.linalg.eigvalsh(result.covariance).min() >= 0
+        assert result.twist.shape == (6,)
+    assert live.pose_at(results[3].stamp).T_wc.allclose(results[3].T_wc, atol=1e-3)
+
+
+def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -> None:
+    """All later frames come while the first one is tracked: two are ready or in preprocessing, and the last one."""
+    source, send = feed()
+
+    def on_result(result: LiveResult) -> None:
+        if result.frame.index == 0:
+            for _ in range(FRAMES):
+                send()
+            time.sleep(0.5)
+
+    results: list[LiveResult] = []
+    live = LiveSLAM(source, V3DSLAM(CAMERA, square))
+    live(lambda result: (results.append(result), on_result(result)))
+    indices = [result.frame.index for result in results]
+    assert indices[0] == 0 and indices[-1] == FRAMES - 1 and len(indices) <= 4
+    assert [result.dropped for result in results[1:]] == [b - a - 1 for a, b in itertools.pairwise(indices)]
+    assert live.dropped == FRAMES - len(indices) == sum(result.dropped for result in results)
+
+
+def test_tracking_does_not_wait_for_a_slow_network_on_every_frame() -> None:
+    """With interval 2 the frames between are tracked without the network."""
+    source, send = feed()
+    segmented: list[int] = []
+
+    def segment(frame: RGBDFrame) -> Instances:
+        segmented.append(frame.index)
+        return square(frame)
+
+    config = Config.model_validate({"segmentation": {"interval": 2}})
+    LiveSLAM(source, V3DSLAM(CAMERA, segment, config))(send)
+    assert segmented == list(range(0, FRAMES, 2))
+
+
+def test_error_of_a_frame_ends_the_run_after_the_frames_before() -> None:
+    def source() -> Iterator[RGBDFrame]:
+        yield Wall()[0]
+        raise InputError("cable")
+
+    results = iter(LiveSLAM(source(), V3DSLAM(CAMERA, square)))
+    assert next(results).frame.index == 0
+    with pytest.raises(InputError, match="cable"):
+        next(results)
+
+
+def test_error_of_the_segmenter_ends_the_run() -> None:
+    def segment(frame: RGBDFrame) -> Instances:
+        raise ValueError("network")
+
+    with pytest.raises(ValueError, match="network"):
+        next(iter(LiveSLAM(feed()[0], V3DSLAM(CAMERA, segment))))
+
+
+def test_leaving_the_loop_stops_all_threads() -> None:
+    source, send = feed()
+    before = set(threading.enumerate())
+    results = iter(LiveSLAM(source, V3DSLAM(CAMERA, square)))
+    next(results)
+    threading.Timer(0.1, send).start()  # this source blocks until its next frame
+    results.close()
+    assert {thread.name for thread in set(threading.enumerate()) - before} <= {"back-end_0"}
+
+
+def test_configuration_without_threads_is_rejected() -> None:
+    with pytest.raises(ConfigError, match="prefetch=false: a live camera needs threads; remove --serial"):
+        LiveSLAM(iter(()), V3DSLAM(CAMERA, square, Config(prefetch=False)))

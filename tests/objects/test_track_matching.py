@@ -1,0 +1,60 @@
+"""Evidence for pairs of tracks and instances, on boards in front of a wall."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.boards import CAMERA, CLOUDS, HERE, Board, BoardTracker, render
+
+from v3d_torch.config import TrackerConfig
+from v3d_torch.objects.appearance import HISTOGRAM_SIZE
+from v3d_torch.objects.instance_clouds import InstanceBackProjector
+from v3d_torch.objects.track_matching import compare_lost_tracks, compare_tracks, detect_instances, predict_tracks
+
+
+def evidence(before: list[Board], after: list[Board], appearance: torch.Tensor | None = None) -> torch.Tensor:
+    """Return the evidence for each pair of a board before (three frames) and a detected board after."""
+    track_boards = BoardTracker()
+    for _ in range(3):
+        tracks = track_boards(*before)
+    if appearance is not None:
+        for track in tracks:
+            track.appearance = torch.eye(HISTOGRAM_SIZE)[0]
+    depth, instances = render(after)
+    clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+    detected = detect_instances(0.1, instances, clouds, appearance, HERE, 1)
+    predicted = predict_tracks(tracks, 0.1, depth, HERE, CAMERA, CLOUDS.voxel_size, 1)
+    return compare_tracks(predicted, detected, TrackerConfig())
+
+
+def test_board_continues_itself_rather_than_its_neighbour() -> None:
+    boards = [Board(-0.3), Board(0.3)]
+    ratio = evidence(boards, boards)
+    assert bool((ratio.diag() > 5).all())
+    assert ratio[0, 1] == ratio[1, 0] == -torch.inf  # both are visible where they were predicted
+
+
+def test_other_appearance_speaks_against_a_pair() -> None:
+    same, other = (torch.eye(HISTOGRAM_SIZE)[i : i + 1] for i in (0, 1))
+    boards = [Board(0.0)]
+    assert float(evidence(boards, boards, same) - evidence(boards, boards, other)) == pytest.approx(5.5)
+
+
+def test_lost_track_beyond_the_gate_is_impossible() -> None:
+    (track,) = BoardTracker()(Board(-0.5))
+    depth, instances = render([Board(-0.4), Board(0.9)])
+    clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+    detected = detect_instances(0.1, instances, clouds, None, HERE, 1)
+    near, far = compare_lost_tracks([track], detected, TrackerConfig())[0].tolist()
+    assert near > 0
+    assert far == -torch.inf
+
+
+@pytest.mark.parametrize(("colour", "likely"), [(0, True), (1, False)])
+def test_track_lost_for_seconds_is_found_again_by_its_colours(colour: int, likely: bool) -> None:
+    (track,) = BoardTracker()(Board(0.0))
+    track.appearance = torch.eye(HISTOGRAM_SIZE)[0]
+    depth, instances = render([Board(0.1)])
+    clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+    detected = detect_instances(4.0, instances, clouds, torch.eye(HISTOGRAM_SIZE)[colour][None], HERE, 1)
+    assert bool(compare_lost_tracks([track], detected, TrackerConfig()) > 0) is likely

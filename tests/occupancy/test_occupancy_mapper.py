@@ -1,0 +1,171 @@
+"""Growth of the occupancy map: frames that are added, rebuilds after corrections, bounded memory, saved state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.rooms import CAMERA, CRATE, keyframe, looking_around, render
+from torch import Tensor
+
+from v3d_torch.config import OccupancyConfig
+from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.io.state_file import read_state, write_state
+from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.occupancy.occupancy_map import OccupancyMap
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+from v3d_torch.runs.state import STATE_CLASSES
+from v3d_torch.tracking.pose_history import PoseEntry, PoseHistory
+from v3d_torch.types import TrackingStatus
+
+CONFIG = OccupancyConfig(interval=1)
+ALL = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
+POSES = looking_around(36)
+SHIFT = se3_exp(torch.tensor([0.2, 0.0, 0.1, 0.0, 0.1, 0.0], dtype=torch.float64))
+
+
+class Drive:
+    """Camera that turns in the room; the first half of its poses is relative to one keyframe, the rest to another."""
+
+    def __init__(self, mapper: OccupancyMapper) -> None:
+        self.mapper = mapper
+        self.keyframes: list[Keyframe] = [keyframe(invert(POSES[0])), keyframe(invert(POSES[18]))]
+        self.entries: list[PoseEntry] = []
+
+    @property
+    def poses(self) -> PoseHistory:
+        history = PoseHistory()
+        history.load_state_dict({"entries": self.entries, "observed_landmarks": torch.zeros(0, dtype=torch.int64)})
+        return history
+
+    def add(self, first: int, last: int, status: TrackingStatus = TrackingStatus.TRACKED) -> None:
+        """Add frames; what the camera sees does not depend on the corrections of the keyframes."""
+        for index in range(first, last):
+            own = self.keyframes[index // 18 % 2]
+            T_ck = invert(POSES[index % 36]) @ POSES[18 * (index // 18 % 2)]
+            self.entries.append(PoseEntry(index / 30, status, own, T_ck, has_motion=True))
+            self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses)
+
+    def correct(self, row: int = 0, shift: Tensor = SHIFT) -> None:
+        """Move a keyframe, as bundle adjustment and loop closing do."""
+        self.keyframes[row].T_cw = self.keyframes[row].T_cw @ shift
+
+
+def same_map(first: OccupancyMap, second: OccupancyMap) -> bool:
+    """Check whether two maps have the same voxels, in any order of the blocks."""
+    a, b = first.blocks, second.blocks
+    return torch.equal(a.keys, b.keys) and torch.equal(a.log_odds[a.rows], b.log_odds[b.rows])
+
+
+def test_every_nth_reliable_frame_is_added() -> None:
+    drive = Drive(OccupancyMapper(CONFIG.model_copy(update={"interval": 3}), CAMERA))
+    drive.add(0, 7)
+    assert drive.mapper._store.frames == [0, 3, 6]
+    drive.add(7, 13, TrackingStatus.LOST)
+    drive.add(13, 17, TrackingStatus.DISCONNECTED)
+    assert drive.mapper._store.frames == [0, 3, 6]
+    drive.add(17, 19, TrackingStatus.ODOMETRY)
+    assert drive.mapper._store.frames == [0, 3, 6, 18]
+    drive.keyframes[1].disconnected = True
+    drive.add(19, 31, TrackingStatus.ODOMETRY)
+    assert drive.mapper._store.frames == [0, 3, 6, 18]
+
+
+def test_map_without_corrections_is_not_rebuilt() -> None:
+    drive = Drive(OccupancyMapper(CONFIG, CAMERA))
+    drive.add(0, 30)
+    before = drive.mapper.map.state_dict()
+    drive.correct(shift=se3_exp(torch.tensor([0.01, 0, 0, 0, 0, 0], dtype=torch.float64)))  # less than half a voxel
+    drive.mapper.correct(drive.poses)
+    assert not drive.mapper.is_rebuilding and torch.equal(drive.mapper.map.blocks.log_odds, before["log_odds"])
+
+
+def test_corrected_map_equals_the_map_of_the_corrected_poses() -> None:
+    drive, truth = Drive(OccupancyMapper(CONFIG, CAMERA)), Drive(OccupancyMapper(CONFIG, CAMERA))
+    drive.add(0, 25)
+    uncorrected = drive.mapper.map.occupied_points
+    drive.correct()
+    drive.mapper.correct(drive.poses)
+    truth.correct()
+    truth.add(0, 25)
+    assert same_map(drive.mapper.map, truth.mapper.map)
+    assert not torch.equal(drive.mapper.map.occupied_points, uncorrected)
+
+
+def test_rebuild_is_spread_over_frames_and_ends_with_the_corrected_map() -> None:
+    drive, truth = Drive(OccupancyMapper(CONFIG, CAMERA)), Drive(OccupancyMapper(CONFIG, CAMERA))
+    drive.add(0, 29)
+    drive.correct()
+    occupancy, rebuilding = drive.mapper.map, []
+    for index in range(29, 50):
+        drive.add(index, index + 1)
+        rebuilding.append(drive.mapper.is_rebuilding)
+    assert rebuilding == [True] * 7 + [False] * 14  # 30 views, and one more with each frame, in steps of five
+    assert drive.mapper.map is occupancy
+    truth.correct()
+    truth.add(0, 50)
+    assert same_map(drive.mapper.map, truth.mapper.map)
+
+
+def test_correction_during_a_rebuild_is_applied_afterwards() -> None:
+    drive, truth = Drive(OccupancyMapper(CONFIG, CAMERA)), Drive(OccupancyMapper(CONFIG, CAMERA))
+    drive.add(0, 29)
+    drive.correct()
+    drive.add(29, 32)
+    assert drive.mapper.is_rebuilding
+    drive.correct()
+    drive.mapper.correct(drive.poses)
+    truth.correct()
+    truth.correct()
+    truth.add(0, 32)
+    assert same_map(drive.mapper.map, truth.mapper.map)
+
+
+def test_number_of_stored_views_is_bounded_also_during_a_rebuild() -> None:
+    drive = Drive(OccupancyMapper(CONFIG.model_copy(update={"max_views": 20}), CAMERA))
+    drive.add(0, 38)
+    drive.correct()
+    for index in range(38, 90):
+        drive.add(index, index + 1)
+        assert len(drive.mapper._store) <= 20
+    drive.mapper.correct(drive.poses)
+    assert not drive.mapper.is_rebuilding and drive.mapper._store.frames[-1] == 89
+
+
+@pytest.mark.parametrize("stop", [12, 32])
+def test_saved_state_continues_to_the_same_bytes(stop: int, tmp_path: Path) -> None:
+    """Also in the middle of a rebuild."""
+    drive = Drive(OccupancyMapper(CONFIG, CAMERA))
+    drive.add(0, min(stop, 29))
+    drive.correct()
+    drive.add(min(stop, 29), stop)
+    assert drive.mapper.is_rebuilding == (stop == 32)
+    write_state(tmp_path / "state", {}, drive.mapper.state_dict())
+    resumed = Drive(OccupancyMapper(CONFIG, CAMERA))
+    resumed.keyframes, resumed.entries = drive.keyframes, list(drive.entries)
+    resumed.mapper.load_state_dict(read_state(tmp_path / "state", STATE_CLASSES)[1])
+    for each in (drive, resumed):
+        each.add(stop, 45)
+        each.mapper.correct(each.poses)
+    assert torch.equal(drive.mapper.map.blocks.log_odds, resumed.mapper.map.blocks.log_odds)
+    assert torch.equal(drive.mapper.map.blocks.coordinates, resumed.mapper.map.blocks.coordinates)
+    assert drive.mapper._store.frames == resumed.mapper._store.frames
+
+
+def test_two_runs_give_the_same_bytes() -> None:
+    first, second = Drive(OccupancyMapper(CONFIG, CAMERA)), Drive(OccupancyMapper(CONFIG, CAMERA))
+    first.add(0, 12)
+    second.add(0, 12)
+    assert torch.equal(first.mapper.map.blocks.log_odds, second.mapper.map.blocks.log_odds)
+
+
+def test_floor_and_grid_follow_the_accelerometer() -> None:
+    drive = Drive(OccupancyMapper(CONFIG, CAMERA))
+    assert drive.mapper.find_floor() is None and drive.mapper.grid() is None
+    drive.add(0, 12)
+    sideways = torch.tensor([1.0, 0.0, 0.0])
+    drive.mapper.accelerometer = sideways
+    torch.testing.assert_close(drive.mapper.up.direction, sideways.double())
+    floor = drive.mapper.find_floor()
+    assert floor is None or floor.up[0] > 0.99

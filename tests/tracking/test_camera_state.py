@@ -1,0 +1,129 @@
+"""Prediction of the camera's state, and its history."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.tracking.state_history import StateHistory
+from v3d_torch.types import TrackingStatus
+
+TWIST = torch.tensor([0.3, -0.1, 0.2, 0.5, 0.2, -0.4], dtype=torch.float64)
+START = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.1, -0.7, 0.3], dtype=torch.float64))
+SMALL = 1e-4 * torch.eye(6, dtype=torch.float64)
+
+
+def state(stamp: float, T_wc: Tensor | None = None, status: TrackingStatus = TrackingStatus.TRACKED) -> CameraState:
+    """State of a camera that moves with constant twist."""
+    return CameraState(
+        stamp=stamp,
+        T_wc=START @ se3_exp(TWIST * stamp) if T_wc is None else T_wc,
+        status=status,
+        covariance=SMALL,
+        twist=TWIST,
+        twist_covariance=SMALL,
+        cross_covariance=torch.zeros(6, 6, dtype=torch.float64),
+    )
+
+
+def history(*stamps: float) -> StateHistory:
+    states = StateHistory()
+    for stamp in stamps:
+        states.append(state(stamp))
+    return states
+
+
+def test_prediction_follows_the_twist_and_stops_after_a_fifth_of_a_second() -> None:
+    now = state(0.0)
+    for elapsed in (0.0, 0.05, 0.2):
+        torch.testing.assert_close(now.predict(elapsed).T_wc, START @ se3_exp(TWIST * elapsed))
+        assert torch.equal(now.predict(elapsed).twist, TWIST)
+    later = now.predict(3.0)
+    torch.testing.assert_close(later.T_wc, START @ se3_exp(TWIST * 0.2))
+    assert not later.twist.any() and later.stamp == 3.0
+
+
+def test_covariance_of_a_prediction_grows_with_time() -> None:
+    now = state(0.0)
+    torch.testing.assert_close(now.predict(0.0).covariance, now.covariance)
+    covariances = [now.predict(elapsed).covariance for elapsed in (0.0, 0.02, 0.1, 0.2, 0.3, 1.0, 10.0)]
+    for a, b in itertools.pairwise(covariances):
+        assert float(b.det()) > float(a.det()) and float(b.trace()) > float(a.trace())
+    assert covariances[-1][:3, :3].trace().sqrt() > 10  # after ten seconds anywhere in the room
+
+
+def test_covariance_of_a_prediction_covers_motions_of_a_hand() -> None:
+    """Poses after a quarter of a second of white acceleration noise have the predicted covariance (Monte Carlo)."""
+    generator = torch.Generator().manual_seed(0)
+    steps, runs, elapsed = 50, 2000, 0.2
+    dt = elapsed / steps
+    sigma = torch.tensor([1.0] * 3 + [2.0] * 3, dtype=torch.float64)
+    twist = TWIST + 1e-2 * torch.randn(runs, 6, dtype=torch.float64, generator=generator)
+    T = START @ se3_exp(1e-2 * torch.randn(runs, 6, dtype=torch.float64, generator=generator))
+    for _ in range(steps):
+        T = T @ se3_exp(twist * dt)
+        twist = twist + sigma * dt**0.5 * torch.randn(runs, 6, dtype=torch.float64, generator=generator)
+    predicted = state(0.0).predict(elapsed)
+    errors = se3_log(invert(predicted.T_wc) @ T)
+    nees = (errors @ torch.linalg.inv(predicted.covariance) * errors).sum(dim=1).mean()
+    assert abs(float(nees) - 6) < 0.4  # within the noise of 2,000 runs, discretisation, and curvature
+
+
+def test_pose_between_frames_is_interpolated_along_the_geodesic() -> None:
+    states = history(1.0, 1.1, 1.2)
+    for stamp in (1.0, 1.03, 1.1, 1.17, 1.2):
+        torch.testing.assert_close(states.at(stamp).T_wc, START @ se3_exp(TWIST * stamp))
+        assert states.at(stamp).stamp == stamp
+    torch.testing.assert_close(states.at(1.25).T_wc, START @ se3_exp(TWIST * 1.25))  # predicted
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0, 1), st.integers(0, 10_000))
+def test_interpolated_covariance_is_an_upper_bound(fraction: float, seed: int) -> None:
+    """It exceeds the covariance of the interpolated pose for independent and for equal errors of both frames."""
+    generator = torch.Generator().manual_seed(seed)
+    roots = torch.randn(2, 6, 6, dtype=torch.float64, generator=generator)
+    a, b = roots @ roots.mT
+    still = torch.eye(4, dtype=torch.float64)
+    states = StateHistory()
+    for stamp, covariance in ((0.0, a), (1.0, b)):
+        states.append(CameraState(**{**vars(state(stamp, still)), "covariance": covariance}))
+    got = states.at(fraction).covariance
+    independent = (1 - fraction) ** 2 * a + fraction**2 * b
+    assert torch.linalg.eigvalsh(got - independent).min() > -1e-9
+    root = (1 - fraction) * torch.linalg.cholesky(a) + fraction * torch.linalg.cholesky(b)
+    assert torch.linalg.eigvalsh(got - root @ root.T).min() > -1e-9
+
+
+def test_times_that_are_not_kept_are_input_errors() -> None:
+    with pytest.raises(InputError, match="no frame was tracked yet; ask after the first frame"):
+        StateHistory().at(1.0)
+    states = history(*(n / 10 for n in range(200)))
+    with pytest.raises(InputError, match=r"those of the last 10 s are kept, the first is at 9\.900000 s"):
+        states.at(9.0)
+
+
+def test_states_of_a_long_run_are_forgotten() -> None:
+    states = StateHistory()
+    one = state(0.0)
+    for n in range(3000):
+        states.append(CameraState(**{**vars(one), "stamp": n / 30}))
+    assert len(states.state_dict()["states"]) == 300
+
+
+def test_correction_of_the_world_moves_all_states() -> None:
+    states = history(1.0, 1.1)
+    T_new_old = se3_exp(torch.tensor([0.5, 0, 0, 0, 0.3, 0], dtype=torch.float64))
+    states.apply_world_correction(T_new_old)
+    torch.testing.assert_close(states.at(1.05).T_wc, T_new_old @ START @ se3_exp(TWIST * 1.05))
+    restored = StateHistory()
+    restored.load_state_dict(states.state_dict())
+    assert torch.equal(restored.at(1.05).T_wc, states.at(1.05).T_wc)

@@ -1,0 +1,68 @@
+"""Consistency of the covariance of poses with their errors (benchmarks/consistency.py)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import torch
+from scipy.stats import chi2
+
+from v3d_torch.config.loading import load_config
+from v3d_torch.datasets import load_sequence
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import Trajectory
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+import consistency
+
+
+def test_nees_of_simulated_errors_is_that_of_the_chi_square_distribution() -> None:
+    """World, mounting and clock of the ground truth are unknown, and do not count as errors."""
+    generator = torch.Generator().manual_seed(0)
+
+    def swing(stamps: torch.Tensor) -> torch.Tensor:
+        amplitude = torch.tensor([0.3, 0.2, 0.3, 0.4, 0.5, 0.3], dtype=torch.float64)
+        phase = torch.arange(6, dtype=torch.float64)
+        return se3_exp(amplitude * torch.sin(1.3 * stamps[:, None] + phase))
+
+    T_gw, T_cb = se3_exp(torch.randn(2, 6, dtype=torch.float64, generator=generator)[:, None])[:, 0]
+    true_stamps, stamps = (
+        torch.arange(2000, dtype=torch.float64) / 100,
+        0.2 + torch.arange(550, dtype=torch.float64) / 30,
+    )
+    groundtruth = Trajectory(true_stamps + 0.03, T_gw @ swing(true_stamps) @ T_cb)
+    roots = torch.tensor([0.01] * 3 + [0.005] * 3, dtype=torch.float64) * (
+        torch.eye(6, dtype=torch.float64) + 0.3 * torch.randn(550, 6, 6, dtype=torch.float64, generator=generator)
+    )
+    errors = (roots @ torch.randn(550, 6, 1, dtype=torch.float64, generator=generator))[..., 0]
+    estimate = swing(stamps) @ se3_exp(-errors)
+    nees = consistency.calibrated_errors(groundtruth, stamps, estimate, roots @ roots.mT).nees(slice(0, 6))
+    assert abs(float(nees.mean()) - 6) < 3 * (12 / 550) ** 0.5
+    assert 0.92 < float((nees < chi2.ppf(0.95, 6)).double().mean()) < 0.98
+
+
+def test_covariance_on_recorded_images_is_consistent(real_sequence: Callable[[str], Path]) -> None:
+    """A second and a half of a rotating camera, with true masks: neither position nor rotation are overconfident."""
+    folder = real_sequence("crowd_rpy")
+    sequence = load_sequence(str(folder))
+    assert sequence.groundtruth is not None
+    config = load_config(overrides=["segmentation.source=masks"])
+    segment = make_segmenter(config.segmentation, masks_dir=folder / "masks")
+    slam = V3DSLAM(sequence.camera, segment, config)
+    states = [slam(frame) for frame in islice(sequence, 45)]
+    errors = consistency.calibrated_errors(
+        sequence.groundtruth,
+        sequence.stamps[:45],
+        torch.stack([state.T_wc for state in states]),
+        torch.stack([state.covariance for state in states]),
+    )
+    for dimensions in (slice(0, 3), slice(3, 6)):
+        nees = errors.nees(dimensions)
+        assert 0.2 < float(nees.mean()) < 6
+        assert float((nees < chi2.ppf(0.95, 3)).double().mean()) > 0.8

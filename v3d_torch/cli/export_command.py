@@ -1,0 +1,162 @@
+"""Steps of the export command: read the run, open its images, write the format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+
+from v3d_torch.config import Config
+from v3d_torch.datasets import RGBDStream
+from v3d_torch.datasets.tum_writer import TUMWriter
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.export.colmap import write_colmap
+from v3d_torch.export.landmark_tracks import LandmarkTracks, landmark_tracks
+from v3d_torch.export.nerfstudio import write_nerfstudio
+from v3d_torch.export.posed_image import PosedImage, Undistorter
+from v3d_torch.export.static_recording import StaticRecording
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.files import check_empty_folder
+from v3d_torch.io.ply import read_ply_points
+from v3d_torch.mapping.map_io import load_map
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.runs.console import ProgressBar, progress_bars
+from v3d_torch.runs.request import RunRequest, read_request
+from v3d_torch.runs.run_images import LocatedFrames, located_frames, open_images, posed_images
+from v3d_torch.runs.stored_run import StoredRun, read_run
+
+_MAX_IMAGES = 300
+"""Number of images that tools take from a video by default (nerfstudio's ``ns-process-data``)."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of an export.
+
+    Attributes:
+        format: ``nerfstudio``, ``colmap`` or ``tum``.
+        every: Every n-th frame is exported; None for the default of the format.
+        keyframes: True to export keyframes only.
+        undistort: True to remove the lens distortion.
+        masks: True to write masks, and to remove the depth of masked pixels.
+    """
+
+    format: str
+    every: int | None = None
+    keyframes: bool = False
+    undistort: bool = False
+    masks: bool = True
+
+
+def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None, console: Console) -> None:
+    """Export the images of a run.
+
+    Args:
+        folder: Results of the run.
+        out: Folder to write, new or empty.
+        options: Format and options.
+        seq: Sequence of the run; None for the one that the run names.
+        console: Console for progress and summary.
+
+    Raises:
+        InputError: If the run, its images or its masks are missing or do not belong together.
+        ConfigError: If an option does not fit the format.
+        OutputError: If the folder is not empty or cannot be written.
+    """
+    if options.format == "tum" and (options.undistort or not options.masks):
+        raise ConfigError("--format tum: has masks and the images as recorded; remove --no-masks and --undistort")
+    run = read_run(folder)
+    check_empty_folder(out)
+    request = read_request(folder)
+    request = request if seq is None else replace(request, seq=seq)
+    with progress_bars(console) as progress:
+        source = open_images(run, request, ProgressBar(progress, "sequence"))
+    frames = _select_frames(run, options)
+    images = posed_images(run, source, frames, masks=options.masks)
+    shown: Iterable[PosedImage] = track(
+        images, "exporting", len(frames), console=console, disable=not console.is_terminal
+    )
+    out_camera = source.camera
+    if options.undistort:
+        undistort = Undistorter(source.camera)
+        out_camera, shown = undistort.camera, map(undistort, shown)
+    notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
+    if left_out := len(run.metrics.status) - len(located_frames(run)):
+        notes.append(f"{left_out} frames without a known pose are left out")
+    console.print(f"{len(frames)} images: {out}", markup=False)
+    for note in notes:
+        console.print(f"note: {note}", markup=False)
+
+
+@dataclass(frozen=True)
+class _Export:
+    """Inputs of an export.
+
+    Attributes:
+        run: Results of the run.
+        request: Options of the run.
+        source: Images of the run.
+        frames: Frames to export.
+    """
+
+    run: StoredRun
+    request: RunRequest
+    source: RGBDStream
+    frames: LocatedFrames
+
+
+def _select_frames(run: StoredRun, options: ExportOptions) -> LocatedFrames:
+    located = located_frames(run, only_keyframes=options.keyframes)
+    takes_all = options.format == "tum" or options.keyframes
+    return located.every(options.every or (1 if takes_all else -(-len(located) // _MAX_IMAGES)))
+
+
+def _write_nerfstudio(out: Path, export: _Export, camera: PinholeCamera, images: Iterable[PosedImage]) -> list[str]:
+    write_nerfstudio(out, camera, images, _point_map(export.run))
+    return []
+
+
+def _write_colmap(out: Path, export: _Export, camera: PinholeCamera, images: Iterable[PosedImage]) -> list[str]:
+    points = read_ply_points(_point_map(export.run))
+    tracks, notes = _read_tracks(export)
+    write_colmap(out, camera, images, points, tracks)
+    return notes
+
+
+def _write_static_recording(
+    out: Path, export: _Export, camera: PinholeCamera, images: Iterable[PosedImage]
+) -> list[str]:
+    with TUMWriter(out, camera, export.source.groundtruth) as writer:
+        recording = StaticRecording(writer)
+        recording.write_poses(export.frames.poses)
+        for image in images:
+            recording.add(image.frame, image.static)
+    return []
+
+
+_WRITERS = {"nerfstudio": _write_nerfstudio, "colmap": _write_colmap, "tum": _write_static_recording}
+"""Function that writes a format and returns notes for the user."""
+
+
+def _point_map(run: StoredRun) -> Path:
+    path = run.folder / "map.ply"
+    if not path.is_file():
+        raise InputError(f"{path}: is missing, because the run did not end; continue it with run --resume {run.folder}")
+    return path
+
+
+def _read_tracks(export: _Export) -> tuple[LandmarkTracks, list[str]]:
+    """Read the landmarks of the exported images from the map that the run saved, if there is one."""
+    path, tables = export.request.save_map, MapTables()
+    reason = "the run was not called with --save-map"
+    if path is not None:
+        reason = f"{path} has no landmarks that two of the images observe"
+        try:
+            tables = load_map(path, export.source.camera, export.run.config or Config()).map
+        except InputError as error:
+            reason = str(error)
+    tracks = landmark_tracks(tables, export.frames.poses)
+    return tracks, [] if len(tracks.points) else [f"no image points are written: {reason}"]

@@ -1,0 +1,86 @@
+"""Steps of the record command: save all frames as they are, or track the camera and save them without what moves."""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from pathlib import Path
+from threading import Event
+
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from v3d_torch.config import Config
+from v3d_torch.datasets import RGBDStream
+from v3d_torch.datasets.tum_writer import TUMWriter
+from v3d_torch.export.static_recording import StaticRecording
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.console import TrackingBar, compile_kernels, progress_bars
+from v3d_torch.runtime.process import set_num_threads
+from v3d_torch.segmentation import make_segmenter
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame
+
+
+def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Console) -> int:
+    """Write all frames of a source.
+
+    Args:
+        source: Frames.
+        out: Folder to write, new or empty.
+        interrupted: Event that ends the recording after the current frame.
+        console: Console for the progress bar.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        InputError: If a frame cannot be read.
+        OutputError: If the folder is not empty, or a file cannot be written.
+    """
+    with TUMWriter(out, source.camera, source.groundtruth) as writer:
+        for frame in track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal):
+            writer.add(frame)
+            if interrupted.is_set():
+                break
+    return len(writer)
+
+
+def record_static(
+    source: RGBDStream, out: Path, config: Config, interrupted: Event, console: Console
+) -> tuple[int, str | None]:
+    """Track the camera, and write all frames without what moves, with masks and estimated poses.
+
+    Args:
+        source: Frames.
+        out: Folder to write, new or empty.
+        config: Configuration of the system.
+        interrupted: Event that ends the recording after the current frame.
+        console: Console for the progress bar.
+
+    Returns:
+        Number of frames, and the reason if the recording ended early but not by the user, else None.
+
+    Raises:
+        WeightsError: If the weights of the network are not available.
+        OutputError: If the folder is not empty, or the poses cannot be written.
+    """
+    set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    slam = V3DSLAM(source.camera, make_segmenter(config.segmentation), config)
+    pipeline = Pipeline(source, slam, evaluate_masks=False)
+    compile_kernels(console)
+    total = len(source) if isinstance(source, Sized) else None
+    with TUMWriter(out, source.camera, source.groundtruth) as writer, progress_bars(console) as progress:
+        recording, bar = StaticRecording(writer), TrackingBar(progress, total, interrupted, done=0)
+
+        def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
+            recording.add(frame, result.static_without_people)
+            bar(frame, result)
+
+        record = pipeline(on_frame)
+        with torch.inference_mode():
+            slam.flush()
+        recording.write_poses(slam.poses.trajectory())
+    return len(writer), None if record.interrupted else record.failure

@@ -1,0 +1,97 @@
+"""Direction of gravity at the first frame of a bag, from the accelerometer of the camera."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from v3d_torch.datasets.gravity import gravity_direction
+
+_LOG = logging.getLogger(__name__)
+
+IMU = "sensor_msgs/msg/Imu"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+
+_BEFORE, _AFTER = 0.5, 0.1
+"""Time before and after the first frame in which accelerations are averaged, seconds: longer than the vibration of a
+hand, shorter than the time in which the camera turns far."""
+
+ReadMessages = Callable[[str], Iterator[tuple[str, int, Any]]]
+"""Function that yields topic, arrival time (nanoseconds) and message of a topic, in order of arrival."""
+
+
+def read_gravity(
+    path: object, types: Mapping[str, str], read: ReadMessages, colour_frame: str, first_stamp: float
+) -> Tensor | None:
+    """Read the direction of gravity.
+
+    Args:
+        path: Path of the bag, for the log.
+        types: Message type of each topic.
+        read: Reads the messages of a topic.
+        colour_frame: Name of the frame of the colour camera, without slashes.
+        first_stamp: Stamp of the first frame, seconds.
+
+    Returns:
+        Unit vector, frame of the colour camera, float64, shape :math:`(3,)`. None if no accelerometer measured around
+        the first frame, or if its orientation relative to the camera is not known.
+    """
+    for topic in (topic for topic, kind in types.items() if kind == IMU):
+        frame, accelerations = _read_accelerations(read(topic), first_stamp)
+        if not np.any(accelerations):  # such as on the topic of a gyroscope
+            continue
+        transforms = [name for name, kind in types.items() if kind == TRANSFORMS and name.endswith("tf_static")]
+        rotation = _find_rotation(colour_frame, frame, [message for name in transforms for *_, message in read(name)])
+        if rotation is not None:
+            return gravity_direction(accelerations @ rotation.T, f"{path}: {topic}")
+        _LOG.warning(
+            "%s: the orientation of %s on %s relative to %s is not in /tf_static; gravity is not used",
+            path, frame, topic, colour_frame,
+        )  # fmt: skip
+    return None
+
+
+def _read_accelerations(
+    messages: Iterator[tuple[str, int, Any]], first_stamp: float
+) -> tuple[str, NDArray[np.float64]]:
+    """Read the frame and the accelerations, shape (N, 3), around the first image."""
+    frame, accelerations = "", [np.zeros((0, 3))]
+    for _, _, message in messages:
+        time = message.header.stamp
+        since = time.sec + time.nanosec * 1e-9 - first_stamp
+        if since > _AFTER:
+            break
+        if since >= -_BEFORE:
+            frame, measured = message.header.frame_id.strip("/"), message.linear_acceleration
+            accelerations.append(np.array([[measured.x, measured.y, measured.z]]))
+    return frame, np.concatenate(accelerations)
+
+
+def _find_rotation(target: str, source: str, messages: list[Any]) -> NDArray[np.float64] | None:
+    """Rotation from one frame to another along static transforms, shape (3, 3); None if they are not connected.
+
+    The optical frames of a camera have the same axes, also if no transform says so.
+    """
+    if target == source or (target.endswith("optical_frame") and source.endswith("optical_frame") and not messages):
+        return np.eye(3)
+    neighbours: dict[str, list[tuple[str, Rotation]]] = {}
+    for transform in (transform for message in messages for transform in message.transforms):
+        parent, child = transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
+        q = transform.transform.rotation
+        rotation = Rotation.from_quat([q.x, q.y, q.z, q.w])  # child to parent
+        neighbours.setdefault(child, []).append((parent, rotation))
+        neighbours.setdefault(parent, []).append((child, rotation.inv()))
+    known, pending = {source: Rotation.identity()}, [source]
+    while pending:
+        frame = pending.pop()
+        for other, rotation in neighbours.get(frame, []):
+            if other not in known:
+                known[other] = rotation * known[frame]
+                pending.append(other)
+    return known[target].as_matrix() if target in known else None

@@ -1,0 +1,97 @@
+"""Least-squares alignment of corresponding points (Umeyama, PAMI 1991)."""
+
+from __future__ import annotations
+
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor
+
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
+from v3d_torch.runtime.batches import fill_padding
+
+
+def umeyama(
+    p: Tensor,
+    q: Tensor,
+    weights: Tensor | None = None,
+    valid: Tensor | None = None,
+    *,
+    with_scale: bool = False,
+) -> Tensor:
+    r"""Align points by the rigid or similarity transform with the smallest squared error.
+
+    .. math::
+        \min_{s, R, t} \sum_i w_i \|q_i - (s R p_i + t)\|^2
+
+    Differentiable in all floating-point inputs, also where points lie in a plane. Reflections are excluded.
+
+    Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns, PAMI 1991.
+
+    Args:
+        p: Points in frame p, metres, floating point, shape :math:`(*, N, 3)`; computed with in float64.
+        q: The same points in frame q, shape :math:`(*, N, 3)`.
+        weights: Weight of each pair, not negative, shape :math:`(*, N)`; 1 by default.
+        valid: Pairs that are not padding, bool, shape :math:`(*, N)`; all by default.
+        with_scale: True to estimate the scale, too; it is 1 by default.
+
+    Returns:
+        Transform ``T_qp``, with the scaled rotation :math:`s R` in its upper left block, dtype of ``p``, shape
+        :math:`(*, 4, 4)`. Points on a line do not determine the rotation, of which one is returned; without points the
+        result is the identity.
+    """
+    KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
+    KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
+    each = None if valid is None else valid[..., None]
+    a, b = fill_padding(p, each, 0.0), fill_padding(q, each, 0.0)
+    if weights is None:
+        w = None if each is None else each.to(torch.float64)
+    else:
+        w = fill_padding(weights, valid, 0.0)[..., None]
+    mean_a, mean_b = (weighted_mean(points, w) for points in (a, b))
+    a, b = a - mean_a[..., None, :], b - mean_b[..., None, :]
+    M = (b if w is None else b * w).mT @ a
+    R = nearest_rotation(M)
+    if with_scale:
+        spread = (a.square() if w is None else a.square() * w).sum(dim=(-2, -1))
+        R = R * ((R * M).sum(dim=(-2, -1)) / spread)[..., None, None]
+    top = torch.cat([R, (mean_b - (R @ mean_a[..., None])[..., 0])[..., None]], dim=-1)
+    last = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, last], dim=-2).to(p.dtype)
+
+
+def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:
+    """Mean of points; 0 without points.
+
+    Args:
+        points: Shape :math:`(..., N, d)`.
+        weights: Shape :math:`(..., N, 1)`; None = equal ones.
+
+    Returns:
+        Shape :math:`(..., d)`.
+    """
+    if weights is None:
+        return points.mean(dim=-2) if points.shape[-2] else points.sum(dim=-2)
+    total = weights.sum(dim=-2)
+    return (weights * points).sum(dim=-2) / torch.where(total > 0, total, 1.0)
+
+
+def nearest_rotation(M: Tensor) -> Tensor:
+    """Rotation R that maximises trace(R^T M), for matrices of shape (..., 3, 3).
+
+    The gradient is that of the maximum, which is finite where the singular vectors have none.
+    """
+    with torch.no_grad():
+        U, _, Vh = torch.linalg.svd(M)
+        signs = torch.stack([*torch.ones_like(M[..., :2, 0]).unbind(-1), torch.linalg.det(U @ Vh).sign()], dim=-1)
+        R = (U * signs[..., None, :]) @ Vh  # the last sign excludes reflections
+    if not needs_gradient(M):
+        return R
+    # Of trace(exp(phi)^T A) with A = M R^T: the gradient by phi, and the Hessian, negated.
+    A = M @ R.mT
+    gradient = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
+    fixed = ((A + A.mT) / 2).detach()
+    H = fixed.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] * torch.eye(3, dtype=A.dtype, device=A.device)
+    phi = (torch.linalg.pinv(H - fixed, hermitian=True) @ gradient[..., None])[..., 0]
+    turn = torch.cat([torch.zeros_like(phi), zero_with_gradient(phi)], dim=-1)
+    return se3_exp(turn)[..., :3, :3] @ R

@@ -1,0 +1,74 @@
+"""Landmarks of a sparse map with the exported images that observe them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.types import Trajectory
+
+_MAX_STAMP_DIFFERENCE = 1e-6
+"""Largest difference between the timestamps of a keyframe and of its image, seconds: files have six decimals."""
+
+_MAX_POSE_DIFFERENCE = 1e-6
+"""Largest difference between the poses of a keyframe and of its image, per element."""
+
+_MIN_OBSERVATIONS = 2
+"""Number of images that observe a landmark."""
+
+
+@dataclass(frozen=True)
+class LandmarkTracks:
+    """Landmarks with their observations.
+
+    Attributes:
+        points: Positions, world frame, metres, float64, shape :math:`(L, 3)`.
+        image: Image of each observation, as an index, int64, shape :math:`(O,)`, sorted.
+        landmark: Landmark of each observation, as a row of ``points``, int64, shape :math:`(O,)`.
+        uv: Undistorted pixel of each observation, float64, shape :math:`(O, 2)`.
+    """
+
+    points: Tensor
+    image: Tensor
+    landmark: Tensor
+    uv: Tensor
+
+
+def landmark_tracks(tables: MapTables, images: Trajectory) -> LandmarkTracks:
+    """Select the landmarks that at least two images observe.
+
+    Args:
+        tables: Data of the map.
+        images: Poses of the images. Keyframes of the same time with another pose, which are of another run, are
+            ignored.
+    """
+    image_of_keyframe = _images_of_keyframes(tables, images)
+    observations = tables.observations
+    image, landmark = image_of_keyframe[observations["keyframe"]], observations["landmark"]
+    usable = observations["valid"] & tables.landmarks["active"][landmark] & (image >= 0)
+    counts = torch.bincount(landmark[usable], minlength=len(tables.landmarks))
+    rows = torch.nonzero(usable & (counts >= _MIN_OBSERVATIONS)[landmark])[:, 0]
+    rows = rows[torch.argsort(image[rows], stable=True)]
+    kept = torch.nonzero(counts >= _MIN_OBSERVATIONS)[:, 0]
+    return LandmarkTracks(
+        points=tables.landmarks["point"][kept],
+        image=image[rows],
+        landmark=torch.searchsorted(kept, landmark[rows]),
+        uv=observations["uv"][rows],
+    )
+
+
+def _images_of_keyframes(tables: MapTables, images: Trajectory) -> Tensor:
+    """Index of the image of each keyframe, -1 for none, int64, shape (K,)."""
+    keyframe_stamps = torch.tensor([each.stamp for each in tables.keyframes], dtype=torch.float64)
+    if not len(images):
+        return torch.full((len(keyframe_stamps),), -1)
+    distances = (keyframe_stamps[:, None] - images.stamps).abs()
+    nearest = distances.argmin(dim=1)
+    T_identity = tables.T_cw @ images.T_wc[nearest]
+    same_pose = (T_identity - torch.eye(4, dtype=torch.float64)).abs().amax(dim=(1, 2)) <= _MAX_POSE_DIFFERENCE
+    same_time = distances.gather(1, nearest[:, None])[:, 0] <= _MAX_STAMP_DIFFERENCE
+    return torch.where(same_time & same_pose, nearest, -1)

@@ -1,0 +1,94 @@
+"""Folder that nerfstudio reads: ``transforms.json`` with images, masks and depth images (Tancik et al., 2023)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v3d_torch.errors import ConfigError
+from v3d_torch.export.posed_image import CORNER_OFFSET, PosedImage
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.files import atomic_write, write_png, write_text
+
+_MILLIMETRES = 1000
+"""Units of the depth images per metre: nerfstudio's default."""
+
+_OPENGL_AXES = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+"""Signs of the camera's axes in OpenGL: x right, y up, z backwards."""
+
+
+def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[PosedImage], points: Path) -> int:
+    """Write a folder for nerfstudio: ``images/``, ``masks/``, ``depths/``, ``points.ply`` and ``transforms.json``.
+
+    Args:
+        folder: Empty folder.
+        camera: Camera of the images.
+        images: Images.
+        points: PLY file with the static map, which is copied.
+
+    Returns:
+        Number of images.
+
+    Raises:
+        ConfigError: If nerfstudio does not have the distortion model of the camera, ``rational_polynomial``.
+        OutputError: If a file cannot be written.
+    """
+    lens = _lens(camera)
+    frames = [_write_frame(folder, image) for image in images]
+    with atomic_write(folder / "points.ply") as temporary:
+        shutil.copyfile(points, temporary)
+    transforms = {
+        **lens,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx + CORNER_OFFSET,
+        "cy": camera.cy + CORNER_OFFSET,
+        "depth_unit_scale_factor": 1 / _MILLIMETRES,
+        "ply_file_path": "points.ply",
+        "frames": frames,
+    }
+    write_text(folder / "transforms.json", json.dumps(transforms, indent=1) + "\n")
+    return len(frames)
+
+
+def _lens(camera: PinholeCamera) -> dict[str, Any]:
+    """Return the camera model of nerfstudio and its distortion coefficients."""
+    if not camera.is_distorted or camera.distortion_model == "plumb_bob":
+        return {"camera_model": "OPENCV", **dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False))}
+    if camera.distortion_model == "equidistant":
+        return {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), camera.distortion, strict=True))}
+    raise ConfigError(
+        f"nerfstudio has no distortion model {camera.distortion_model}; remove the distortion: --undistort"
+    )
+
+
+def opengl_pose(T_wc: Tensor) -> Tensor:
+    """Return the pose of a camera whose axes are x right, y up, z backwards, float64, shape :math:`(4, 4)`.
+
+    Args:
+        T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+    """
+    return T_wc * _OPENGL_AXES
+
+
+def _write_frame(folder: Path, image: PosedImage) -> dict[str, Any]:
+    """Write the images of a frame and return its entry."""
+    image.write_colour(folder / "images")
+    units = (image.static_depth[0] * _MILLIMETRES).round().clamp(max=np.iinfo(np.uint16).max)
+    write_png(folder / "depths" / image.name, units.numpy().astype(np.uint16))
+    image.write_mask(folder / "masks" / image.name)
+    return {
+        "file_path": f"images/{image.name}",
+        "mask_path": f"masks/{image.name}",
+        "depth_file_path": f"depths/{image.name}",
+        "transform_matrix": opengl_pose(image.T_wc).tolist(),
+    }

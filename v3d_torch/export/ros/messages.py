@@ -1,0 +1,193 @@
+"""ROS 2 messages of poses, cameras and occupancy grids, made from tensors.
+
+The definitions are those of ROS 2 Humble. Later distributions differ from them in additional constants only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rosbags.typesys.stores import ros2_humble as ros
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from v3d_torch.errors import OutputError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
+from v3d_torch.occupancy.occupancy_map import VoxelState
+
+_NANOSECONDS = 10**9
+
+_MAX_SECONDS = 2**31
+"""Times of ROS count seconds in 32 bits, with sign."""
+
+_OCCUPANCY = {VoxelState.UNKNOWN: -1, VoxelState.FREE: 0, VoxelState.OCCUPIED: 100}
+"""Values of cells, as `nav_msgs/OccupancyGrid` defines them: the probability in per cent, or unknown."""
+
+
+def nanoseconds(stamp: float) -> int:
+    """Convert a timestamp to whole nanoseconds.
+
+    Args:
+        stamp: Timestamp, seconds.
+
+    Raises:
+        OutputError: If messages of ROS cannot hold the time.
+    """
+    if not 0 <= stamp < _MAX_SECONDS:
+        raise OutputError(f"timestamp {stamp:.6f} s: messages of ROS hold 0 to 2^31 s; shift the timestamps")
+    return round(stamp * _NANOSECONDS)
+
+
+def header(stamp: float, frame: str) -> ros.std_msgs__msg__Header:
+    """Make a header.
+
+    Args:
+        stamp: Timestamp, seconds.
+        frame: Name of the coordinate frame of the data.
+
+    Raises:
+        OutputError: As `nanoseconds`. All functions with a timestamp can raise it.
+    """
+    return ros.std_msgs__msg__Header(
+        ros.builtin_interfaces__msg__Time(*divmod(nanoseconds(stamp), _NANOSECONDS)), frame
+    )
+
+
+def point(position: Tensor) -> ros.geometry_msgs__msg__Point:
+    """Make a point from a position, metres, shape :math:`(3,)`."""
+    return ros.geometry_msgs__msg__Point(*position.tolist())
+
+
+def vector(components: Tensor) -> ros.geometry_msgs__msg__Vector3:
+    """Make a vector from its components, shape :math:`(3,)`."""
+    return ros.geometry_msgs__msg__Vector3(*components.tolist())
+
+
+def pose(T: Tensor) -> ros.geometry_msgs__msg__Pose:
+    """Make a pose from the transform from the posed frame to the frame of the header, shape :math:`(4, 4)`."""
+    return ros.geometry_msgs__msg__Pose(point(T[:3, 3]), _quaternion(T))
+
+
+def transforms(stamp: float, T: dict[tuple[str, str], Tensor]) -> ros.tf2_msgs__msg__TFMessage:
+    """Make the transforms of one time, for the topic ``/tf``.
+
+    Args:
+        stamp: Timestamp, seconds.
+        T: Transform from the child to the parent frame, float64, shape :math:`(4, 4)`, by (parent, child).
+    """
+    stamped = [
+        ros.geometry_msgs__msg__TransformStamped(
+            header(stamp, parent),
+            child,
+            ros.geometry_msgs__msg__Transform(vector(T_pc[:3, 3]), _quaternion(T_pc)),
+        )
+        for (parent, child), T_pc in T.items()
+    ]
+    return ros.tf2_msgs__msg__TFMessage(stamped)
+
+
+def odometry(
+    stamp: float,
+    frames: tuple[str, str],
+    T_pc: Tensor,
+    twist: Tensor,
+    pose_covariance: Tensor,
+    twist_covariance: Tensor,
+) -> ros.nav_msgs__msg__Odometry:
+    """Make an odometry message.
+
+    Args:
+        stamp: Timestamp, seconds.
+        frames: Names of the parent and the child frame.
+        T_pc: Pose of the child frame in the parent frame, float64, shape :math:`(4, 4)`.
+        twist: Velocity of the child frame, in the child frame: linear (m/s) and angular (rad/s), float64, shape
+            :math:`(6,)`.
+        pose_covariance: Covariance of position and of rotation about the axes of the parent frame, in this order,
+            metres and radians, shape :math:`(6, 6)`.
+        twist_covariance: Covariance of the twist, shape :math:`(6, 6)`.
+    """
+    velocity = ros.geometry_msgs__msg__Twist(vector(twist[:3]), vector(twist[3:]))
+    return ros.nav_msgs__msg__Odometry(
+        header(stamp, frames[0]),
+        frames[1],
+        ros.geometry_msgs__msg__PoseWithCovariance(pose(T_pc), _flatten(pose_covariance)),
+        ros.geometry_msgs__msg__TwistWithCovariance(velocity, _flatten(twist_covariance)),
+    )
+
+
+def path(stamp: float, frame: str, stamps: Sequence[float], T: Tensor) -> ros.nav_msgs__msg__Path:
+    """Make a path.
+
+    Args:
+        stamp: Timestamp of the message, seconds.
+        frame: Name of the coordinate frame of the poses.
+        stamps: Timestamps of the poses, seconds.
+        T: Poses in the frame, float64, shape :math:`(N, 4, 4)`.
+    """
+    poses = [
+        ros.geometry_msgs__msg__PoseStamped(header(pose_stamp, frame), pose(T_each))
+        for pose_stamp, T_each in zip(stamps, T, strict=True)
+    ]
+    return ros.nav_msgs__msg__Path(header(stamp, frame), poses)
+
+
+def camera_info(stamp: float, frame: str, camera: PinholeCamera) -> ros.sensor_msgs__msg__CameraInfo:
+    """Make the description of a camera.
+
+    Args:
+        stamp: Timestamp, seconds.
+        frame: Name of the optical frame of the camera.
+        camera: Camera.
+    """
+    K = camera.K
+    P = torch.cat([K, torch.zeros(3, 1, dtype=K.dtype)], dim=1)
+    return ros.sensor_msgs__msg__CameraInfo(
+        header(stamp, frame),
+        camera.height,
+        camera.width,
+        camera.distortion_model,
+        np.array(camera.distortion),
+        _flatten(K),
+        np.eye(3).reshape(-1),
+        _flatten(P),
+        0,
+        0,
+        ros.sensor_msgs__msg__RegionOfInterest(0, 0, 0, 0, do_rectify=False),
+    )
+
+
+def occupancy_grid(stamp: float, frame: str, grid: OccupancyGrid, T_fw: Tensor) -> ros.nav_msgs__msg__OccupancyGrid:
+    """Make an occupancy grid. It is level, also if the frame is not: its origin is turned in the frame.
+
+    Args:
+        stamp: Timestamp, seconds.
+        frame: Name of the coordinate frame in which the pose of the grid is given.
+        grid: Grid.
+        T_fw: Transform from the world frame to that frame, float64, shape :math:`(4, 4)`.
+    """
+    T_lg = torch.eye(4, dtype=torch.float64)
+    T_lg[:2, 3] = torch.tensor(grid.origin, dtype=torch.float64)
+    height, width = grid.states.shape
+    values = torch.tensor([_OCCUPANCY[state] for state in VoxelState], dtype=torch.int8)
+    return ros.nav_msgs__msg__OccupancyGrid(
+        header(stamp, frame),
+        ros.nav_msgs__msg__MapMetaData(
+            header(stamp, frame).stamp, grid.cell_size, width, height, pose(T_fw @ invert(grid.T_lw) @ T_lg)
+        ),
+        values[grid.states.to(torch.int64).flatten() + 1].numpy(),
+    )
+
+
+def _quaternion(T: Tensor) -> ros.geometry_msgs__msg__Quaternion:
+    x, y, z, w = Rotation.from_matrix(T[:3, :3].numpy()).as_quat(canonical=True).tolist()
+    return ros.geometry_msgs__msg__Quaternion(x, y, z, w)
+
+
+def _flatten(matrix: Tensor) -> NDArray[np.float64]:
+    """Return the elements of a matrix, row by row."""
+    return matrix.reshape(-1).to(torch.float64).numpy()

@@ -1,0 +1,139 @@
+"""ROS 2 messages of a run, frame by frame.
+
+================================  ==========================================  =====================================
+``/tf``                           ``tf2_msgs/TFMessage``, every frame         ``map``, ``odom``, ``camera_link``,
+                                                                              ``camera_color_optical_frame``
+``/odom``                         ``nav_msgs/Odometry``, every frame          pose in ``odom``, velocity, covariances
+``/camera/color/camera_info``     ``sensor_msgs/CameraInfo``, every frame
+``/objects``                      ``visualization_msgs/MarkerArray``,         box, name and velocity of each object
+                                  every frame
+``/cloud``                        ``sensor_msgs/PointCloud2``, keyframes      static pixels, in the camera's frame
+``/path``                         ``nav_msgs/Path``, keyframes                keyframes; at the end all frames
+``/cloud_map``                    ``sensor_msgs/PointCloud2``, at the end     the static map
+``/map``                          ``nav_msgs/OccupancyGrid``, at the end      the floor, if an occupancy map is grown
+================================  ==========================================  =====================================
+
+While the camera is lost, only ``/camera/color/camera_info`` has messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from v3d_torch.export.ros import frames
+from v3d_torch.export.ros.markers import object_markers
+from v3d_torch.export.ros.messages import camera_info, occupancy_grid, odometry, path, transforms
+from v3d_torch.export.ros.point_cloud import point_cloud
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.mapping.keyframe import stack_poses
+from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.reconstruction.point_map import PointMap
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame, TrackingStatus
+
+_CLOUD_STRIDE = 4
+"""Every n-th row and column of a keyframe is in its cloud: a bag stays small, and viewers show many clouds at once."""
+
+
+class Message(Protocol):
+    """Message of any type."""
+
+    __msgtype__: ClassVar[str]
+
+
+TopicMessage = tuple[str, Message]
+"""Topic and message."""
+
+
+class RunMessages:
+    """Source of the messages of a run.
+
+    Args:
+        camera: Camera of all frames.
+    """
+
+    def __init__(self, camera: PinholeCamera) -> None:
+        self._camera = camera
+        self._odometry_frame = frames.OdometryFrame()
+        self._previous: int | None = None  # position in the pose history
+
+    def of_frame(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM) -> Iterator[TopicMessage]:
+        """Yield the messages of a frame.
+
+        Args:
+            frame: Frame.
+            objects: Objects of the frame, or its `FrameResult`.
+            slam: System after it tracked the frame.
+
+        Raises:
+            OutputError: If messages of ROS cannot hold the timestamp.
+        """
+        stamp = frame.stamp
+        yield "/camera/color/camera_info", camera_info(stamp, frames.OPTICAL, self._camera)
+        if slam.poses.status is TrackingStatus.LOST:
+            return
+        yield from self._pose_messages(stamp, slam)
+        velocities = {track.id: track.velocity for track in slam.classify_motion.tracker.tracks}
+        yield "/objects", object_markers(stamp, objects, velocities)
+        keyframes = slam.map.keyframes
+        if keyframes and keyframes[-1].frame == frame.index:
+            yield "/cloud", self._cloud(frame, objects.static_without_people)
+            own = [each for each in slam.map.active_keyframes if not each.is_from_earlier_run]
+            T_ml = frames.camera_in_map(invert(stack_poses(own)))
+            yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)
+
+    def of_end(self, slam: V3DSLAM, point_map: PointMap) -> Iterator[TopicMessage]:
+        """Yield the messages of the final state, with the timestamp of the last frame.
+
+        Args:
+            slam: System after at least one frame.
+            point_map: Map of the static scene.
+        """
+        stamp, trajectory = slam.poses.stamp, slam.poses.trajectory()
+        yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc))
+        points = frames.points_in_map(point_map.points)
+        yield "/cloud_map", point_cloud(stamp, frames.MAP, points, point_map.colours)
+        if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
+            yield "/map", occupancy_grid(stamp, frames.MAP, grid, frames.T_MAP_WORLD)
+
+    def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
+        odometry_frame, state = self._odometry_frame, slam.states.at(stamp)
+        newest = len(slam.poses) - 1
+        previous = newest if self._previous is None else self._previous
+        odometry_frame.update(*frames.camera_in_map(invert(slam.poses.poses_of([previous, newest]))))
+        self._previous = newest
+        tree = {
+            (frames.MAP, frames.ODOM): odometry_frame.T_mo,
+            (frames.ODOM, frames.CAMERA): odometry_frame.T_ol,
+            (frames.CAMERA, frames.OPTICAL): frames.T_LINK_OPTICAL,  # not static: it is there wherever a replay begins
+        }
+        yield "/tf", transforms(stamp, tree)
+        to_link = _rotate_both_halves(frames.T_LINK_OPTICAL)
+        to_odom = _rotate_both_halves(odometry_frame.T_ol @ frames.T_LINK_OPTICAL)
+        yield (
+            "/odom",
+            odometry(
+                stamp,
+                (frames.ODOM, frames.CAMERA),
+                odometry_frame.T_ol,
+                to_link @ state.twist,
+                pose_covariance=to_odom @ state.covariance @ to_odom.T,
+                twist_covariance=to_link @ state.twist_covariance @ to_link.T,
+            ),
+        )
+
+    def _cloud(self, frame: RGBDFrame, static: Tensor) -> Message:
+        step = slice(None, None, _CLOUD_STRIDE)
+        keep = static[step, step] & (frame.depth[0, step, step] > 0)
+        points = self._camera.rays[step, step][keep] * frame.depth[0, step, step][keep][:, None]
+        return point_cloud(frame.stamp, frames.OPTICAL, points, frame.image[:, step, step].permute(1, 2, 0)[keep])
+
+
+def _rotate_both_halves(T: Tensor) -> Tensor:
+    """Matrix that rotates translation and rotation of a twist or an error by a transform, float64, shape (6, 6)."""
+    return torch.block_diag(T[:3, :3], T[:3, :3])

@@ -1,0 +1,176 @@
+r"""Essential matrices between two views, by RANSAC and refinement of the Sampson distance.
+
+With the normalised coordinates :math:`x_a, x_b` of a point in both images, :math:`x_b^\top E\, x_a = 0`, where
+:math:`E = [t]_\times R` for the motion :math:`T_{ba} = (R, t)`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import kornia_rs
+import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
+from torch import Tensor
+
+from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
+from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
+from v3d_torch.kernels.compiler import can_read
+from v3d_torch.optim.implicit import needs_gradient
+from v3d_torch.runtime.batches import common_batch, fill_padding
+
+_MIN_PAIRS = 6
+"""A sample of 5 pairs, and one more pair that can confirm its matrix."""
+
+
+class EssentialMatrix(NamedTuple):
+    """Essential matrices found by RANSAC.
+
+    Attributes:
+        E: Essential matrices, of unit Frobenius norm, shape :math:`(*, 3, 3)`; 0 if none was found.
+        inliers: Mask of the pairs that satisfy the epipolar constraint, bool, shape :math:`(*, N)`.
+        found: True if a matrix was found, bool, shape :math:`(*)`.
+    """
+
+    E: Tensor
+    inliers: Tensor
+    found: Tensor
+
+
+def essential_ransac(
+    uv_a: Tensor,
+    uv_b: Tensor,
+    K: Tensor,
+    weights: Tensor | None = None,
+    valid: Tensor | None = None,
+    *,
+    threshold: float = 1.0,
+    iterations: int = ITERATIONS,
+    seed: int = 0,
+) -> EssentialMatrix:
+    """Estimate essential matrices from pairs of pixels: RANSAC, refined by the Sampson distance of all inliers.
+
+    The matrices are differentiable in pixels, camera matrix and weights, by the implicit function theorem; the inliers
+    are constant. On the CPU, kornia-rs finds the hypotheses by the five-point algorithm, one problem of the batch after
+    the other. On other devices and where `torch.func` traces the computation, torch finds them by the eight-point
+    algorithm, all at once; that algorithm does not work if all points lie in a plane.
+
+    `kornia.geometry.motion_from_essential_choose_solution` gives the motion, up to the length of its translation.
+
+    Nister, An Efficient Solution to the Five-Point Relative Pose Problem, PAMI 2004; Hartley and Zisserman, Multiple
+    View Geometry, 2004, Sec. 9.6 and 11.4.
+
+    Args:
+        uv_a: Undistorted pixels in image a, floating point, shape :math:`(*, N, 2)`.
+        uv_b: Undistorted pixels of the same points in image b, shape :math:`(*, N, 2)`.
+        K: Camera matrix of both images, shape :math:`(*, 3, 3)`.
+        weights: Weight of each pair in the refinement, not negative, shape :math:`(*, N)`; 1 by default.
+        valid: Pairs that are not padding, bool, shape :math:`(*, N)`; all by default.
+        threshold: Maximum Sampson distance of an inlier, pixels.
+        iterations: Maximum number of hypotheses.
+        seed: Seed of the sampling.
+
+    Returns:
+        Matrices with the dtype of ``uv_a``; their sign is arbitrary. No matrix is found from fewer than 6 pairs.
+    """
+    KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
+    KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
+    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2])
+    mask = uv_a.new_ones(*batch, uv_a.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
+    weights = torch.ones_like(uv_a[..., 0]) if weights is None else weights
+    row = None if valid is None else valid[..., None]
+    problem = EpipolarProblem(
+        a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),
+        b=_homogeneous(fill_padding(uv_b, row, 0.0).expand(*batch, -1, 2)),
+        K_inverse=torch.linalg.inv(K.to(torch.float64)).expand(*batch, 3, 3),
+        weights=fill_padding(weights, valid, 0.0).expand(*batch, -1),
+    )
+    constant = EpipolarProblem(*(each.detach() for each in problem))
+    with torch.no_grad():
+        sample = _sample_five_points if can_read(constant.a) else _sample_eight_points
+        hypothesis, found = sample(constant, mask, threshold, iterations, seed)
+        found = found & (mask.sum(dim=-1) >= _MIN_PAIRS)
+        state, inliers, active = refine_essential(hypothesis, constant, mask & found[..., None], threshold)
+    if needs_gradient(*problem):
+        state = problem.differentiate(state, active)
+    E = torch.where(found[..., None, None], compose(*state), 0.0)
+    return EssentialMatrix(E.to(uv_a.dtype), inliers, found)
+
+
+def _sample_five_points(
+    problem: EpipolarProblem, valid: Tensor, threshold: float, iterations: int, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Best essential matrices of kornia-rs, (..., 3, 3), and True where there is one, (...)."""
+    focal = 1 / problem.K_inverse.diagonal(dim1=-2, dim2=-1)[..., :2].prod(dim=-1).sqrt()
+    pairs = torch.cat([(each @ problem.K_inverse.mT)[..., :2] for each in (problem.a, problem.b)], dim=-1)
+    E = torch.eye(3, dtype=torch.float64).repeat(*valid.shape[:-1], 1, 1)
+    found = torch.zeros(valid.shape[:-1], dtype=torch.bool)
+    for row in (valid.sum(dim=-1) >= _MIN_PAIRS).nonzero().tolist():
+        index = tuple(row)
+        try:
+            result = kornia_rs.ransac.essential(
+                pairs[index][valid[index]].numpy(),
+                threshold=(threshold / float(focal[index])) ** 2,  # kornia-rs compares squared distances
+                max_iters=iterations,
+                seed=seed,
+            )
+        except ValueError:  # raised by kornia-rs for some degenerate pairs
+            continue
+        if result.model is None:  # no sample gives a model
+            continue
+        E[index], found[index] = torch.tensor(result.model, dtype=torch.float64).reshape(3, 3), True
+    return E, found
+
+
+def _sample_eight_points(
+    problem: EpipolarProblem, valid: Tensor, threshold: float, iterations: int, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Best essential matrices of RANSAC in torch, (..., 3, 3), and True where there is one, (...)."""
+    a, b = (each @ problem.K_inverse.mT for each in (problem.a, problem.b))
+    by_hypothesis = {name: getattr(problem, name)[..., None, :, :] for name in ("a", "b", "K_inverse")}
+
+    def solve(samples: Tensor) -> Tensor:
+        products = (gather_samples(b, samples)[..., :, None] * gather_samples(a, samples)[..., None, :]).flatten(-2)
+        smallest = torch.linalg.eigh(products.mT @ products).eigenvectors[..., 0]
+        return compose(*decompose(smallest.unflatten(-1, (3, 3))))[..., None, :, :]
+
+    def squared_errors(E: Tensor) -> Tensor:
+        return problem._replace(**by_hypothesis).sampson(E).square()
+
+    return find_best_hypothesis(
+        solve, squared_errors, valid, size=8, threshold=threshold, iterations=iterations, seed=seed
+    )
+
+
+def _homogeneous(uv: Tensor) -> Tensor:
+    return torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1)
+
+
+class EssentialRANSAC(torch.nn.Module):
+    """:func:`essential_ransac` as a module.
+
+    Args:
+        threshold: Maximum Sampson distance of an inlier, pixels.
+        iterations: Maximum number of hypotheses.
+        seed: Seed of the sampling.
+    """
+
+    def __init__(self, threshold: float = 1.0, iterations: int = ITERATIONS, seed: int = 0) -> None:
+        super().__init__()
+        self.threshold = threshold
+        self.iterations = iterations
+        self.seed = seed
+
+    def forward(
+        self,
+        uv_a: Tensor,
+        uv_b: Tensor,
+        K: Tensor,
+        weights: Tensor | None = None,
+        valid: Tensor | None = None,
+    ) -> EssentialMatrix:
+        """Estimate matrices from pixels :math:`(*, N, 2)` in two images; see :func:`essential_ransac`."""
+        return essential_ransac(
+            uv_a, uv_b, K, weights, valid, threshold=self.threshold, iterations=self.iterations, seed=self.seed
+        )

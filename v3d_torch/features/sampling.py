@@ -1,0 +1,97 @@
+"""RANSAC in torch: many hypotheses from random samples, for a batch of problems on any device.
+
+Fischler and Bolles, Random Sample Consensus, CACM 1981. The score is the truncated squared error (MSAC; Torr and
+Zisserman, MLESAC, CVIU 2000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v3d_torch.config import OdometryConfig
+
+ITERATIONS = OdometryConfig().iterations
+"""Default number of hypotheses: that of the configuration of odometry."""
+
+_CHUNK = 64
+"""Samples that are tested at once: bounds the memory."""
+
+
+def find_best_hypothesis(
+    solve: Callable[[Tensor], Tensor],
+    squared_errors: Callable[[Tensor], Tensor],
+    valid: Tensor,
+    *,
+    size: int,
+    threshold: float,
+    iterations: int,
+    seed: int,
+) -> tuple[Tensor, Tensor]:
+    """Find the hypothesis with the lowest truncated error.
+
+    Args:
+        solve: Function from samples, indices of shape :math:`(..., S, n)`, to hypotheses, matrices of shape
+            :math:`(..., S, H, r, c)`, H for each sample; NaN for those that do not exist.
+        squared_errors: Function from hypotheses of shape :math:`(..., T, r, c)` to the squared error of each element,
+            :math:`(..., T, N)`; infinite or NaN for elements that exclude the hypothesis.
+        valid: Elements that are not padding, bool, shape :math:`(..., N)`.
+        size: Number n of elements in a sample.
+        threshold: Errors are truncated here.
+        iterations: Number of samples.
+        seed: Seed of the sampling.
+
+    Returns:
+        The best hypothesis, shape :math:`(..., r, c)`, and True where there is one, bool, shape :math:`(...)`.
+    """
+    best, lowest = None, None
+    for samples in draw_samples(valid, size, iterations, seed).split(_CHUNK, dim=-2):
+        hypotheses = solve(samples).flatten(-4, -3)
+        errors = squared_errors(hypotheses).nan_to_num(nan=torch.inf).clamp(max=threshold**2)
+        costs = torch.where(valid[..., None, :], errors, 0.0).sum(dim=-1)
+        costs = torch.where(hypotheses.isfinite().all(dim=(-2, -1)), costs, torch.inf)
+        cost, index = costs.min(dim=-1)
+        chosen = torch.take_along_dim(hypotheses, index[..., None, None, None], dim=-3)[..., 0, :, :]
+        if best is None or lowest is None:
+            best, lowest = chosen, cost
+        else:
+            is_better = cost < lowest
+            best, lowest = torch.where(is_better[..., None, None], chosen, best), torch.where(is_better, cost, lowest)
+    if best is None or lowest is None:
+        raise ValueError("RANSAC needs at least one iteration")
+    return best, lowest.isfinite() & (valid.sum(dim=-1) >= size)
+
+
+def draw_samples(valid: Tensor, size: int, count: int, seed: int) -> Tensor:
+    """Draw samples of different elements, the same on every device.
+
+    Args:
+        valid: Elements that can be drawn, bool, shape :math:`(..., N)`, at least ``size``; with fewer, samples contain
+            others, too.
+        size: Number n of elements in a sample, at most N.
+        count: Number S of samples.
+        seed: Seed of the sampling.
+
+    Returns:
+        Indices, int64, shape :math:`(..., S, n)`.
+    """
+    # Random numbers of NumPy, because those of torch depend on the device and are refused by torch.func.vmap.
+    keys = torch.from_numpy(np.random.default_rng(seed).random((count, valid.shape[-1]))).to(valid.device)
+    return torch.where(valid[..., None, :], keys, 1.0).topk(size, dim=-1, largest=False).indices
+
+
+def gather_samples(elements: Tensor, samples: Tensor) -> Tensor:
+    """Gather the elements of samples.
+
+    Args:
+        elements: Shape :math:`(..., N, d)`.
+        samples: Indices, int64, shape :math:`(..., S, n)`.
+
+    Returns:
+        Shape :math:`(..., S, n, d)`.
+    """
+    index = samples.flatten(-2)[..., None].expand(*samples.shape[:-2], -1, elements.shape[-1])
+    return elements.gather(-2, index).unflatten(-2, samples.shape[-2:])

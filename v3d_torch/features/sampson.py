@@ -1,0 +1,148 @@
+r"""Essential matrices with the smallest Sampson distances: least squares over rotations U and V.
+
+.. math::
+    E = \frac{1}{\sqrt 2}\, U \,\mathrm{diag}(1, 1, 0)\, V^\top
+
+has five degrees of freedom: the rotation of U, and that of V about its first two columns. Hartley and Zisserman,
+Multiple View Geometry, 2004, Sec. 9.6 and 11.4.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from v3d_torch.geometry.se3 import hat, se3_exp
+from v3d_torch.kernels.compiler import is_all_true
+from v3d_torch.optim.implicit import jacobian, zero_with_gradient
+from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt, select
+
+_ROUNDS = 3
+"""Rounds of refinement on the inliers, after each of which all pairs are classified anew."""
+
+_ITERATIONS, _TOLERANCE = 10, 1e-6
+"""Maximum number of steps in a round, and relative change of the cost that ends it."""
+
+_REGULARISATION = 1e-9
+"""Added to the diagonal of the normal equations, which are singular without inliers."""
+
+
+State = tuple[Tensor, Tensor]
+"""Rotations U and V, shape :math:`(..., 3, 3)` each, of an essential matrix."""
+
+
+def compose(U: Tensor, V: Tensor) -> Tensor:
+    """Essential matrices U diag(1, 1, 0) V^T, of unit norm."""
+    return 0.5**0.5 * (U[..., :2] @ V[..., :2].mT)
+
+
+def decompose(E: Tensor) -> State:
+    """Rotations U and V of the essential matrices nearest to E; the third columns do not matter."""
+    U, _, Vh = torch.linalg.svd(E)
+    rotations = []
+    for Q in (U, Vh.mT):
+        signs = torch.stack([*torch.ones_like(Q[..., :2, 0]).unbind(-1), torch.linalg.det(Q)], dim=-1)
+        rotations.append(Q * signs[..., None, :])
+    return rotations[0], rotations[1]
+
+
+def _move(state: State, x: Tensor) -> State:
+    """State moved by (..., 5): rotation of U about three axes, and of V about its first two columns.
+
+    Rotating both about their third columns does not change E.
+    """
+    U, V = state
+    turns = x[..., :3], (V[..., :2] @ x[..., 3:, None])[..., 0]
+    R_u, R_v = (se3_exp(torch.cat([torch.zeros_like(turn), turn], dim=-1))[..., :3, :3] for turn in turns)
+    return R_u @ U, R_v @ V
+
+
+class EpipolarProblem(NamedTuple):
+    """Pairs of pixels in two images.
+
+    Attributes:
+        a: Homogeneous pixels in image a, shape :math:`(..., N, 3)`.
+        b: Homogeneous pixels in image b, shape :math:`(..., N, 3)`.
+        K_inverse: Inverse camera matrix, shape :math:`(..., 3, 3)`.
+        weights: Weight of each pair, shape :math:`(..., N)`.
+    """
+
+    a: Tensor
+    b: Tensor
+    K_inverse: Tensor
+    weights: Tensor
+
+    def sampson(self, E: Tensor) -> Tensor:
+        """Sampson distances, signed, pixels: (..., 3, 3) to (..., N)."""
+        F = self.K_inverse.mT @ E @ self.K_inverse
+        line_b, line_a = self.a @ F.mT, self.b @ F
+        return (line_b * self.b).sum(dim=-1) / _length(line_a, line_b)
+
+    def jacobian(self, state: State) -> Tensor:
+        """Derivatives of the Sampson distances by the arguments of `_move`, (..., 5, N)."""
+        (U, V), E = state, compose(*state)
+        axes = torch.cat([torch.eye(3, dtype=U.dtype, device=U.device).expand_as(U), V[..., :2].mT], dim=-2)
+        turns = hat(torch.cat([torch.zeros_like(axes), axes], dim=-1))[..., :3, :3]  # 5 x 3 x 3
+        E, K_inverse = E[..., None, :, :], self.K_inverse[..., None, :, :]
+        tangents = torch.cat([turns[..., :3, :, :] @ E, E @ turns[..., 3:, :, :].mT], dim=-3)
+        F, G = (K_inverse.mT @ M @ K_inverse for M in (E, tangents))
+        a, b = self.a.mT[..., None, :, :], self.b.mT[..., None, :, :]
+        line_b, line_a, change_b, change_a = F @ a, F.mT @ b, G @ a, G.mT @ b  # 3 x N
+        length = _length(line_a.mT, line_b.mT)
+        distance = (line_b * b).sum(dim=-2) / length
+        stretch = (line_a * change_a)[..., :2, :].sum(dim=-2) + (line_b * change_b)[..., :2, :].sum(dim=-2)
+        return (change_b * b).sum(dim=-2) / length - distance * stretch / length.square()
+
+    def linearise(self, state: State, influence: Tensor) -> tuple[Tensor, State]:
+        """Cost, and halves of its Hessian by Gauss-Newton and of its gradient."""
+        r, J = self.sampson(compose(*state)), self.jacobian(state)
+        weighted = J * influence[..., None, :]
+        return (influence * r.square()).sum(dim=-1), (weighted @ J.mT, (weighted @ r[..., None])[..., 0])
+
+    def differentiate(self, state: State, active: Tensor) -> State:
+        """The optimum ``state`` of the active pairs, with its derivatives."""
+
+        def gradient(x: Tensor, problem: EpipolarProblem) -> Tensor:
+            return problem.linearise(_move(state, x), problem.weights * active)[1][1]
+
+        constant = EpipolarProblem(*(each.detach() for each in self))
+        zero = state[0].new_zeros(*state[0].shape[:-2], 5)
+        H = _regularise(jacobian(lambda x: gradient(x, constant), zero))
+        return _move(state, zero_with_gradient(-torch.linalg.solve(H, gradient(zero, self))))
+
+
+def _length(line_a: Tensor, line_b: Tensor) -> Tensor:
+    """Denominator of the Sampson distance, of the epipolar lines (..., N, 3) in both images, (..., N)."""
+    square = line_a[..., :2].square().sum(dim=-1) + line_b[..., :2].square().sum(dim=-1)
+    return square.clamp(min=1e-30).sqrt()
+
+
+def _regularise(H: Tensor) -> Tensor:
+    return H + _REGULARISATION * torch.eye(5, dtype=H.dtype, device=H.device)
+
+
+def _step(state: State, system: State, damping: Tensor) -> State:
+    H, gradient = system
+    damped = _regularise(H + torch.diag_embed(H.diagonal(dim1=-2, dim2=-1) * damping[..., None]))
+    return _move(state, -torch.linalg.solve(damped, gradient))
+
+
+def refine_essential(
+    E: Tensor, problem: EpipolarProblem, valid: Tensor, threshold: float
+) -> tuple[State, Tensor, Tensor]:
+    """Optimum on the inliers, the inliers (..., N), and the pairs (..., N) that took part in the last round."""
+    state, active = decompose(E), valid
+    inliers = valid & (problem.sampson(compose(*state)).abs() <= threshold)
+    finished = torch.zeros(E.shape[:-2], dtype=torch.bool, device=E.device)
+    for _ in range(_ROUNDS):
+        active = select(finished, active, inliers)
+        linearise = partial(problem.linearise, influence=problem.weights * active)
+        state = levenberg_marquardt(state, linearise, _step, _ITERATIONS, _TOLERANCE, finished).state
+        inliers = valid & (problem.sampson(compose(*state)).abs() <= threshold)
+        finished = finished | (inliers == active).all(dim=-1)
+        if is_all_true(finished):
+            break
+    return state, inliers, active

@@ -1,0 +1,7 @@
+"""Live processing: capture, preprocessing and tracking beside each other, always on the newest frame."""
+
+from __future__ import annotations
+
+from v3d_torch.live.live_slam import LiveResult, LiveSLAM
+
+__all__ = ["LiveResult", "LiveSLAM"]

@@ -1,0 +1,106 @@
+"""Preprocessing of the newest frame while the one before is tracked."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from threading import Thread
+
+import torch
+
+from v3d_torch.frame_result import PreprocessedFrame, Segmentation
+from v3d_torch.live.frame_capture import CapturedFrame
+from v3d_torch.live.latest_queue import LatestQueue
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """A captured frame whose features are complete; its segmentation may still run.
+
+    Attributes:
+        captured: Frame with the time of its capture.
+        preprocessed: Frame for `V3DSLAM.track`.
+        is_segmented: True if the network sees the frame.
+    """
+
+    captured: CapturedFrame
+    preprocessed: PreprocessedFrame
+    is_segmented: bool
+
+
+class LivePreprocessor:
+    """Two threads that preprocess one frame at a time: one extracts features, the other one segments.
+
+    As soon as the features of a frame are complete, it replaces an earlier frame whose tracking has not begun, and is
+    ready for tracking, which waits for the segmentation where it needs it.
+
+    The network sees a frame if it is at least the ``segmentation.interval``-th after the last tracked one that it saw.
+    While frames are left out, it sees at most every second frame, which gives time to catch up.
+
+    Args:
+        captured: Queue of captured frames.
+        slam: System that preprocesses the frames.
+
+    Attributes:
+        frames: Queue with the newest frame that is ready for tracking.
+    """
+
+    def __init__(self, captured: LatestQueue[CapturedFrame], slam: V3DSLAM) -> None:
+        self.frames = LatestQueue[LiveFrame]()
+        self._captured = captured
+        self._slam = slam
+        self._prediction = slam.predictions[-1]
+        self._last_tracked = 0  # number of the last frame whose tracking has begun
+        self._last_segmented = -slam.config.segmentation.interval  # number of the last such frame that was segmented
+        self._inference = torch.is_inference_mode_enabled()
+        self._segmenter = ThreadPoolExecutor(1, "segmentation")
+        self._thread = Thread(target=self._run, name="features", daemon=True)
+
+    def start(self) -> None:
+        """Start the threads."""
+        self._thread.start()
+
+    def begin_tracking(self, live: LiveFrame) -> None:
+        """Note that the tracking of a frame begins."""
+        if live.is_segmented:
+            self._last_segmented = live.captured.number
+        self._last_tracked = live.captured.number
+
+    def end_tracking(self) -> None:
+        """Take the newest prediction of the pose, after the tracking of a frame."""
+        self._prediction = self._slam.advance_predictions()
+
+    def close(self) -> None:
+        """Stop the threads after the frame that they work on; the queue of captured frames is closed before."""
+        self.frames.close()
+        self._thread.join()
+        self._segmenter.shutdown()
+
+    def _run(self) -> None:
+        try:
+            with torch.inference_mode(self._inference):
+                while (captured := self._captured.take()) is not None:
+                    self._preprocess(captured)
+        except BaseException as error:
+            self.frames.close(error)
+        else:
+            self.frames.close()
+
+    def _preprocess(self, captured: CapturedFrame) -> None:
+        is_segmented = self._is_segmentation_due(captured.number)
+        segmentation = self._segmenter.submit(self._segment, captured.frame, is_segmented)
+        extraction = self._slam.extract_features(captured.frame)
+        preprocessed = PreprocessedFrame(captured.frame, extraction, segmentation.result)
+        self.frames.put(LiveFrame(captured, preprocessed, is_segmented))
+        wait([segmentation])
+
+    def _is_segmentation_due(self, number: int) -> bool:
+        since_segmented, since_tracked = number - self._last_segmented, number - self._last_tracked
+        is_catching_up = since_tracked > 1 and self._last_segmented == self._last_tracked
+        return since_segmented >= self._slam.config.segmentation.interval and not is_catching_up
+
+    def _segment(self, frame: RGBDFrame, is_due: bool) -> Segmentation:
+        with torch.inference_mode(self._inference):
+            return self._slam.segment_instances(frame, self._prediction, is_due)

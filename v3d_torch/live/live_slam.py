@@ -1,0 +1,126 @@
+"""SLAM on a live camera: capture, preprocessing and tracking beside each other, always on the newest frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
+from dataclasses import dataclass
+
+from v3d_torch.errors import ConfigError
+from v3d_torch.frame_result import FrameResult
+from v3d_torch.live.frame_capture import FrameCapture
+from v3d_torch.live.live_preprocessor import LivePreprocessor
+from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
+from v3d_torch.runtime.process import trim_memory
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.types import RGBDFrame
+
+_TRIM_INTERVAL = 200
+"""Frames between two calls of `trim_memory`, which takes some milliseconds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveResult(FrameResult):
+    """Result of a live frame.
+
+    Attributes:
+        frame: Frame.
+        captured_at: Time of capture in the clock of the computer (`time.monotonic`), seconds; that of the camera is
+            ``stamp``.
+        finished_at: Time of this result in the same clock, seconds.
+        dropped: Number of frames that were left out since the previous result.
+    """
+
+    frame: RGBDFrame
+    captured_at: float
+    finished_at: float
+    dropped: int
+
+    @property
+    def latency(self) -> float:
+        """Time from the capture of the frame to its result, seconds."""
+        return self.finished_at - self.captured_at
+
+
+class LiveSLAM:
+    """Runs a camera through a system: capture, preprocessing and tracking work beside each other.
+
+    Each stage takes the newest frame that is ready, and nothing else waits. If tracking is slower than the camera,
+    frames are left out and counted. Iterate over the results, or call the object with a callback; both end with the
+    source.
+
+    Args:
+        source: Frames at their own rate: a camera (``open_source("realsense:")``), a `RealtimePlayback`, or any
+            iterable that waits for its next frame, such as ``iter(queue.get, None)``.
+        slam: System, made for the camera of the source.
+        clock: Clock of the computer.
+
+    Attributes:
+        dropped: Number of frames that were left out so far.
+
+    Raises:
+        ConfigError: If the configuration allows no threads (``prefetch=false``).
+    """
+
+    def __init__(self, source: Iterable[RGBDFrame], slam: V3DSLAM, clock: Clock = MONOTONIC_CLOCK) -> None:
+        if not slam.config.prefetch:
+            raise ConfigError("prefetch=false: a live camera needs threads; remove --serial or set prefetch=true")
+        self.slam = slam
+        self.dropped = 0
+        self._source = source
+        self._clock = clock
+        self._capture: FrameCapture | None = None
+
+    @property
+    def rejected(self) -> int:
+        """Number of frames so far that were not later than all before them: late, doubled or out of order."""
+        return 0 if self._capture is None else self._capture.rejected
+
+    def __iter__(self) -> Generator[LiveResult, None, None]:
+        """Start the source and yield the result of each tracked frame.
+
+        Raises:
+            InputError: If the source ends with an error, or a frame is not valid.
+            ConfigError: If the segmenter returned something else than instances.
+        """
+        self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
+        preprocessor = LivePreprocessor(capture.frames, self.slam)
+        with closing(preprocessor), closing(capture):
+            capture.start()
+            preprocessor.start()
+            number = 0
+            while (live := preprocessor.frames.take()) is not None:
+                preprocessor.begin_tracking(live)
+                result = self.slam.track(live.preprocessed)
+                preprocessor.end_tracking()
+                finished_at, captured = self._clock.now(), live.captured
+                dropped, number = captured.number - number - 1, captured.number
+                self.dropped += dropped
+                yield LiveResult(
+                    **vars(result),
+                    frame=captured.frame,
+                    captured_at=captured.captured_at,
+                    finished_at=finished_at,
+                    dropped=dropped,
+                )
+                if len(self.slam.poses) % _TRIM_INTERVAL == 0:
+                    trim_memory()
+            self.slam.flush()
+
+    def __call__(self, on_result: Callable[[LiveResult], object]) -> None:
+        """Run until the source ends, and call back with each result.
+
+        Args:
+            on_result: Called in this thread. If it takes long, frames are left out.
+
+        Raises:
+            InputError: As for iteration.
+            ConfigError: As for iteration.
+        """
+        for result in self:
+            on_result(result)
+
+    def pose_at(self, stamp: float) -> CameraState:
+        """Return the camera at a time, see `V3DSLAM.pose_at`; from any thread."""
+        return self.slam.pose_at(stamp)

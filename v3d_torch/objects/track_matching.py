@@ -1,0 +1,238 @@
+"""Evidence for all pairs of tracks and instances of a frame, from positions, masks, appearance and class."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from v3d_torch.config import TrackerConfig
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
+from v3d_torch.objects.appearance import HISTOGRAM_SIZE, histogram_similarity
+from v3d_torch.objects.association import (
+    appearance_log_ratio,
+    class_log_ratio,
+    overlap_log_ratio,
+    position_log_ratio,
+    vacancy_log_ratio,
+)
+from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.silhouette import Silhouette, silhouettes
+from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.types import Instances
+
+_MIN_VISIBLE_FRACTION = 0.5
+"""An object is visible at its predicted position if the depth agrees with more than this fraction of its points."""
+
+_MAX_BESIDE_COVERAGE = 0.1
+"""An instance lies beside a predicted mask if their intersection is less than this fraction of the smaller area."""
+
+_MIN_COVERAGE = 0.5
+"""An instance covers a predicted mask if their intersection is at least this fraction of the smaller area."""
+
+DEPTH_TOLERANCE = 0.2
+"""Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
+
+
+@dataclass(frozen=True)
+class DetectedInstances:
+    """Instances of a frame, as the tracker compares them.
+
+    Attributes:
+        stamp: Timestamp, seconds.
+        labels: Class of each of N instances, int64, shape :math:`(N,)`.
+        detections: Detections of the instances.
+        masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
+        appearance: Colour histograms, float32, shape :math:`(N, D)`; NaN if unknown.
+    """
+
+    stamp: float
+    labels: Tensor
+    detections: Sequence[Detection3D]
+    masks: Tensor
+    appearance: Tensor
+
+    def __len__(self) -> int:
+        return len(self.detections)
+
+
+@dataclass(frozen=True)
+class PredictedTracks:
+    """Tracks at their predicted positions in a frame.
+
+    Attributes:
+        tracks: T tracks.
+        silhouettes: Projection of the newest cloud of each track at its predicted position.
+        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`.
+        visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
+            :math:`(T,)`.
+    """
+
+    tracks: Sequence[Track]
+    silhouettes: Sequence[Silhouette]
+    masks: Tensor
+    visible_fractions: Tensor
+
+    @property
+    def visible(self) -> Tensor:
+        """Tracks that are visible at their predicted position, bool, shape (T,)."""
+        return self.visible_fractions > _MIN_VISIBLE_FRACTION
+
+
+def detect_instances(
+    stamp: float,
+    instances: Instances,
+    clouds: InstanceClouds,
+    appearance: Tensor | None,
+    T_wc: Tensor,
+    stride: int,
+) -> DetectedInstances:
+    """Transform the instances of a frame into the world frame and to coarse masks.
+
+    Args:
+        stamp: Timestamp, seconds.
+        instances: Instances of the frame.
+        clouds: Clouds of the instances, camera frame.
+        appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
+        T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+        stride: Step between the coarse pixels, pixels.
+    """
+    R, t = T_wc[:3, :3], T_wc[:3, 3]
+    detections = []
+    for points, valid, centroid in zip(clouds.points, clouds.valid, clouds.centroid, strict=True):
+        cloud = points[valid]
+        detections.append(Detection3D(stamp, R @ centroid.to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud)))
+    return DetectedInstances(
+        stamp,
+        instances.labels,
+        detections,
+        pack_masks(instances.masks, stride),
+        torch.full((len(detections), HISTOGRAM_SIZE), torch.nan) if appearance is None else appearance,
+    )
+
+
+def predict_tracks(
+    tracks: Sequence[Track],
+    stamp: float,
+    depth: Tensor,
+    T_cw: Tensor,
+    camera: PinholeCamera,
+    spacing: float,
+    stride: int,
+) -> PredictedTracks:
+    """Predict tracks, and check whether they are visible there.
+
+    Args:
+        tracks: Tracks.
+        stamp: Timestamp, seconds.
+        depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+        camera: Camera of the frame.
+        spacing: Spacing of the points of the clouds, metres.
+        stride: Step between the coarse pixels, pixels.
+    """
+    clouds = [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in tracks]
+    projected = silhouettes(clouds, camera, spacing)
+    coarse_depth = depth[:, ::stride, ::stride].contiguous()
+    masks = [each.mask(coarse_depth, 0, DEPTH_TOLERANCE, step=stride, include_missing=True) for each in projected]
+    return PredictedTracks(
+        tuple(tracks),
+        projected,
+        pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
+        torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
+    )
+
+
+def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Add up the evidence for each pair of a track and an instance.
+
+    An instance can continue a track of its class within the gate or whose predicted mask it covers, and any track whose
+    last or predicted mask it overlaps: the position jumps when an object is hidden. An instance beside an object that
+    is visible at its predicted position is another object.
+
+    Args:
+        predicted: T tracks.
+        detected: N instances.
+        config: Gates.
+
+    Returns:
+        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
+    """
+    # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
+    last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
+    intersection = count_common_pixels(predicted.masks, detected.masks)
+    areas, predicted_areas = count_pixels(detected.masks), count_pixels(predicted.masks)[:, None]
+    coverage = (intersection / torch.minimum(predicted_areas, areas).clamp(min=1)).to(torch.float64)
+    overlap = torch.maximum(
+        _intersection_over_union(
+            count_common_pixels(last_masks, detected.masks), count_pixels(last_masks)[:, None], areas
+        ),
+        _intersection_over_union(intersection, predicted_areas, areas),
+    )
+    same_class = _same_class(predicted.tracks, detected)
+    beside = predicted.visible[:, None] & (coverage < _MAX_BESIDE_COVERAGE)
+    near = _within_gate(predicted.tracks, detected, config) & ~beside
+    possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
+    visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
+    evidence = (
+        _position_evidence(predicted.tracks, detected, possible)
+        + overlap_log_ratio(coverage, overlap, visible)
+        + _other_evidence(predicted.tracks, detected, same_class)
+    )
+    return evidence.masked_fill(~possible, -torch.inf)
+
+
+def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Add up the evidence for each pair of a lost track and an instance; a lost track has no predicted mask.
+
+    Args:
+        tracks: T lost tracks.
+        detected: N instances.
+        config: Gates.
+
+    Returns:
+        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
+    """
+    same_class = _same_class(tracks, detected)
+    possible = same_class & _within_gate(tracks, detected, config)
+    evidence = _position_evidence(tracks, detected, possible) + _other_evidence(tracks, detected, same_class)
+    return evidence.masked_fill(~possible, -torch.inf)
+
+
+def _position_evidence(tracks: Sequence[Track], detected: DetectedInstances, possible: Tensor) -> Tensor:
+    """Evidence of the positions of the possible pairs, 0 for the others, shape (T, N)."""
+    squared_distance = torch.full(possible.shape, torch.nan, dtype=torch.float64)
+    variance = torch.ones_like(squared_distance)
+    for i, j in possible.nonzero().tolist():
+        difference, variance[i, j] = tracks[i].innovation(detected.detections[j])
+        squared_distance[i, j] = difference.square().sum()
+    return position_log_ratio(squared_distance, variance)
+
+
+def _other_evidence(tracks: Sequence[Track], detected: DetectedInstances, same_class: Tensor) -> Tensor:
+    """Evidence of appearance, class and vacancy, shape (T, N)."""
+    unknown = torch.full((HISTOGRAM_SIZE,), torch.nan)
+    appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
+    similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
+    vacant_time = torch.tensor([[track.vacant_time] for track in tracks], dtype=torch.float64)
+    return appearance_log_ratio(similarity) + class_log_ratio(same_class) + vacancy_log_ratio(vacant_time)
+
+
+def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
+    return torch.tensor([track.label for track in tracks])[:, None] == detected.labels
+
+
+def _within_gate(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Check which instances are within the distance that each track can have moved, bool, shape (T, N)."""
+    predicted = torch.stack([track.predict_centroid(detected.stamp) for track in tracks])
+    observed = torch.stack([detection.centroid for detection in detected.detections])
+    elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
+    return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * elapsed
+
+
+def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """Return the intersection over union from areas of intersections (A, B) and masks (A, 1) and (B,), float64."""
+    return (intersection / (a + b - intersection).clamp(min=1)).to(torch.float64)

@@ -1,0 +1,1 @@
+"""Occupancy map: free and occupied space for planning, with floor, distance field and files."""

@@ -1,0 +1,47 @@
+"""2D grids as files of ROS's map_server: an image ``.pgm`` and its description ``.yaml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+import yaml
+
+from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
+from v3d_torch.occupancy.occupancy_map import VoxelState
+
+_GREY = {VoxelState.OCCUPIED: 0, VoxelState.UNKNOWN: 205, VoxelState.FREE: 254}
+"""Grey values that map_saver writes. map_server reads a pixel as occupied if (255 - grey) / 255 is above the occupied
+threshold, as free below the free threshold, else as unknown."""
+
+_OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
+"""Thresholds of map_saver."""
+
+
+def write_map_server_files(path: Path, grid: OccupancyGrid) -> None:
+    """Write a grid as ``.pgm`` and ``.yaml``.
+
+    Args:
+        path: Path of the YAML file; the image is written beside it.
+        grid: Grid.
+
+    Raises:
+        OutputError: If a file cannot be written.
+    """
+    image = path.with_suffix(".pgm")
+    values = torch.tensor([_GREY[state] for state in VoxelState], dtype=torch.uint8)
+    grey = values[grid.states.flip(0).to(torch.int64) + 1]  # the first row of the image has the largest y
+    height, width = grey.shape
+    with atomic_write(image) as temporary:
+        temporary.write_bytes(f"P5\n{width} {height}\n255\n".encode() + grey.numpy().tobytes())
+    about = {
+        "image": image.name,
+        "mode": "trinary",
+        "resolution": grid.cell_size,
+        "origin": [*grid.origin, 0.0],
+        "negate": 0,
+        "occupied_thresh": _OCCUPIED_THRESHOLD,
+        "free_thresh": _FREE_THRESHOLD,
+    }
+    write_text(path, yaml.safe_dump(about, sort_keys=False, default_flow_style=None))

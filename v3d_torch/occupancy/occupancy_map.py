@@ -1,0 +1,190 @@
+"""Occupancy map: a voxel grid of free, occupied and unknown space, with queries for planning."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from v3d_torch.config import OccupancyConfig
+from v3d_torch.kernels.occupancy import SIDE, UNKNOWN
+from v3d_torch.occupancy.clearance import NearestVoxels, are_balls_free, cube_gap
+from v3d_torch.occupancy.ray_casting import observe_voxels
+from v3d_torch.occupancy.sensor_model import SensorModel
+from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
+
+_LOG = logging.getLogger(__name__)
+
+_KEPT_FRACTION = 0.9
+"""Fraction of the maximum number of blocks that is kept when blocks are removed, so that this is rare."""
+
+
+class VoxelState(IntEnum):
+    """State of a voxel."""
+
+    UNKNOWN = -1
+    FREE = 0
+    OCCUPIED = 1
+
+
+class OccupancyMap:
+    """Voxel grid with log-odds of occupancy, in the world frame.
+
+    Voxel (i, j, k) is the cube between the corners (i, j, k) and (i + 1, j + 1, k + 1), times the size of a voxel. It
+    is occupied if its probability is at least 0.5, and unknown if it was never observed. All queries take batches of
+    points.
+
+    Args:
+        config: Sensor model, size of voxels, bounds of memory and distances.
+    """
+
+    def __init__(self, config: OccupancyConfig) -> None:
+        self.config = config
+        self.blocks = VoxelBlocks()
+        self.sensor_model = SensorModel.from_config(config)
+        self._nearest: NearestVoxels | None = None  # of the occupied voxels; None after they changed
+
+    @property
+    def is_empty(self) -> bool:
+        """True if nothing was observed yet."""
+        return len(self.blocks) == 0
+
+    @property
+    def occupied_points(self) -> Tensor:
+        """Centres of the occupied voxels, metres, float64, shape :math:`(N, 3)`."""
+        return self._centres(self.blocks.log_odds >= 0)
+
+    @property
+    def free_points(self) -> Tensor:
+        """Centres of the free voxels, metres, float64, shape :math:`(N, 3)`."""
+        log_odds = self.blocks.log_odds
+        return self._centres((log_odds < 0) & (log_odds != UNKNOWN))
+
+    def integrate(self, depth: Tensor, static: Tensor, rays: Tensor, T_wc: Tensor) -> None:
+        """Add the observations of a depth image.
+
+        Args:
+            depth: Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement. Pixels can be subsampled.
+            static: Mask of static pixels, bool, shape :math:`(h, w)`. The others are no obstacles; they only show that
+                the space in front of them is free.
+            rays: Viewing ray of each pixel at unit depth, float32, shape :math:`(h, w, 3)`; see `PinholeCamera.rays`.
+            T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+        """
+        config = self.config
+        limits = config.voxel_size, config.max_depth, config.depth_tolerance
+        self.blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self.sensor_model)
+        if len(self.blocks) > config.max_blocks:
+            self._remove_farthest(T_wc[:3, 3])
+        self._nearest = None
+
+    def states(self, points: Tensor) -> Tensor:
+        """State of the voxel around each point.
+
+        Args:
+            points: Points, world frame, metres, shape :math:`(..., 3)`.
+
+        Returns:
+            Values of `VoxelState`, int8, shape :math:`(...)`.
+        """
+        log_odds = self.blocks.log_odds_at(self._voxels(points))
+        states = torch.where(log_odds >= 0, VoxelState.OCCUPIED, VoxelState.FREE)
+        return torch.where(log_odds == UNKNOWN, VoxelState.UNKNOWN, states).to(torch.int8).reshape(points.shape[:-1])
+
+    def probability(self, points: Tensor) -> Tensor:
+        """Probability that the voxel around each point is occupied.
+
+        Args:
+            points: Points, world frame, metres, shape :math:`(..., 3)`.
+
+        Returns:
+            Probabilities, float64, shape :math:`(...)`; NaN where space is unknown.
+        """
+        log_odds = self.blocks.log_odds_at(self._voxels(points))
+        probability = torch.sigmoid(log_odds.to(torch.float64) * self.sensor_model.step)
+        return torch.where(log_odds == UNKNOWN, torch.nan, probability).reshape(points.shape[:-1])
+
+    def is_free(self, points: Tensor, radius: float = 0.0) -> Tensor:
+        """Check whether balls lie in free space. Unknown space is not free.
+
+        Args:
+            points: Centres of the balls, world frame, metres, shape :math:`(..., 3)`.
+            radius: Radius of the balls, metres.
+
+        Returns:
+            True if every voxel that a ball touches is free, bool, shape :math:`(...)`.
+        """
+        rows = points.reshape(-1, 3).to(torch.float64)
+        return are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Distance to the centre of the nearest occupied voxel.
+
+        Args:
+            points: Points, world frame, metres, shape :math:`(..., 3)`.
+
+        Returns:
+            Euclidean distances, metres, truncated to ``max_distance``, float64, shape :math:`(...)`; NaN where space is
+            unknown. Differentiable in ``points``.
+        """
+        offset, near = self._offsets(points)
+        distance = torch.where(near, torch.where(near[..., None], offset, 1.0).norm(dim=-1), self.config.max_distance)
+        return torch.where(self.states(points) == VoxelState.UNKNOWN, torch.nan, distance)
+
+    def gradient(self, points: Tensor) -> Tensor:
+        """Gradient of the distance: the unit vector away from the nearest occupied voxel.
+
+        Args:
+            points: Points, world frame, metres, shape :math:`(..., 3)`.
+
+        Returns:
+            Gradients, float64, shape :math:`(..., 3)`; 0 where the distance is truncated or 0, NaN where space is
+            unknown.
+        """
+        offset, near = self._offsets(points.detach())
+        gradient = torch.where(near[..., None], torch.nn.functional.normalize(offset, dim=-1), 0.0)
+        return torch.where(self.states(points)[..., None] == VoxelState.UNKNOWN, torch.nan, gradient)
+
+    def replace_blocks(self, blocks: VoxelBlocks) -> None:
+        """Replace the content of the map."""
+        self.blocks, self._nearest = blocks, None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the blocks of the map."""
+        return self.blocks.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the blocks of `state_dict`."""
+        self.blocks.load_state_dict(state)
+        self._nearest = None
+
+    def _offsets(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Vectors from the nearest occupied voxels to points, (..., 3), and which are not truncated, (...)."""
+        if self._nearest is None:
+            self._nearest = NearestVoxels(self.occupied_points, self.config.max_distance)
+        nearest, near = self._nearest(points.detach().reshape(-1, 3).to(torch.float64))
+        return points.to(torch.float64) - nearest.reshape(points.shape), near.reshape(points.shape[:-1])
+
+    def _voxels(self, points: Tensor) -> Tensor:
+        """Coordinates of the voxels around points (..., 3), int64, (N, 3)."""
+        return (points.detach().to(torch.float64).reshape(-1, 3) / self.config.voxel_size).floor().to(torch.int64)
+
+    def _centres(self, mask: Tensor) -> Tensor:
+        """Centres of the voxels in a mask (N, 4096), float64, (M, 3)."""
+        return (self.blocks.voxels_where(mask).to(torch.float64) + 0.5) * self.config.voxel_size
+
+    def _remove_farthest(self, camera: Tensor) -> None:
+        """Remove the blocks farthest from the camera, but none that reaches into the window around it."""
+        side = SIDE * self.config.voxel_size
+        gap = cube_gap(camera, self.blocks.coordinates, side)
+        kept = max(int(_KEPT_FRACTION * self.config.max_blocks), 1)
+        limit = max(float(gap.kthvalue(kept).values), self.config.window_radius)
+        before = len(self.blocks)
+        self.blocks.keep(gap <= limit)
+        _LOG.warning(
+            "occupancy map: %d of %d blocks were removed, all farther than %.1f m from the camera (occupancy.max_blocks"
+            " is %d)", before - len(self.blocks), before, limit, self.config.max_blocks
+        )  # fmt: skip

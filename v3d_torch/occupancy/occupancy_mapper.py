@@ -1,0 +1,173 @@
+"""Growth of the occupancy map frame by frame, and its correction when the poses of the frames are corrected."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+
+from v3d_torch.config import OccupancyConfig
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.occupancy.floor import Floor, find_floor
+from v3d_torch.occupancy.gravity import UpDirection, estimate_up
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
+from v3d_torch.occupancy.occupancy_map import OccupancyMap
+from v3d_torch.occupancy.range_view import RangeView
+from v3d_torch.occupancy.view_store import ViewStore, displacement
+from v3d_torch.tracking.pose_history import PoseHistory
+from v3d_torch.types import TrackingStatus
+
+_LOG = logging.getLogger(__name__)
+
+_CHECK_INTERVAL = 10
+"""Views between two checks whether poses were corrected: about a second."""
+
+_MAX_DISPLACEMENT = 0.5
+"""Largest displacement of a view with which the map stays as it is, voxels."""
+
+_REBUILD_VIEWS = 4
+"""Views that are added again with each new view while the map is rebuilt: a rebuild is spread over many frames."""
+
+
+class OccupancyMapper:
+    """Adds frames to an occupancy map.
+
+    The range views that were added are stored. When bundle adjustment or a loop has moved one of them by more than half
+    a voxel, the map is rebuilt from all of them beside the current map, a few views per frame, and then replaces it.
+    A map after a rebuild is the map that the corrected poses would have given from the start.
+
+    Args:
+        config: Occupancy map.
+        camera: Camera of all frames.
+
+    Attributes:
+        map: The occupancy map.
+        accelerometer: Unit vector against gravity in the frame of the first camera, float64, shape :math:`(3,)`, as an
+            accelerometer at rest measures it; None without accelerometer.
+    """
+
+    def __init__(self, config: OccupancyConfig, camera: PinholeCamera, accelerometer: Tensor | None = None) -> None:
+        self._config = config
+        self._camera = camera
+        self.accelerometer = accelerometer
+        self.map = OccupancyMap(config)
+        self._store = ViewStore(config.max_views)
+        self._count = 0
+        self._up_votes: Tensor | None = None
+        self._rebuilt: OccupancyMap | None = None
+        self._rebuilt_views = 0
+
+    @property
+    def is_rebuilding(self) -> bool:
+        """True while the map is rebuilt after a correction of the poses."""
+        return self._rebuilt is not None
+
+    @property
+    def up(self) -> UpDirection:
+        """Approximate up direction, which `find_floor` refines."""
+        return estimate_up(self.accelerometer, self._up_votes)
+
+    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up_votes: Tensor | None = None) -> None:
+        """Add a frame, if it is due and its pose is known.
+
+        Args:
+            depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+            static: Mask of static pixels, bool, shape :math:`(H, W)`.
+            poses: Poses of all frames up to this one.
+            up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None without.
+        """
+        self._up_votes = up_votes
+        frame = len(poses) - 1
+        if frame % self._config.interval != 0 or not _is_reliable(poses):
+            return
+        view = RangeView.sample(self._count, depth[0], static, self._config.stride)
+        self._store.append(view, frame, poses.T_cw)
+        self._count += 1
+        self._integrate(self.map, len(self._store) - 1)
+        if (kept := self._store.reduce()) is not None:
+            self._rebuilt_views = int(kept[: self._rebuilt_views].sum())
+        if self._rebuilt is None and self._count % _CHECK_INTERVAL == 0:
+            self._begin_rebuild(poses)
+        self._continue_rebuild(_REBUILD_VIEWS + 1)
+
+    def find_floor(self) -> Floor | None:
+        """Find the floor of the map; None if none is visible. It takes a tenth of a second."""
+        return find_floor(self.map, self.up)
+
+    def grid(self, heights: tuple[float, float] | None = None) -> OccupancyGrid | None:
+        """Return the 2D grid above the floor; None if no floor is visible.
+
+        Args:
+            heights: Lowest and highest obstacle, metres above the floor; None for those of the configuration.
+        """
+        floor = self.find_floor()
+        return None if floor is None else occupancy_grid(self.map, floor, heights)
+
+    def correct(self, poses: PoseHistory) -> None:
+        """Apply all corrections of the poses at once; call this after the last frame.
+
+        Args:
+            poses: Poses of all frames.
+        """
+        self._continue_rebuild(len(self._store))
+        self._begin_rebuild(poses)
+        self._continue_rebuild(len(self._store))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the map, the stored views, and the state of a rebuild."""
+        return {
+            "map": self.map.state_dict(),
+            "store": self._store.state_dict(),
+            "count": self._count,
+            "up_votes": self._up_votes,
+            "rebuilt": None if self._rebuilt is None else self._rebuilt.state_dict(),
+            "rebuilt_views": self._rebuilt_views,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self.map.load_state_dict(state["map"])
+        self._store.load_state_dict(state["store"])
+        self._count, self._rebuilt_views = state["count"], state["rebuilt_views"]
+        self._up_votes = state["up_votes"]
+        self._rebuilt = None
+        if state["rebuilt"] is not None:
+            self._rebuilt = OccupancyMap(self._config)
+            self._rebuilt.load_state_dict(state["rebuilt"])
+
+    def _begin_rebuild(self, poses: PoseHistory) -> None:
+        """Begin a rebuild if a view has moved too far."""
+        T_cw = poses.poses_of(self._store.frames)
+        moved = displacement(T_cw, self._store.T_cw)
+        if not (moved > _MAX_DISPLACEMENT * self._config.voxel_size).any():
+            return
+        _LOG.info("occupancy map: rebuilt from %d views, which moved by up to %.3f m", len(moved), float(moved.max()))
+        self._store.T_cw = T_cw
+        self._rebuilt, self._rebuilt_views = OccupancyMap(self._config), 0
+
+    def _continue_rebuild(self, count: int) -> None:
+        """Continue a rebuild with the next stored views; after the last one, replace the map."""
+        if self._rebuilt is None:
+            return
+        end = min(self._rebuilt_views + count, len(self._store))
+        for position in range(self._rebuilt_views, end):
+            self._integrate(self._rebuilt, position)
+        self._rebuilt_views = end
+        if end == len(self._store):
+            self.map.replace_blocks(self._rebuilt.blocks)
+            self._rebuilt, self._rebuilt_views = None, 0
+
+    def _integrate(self, occupancy: OccupancyMap, position: int) -> None:
+        """Add a stored view to a map."""
+        view = self._store.views[position]
+        rays = view.rays(self._camera, self._config.stride)
+        occupancy.integrate(view.depth, view.static, rays, invert(self._store.T_cw[position]))
+
+
+def _is_reliable(poses: PoseHistory) -> bool:
+    """Check whether the pose of the last frame is known relative to the whole map."""
+    is_found = poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
+    return is_found and not (poses.keyframe is not None and poses.keyframe.disconnected)

@@ -1,0 +1,49 @@
+r"""Derivatives of an optimum by the implicit function theorem.
+
+An optimum :math:`x` of a cost with parameters :math:`\theta` is a root of the gradient :math:`g(x, \theta)`. Therefore
+
+.. math::
+    \frac{dx}{d\theta} = - \left( \frac{\partial g}{\partial x} \right)^{-1} \frac{\partial g}{\partial \theta}
+
+whatever the steps that led to :math:`x`: they need not be stored, and the initial estimate has no influence (Gould et
+al., On Differentiating Parameterized Argmin and Argmax Problems, 2016). :math:`\partial g / \partial x` is the Hessian
+of the cost, not its Gauss-Newton approximation, so that the derivatives are exact also where residuals are not 0.
+
+A solver finds the optimum without gradients. One Newton step from there, with a constant Hessian, has the value 0 and
+the derivative above.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.func import jvp, vmap
+
+
+def needs_gradient(*tensors: Tensor) -> bool:
+    """Check whether the derivatives of a result with respect to any of its inputs can be asked for."""
+    if torch._C._are_functorch_transforms_active():
+        return True
+    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
+
+
+def zero_with_gradient(step: Tensor) -> Tensor:
+    """Zero with the derivatives of a Newton step. At the optimum the step itself is only the rest of the solver."""
+    return step - step.detach()
+
+
+def jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Jacobians of a function that maps each row of its argument to a row of the result, by forward differentiation.
+
+    Args:
+        function: Function from shape :math:`(..., n)` to shape :math:`(..., m)`.
+        x: Arguments, shape :math:`(..., n)`.
+
+    Returns:
+        Shape :math:`(..., m, n)`.
+    """
+    basis = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    columns = vmap(lambda direction: jvp(function, (x,), (direction.expand_as(x),))[1])(basis)
+    return columns.movedim(0, -1)

@@ -1,0 +1,154 @@
+"""Images of a finished run with their poses and masks, for exports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import torch
+from torch import Tensor
+
+from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
+from v3d_torch.datasets.open_source import is_live
+from v3d_torch.errors import InputError
+from v3d_torch.export.posed_image import PosedImage
+from v3d_torch.io.download import Progress
+from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.stored_run import StoredRun
+from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
+
+_MASKS = "map_masks"
+
+_LOCATED = (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
+"""Statuses of frames whose pose is known relative to the whole map."""
+
+_STAMP_TOLERANCE = 2e-6
+"""Tolerance of timestamps, seconds: files have six decimals."""
+
+
+def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) -> RGBDStream:
+    """Open the source of the images of a run again.
+
+    Args:
+        run: Results of the run.
+        request: Options of the run.
+        progress: Callback for the progress of slow sources; None for no reports.
+
+    Raises:
+        InputError: If the source is a live camera, or cannot be opened.
+        DownloadError: If the source is missing and cannot be downloaded.
+    """
+    if is_live(request.seq):
+        raise InputError(
+            f"{run.folder}: the images of a live camera are not stored; record them first with v3d-torch record, and"
+            " run the recording"
+        )
+    return open_source(
+        request.seq,
+        data_root=request.data_root,
+        camera=request.camera,
+        options=request.source_options,
+        progress=progress,
+        skip_broken=request.skip_broken,
+    )
+
+
+@dataclass(frozen=True)
+class LocatedFrames:
+    """Frames of a run with a known pose.
+
+    Attributes:
+        indices: Positions in the source, increasing.
+        poses: Poses of the frames.
+    """
+
+    indices: list[int]
+    poses: Trajectory
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def every(self, step: int) -> LocatedFrames:
+        """Return every n-th frame."""
+        poses = Trajectory(self.poses.stamps[::step], self.poses.T_wc[::step])
+        return LocatedFrames(self.indices[::step], poses)
+
+
+def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFrames:
+    """Select the frames whose pose is known relative to the whole map.
+
+    Args:
+        run: Results of the run.
+        only_keyframes: True for the keyframes among them.
+
+    Raises:
+        InputError: If there is no such frame.
+    """
+    table = [] if run.frames is None else run.frames.select(["frame", "keyframe"]).to_pylist()
+    located = {  # broken frames have no row and no pose
+        position: row["frame"]
+        for position, (status, row) in enumerate(zip(run.metrics.status, table, strict=False))
+        if status in _LOCATED and (row["keyframe"] or not only_keyframes)
+    }
+    if not located or run.trajectory is None:
+        raise InputError(f"{run.folder}: has no frame with a known pose; run another sequence")
+    rows = list(located)
+    return LocatedFrames([*located.values()], Trajectory(run.trajectory.stamps[rows], run.trajectory.T_wc[rows]))
+
+
+def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, masks: bool) -> Iterator[PosedImage]:
+    """Read frames with their poses and masks, one after the other.
+
+    Args:
+        run: Results of the run.
+        source: Images of the run.
+        frames: Frames to read.
+        masks: True to read the masks that the run saved; False for masks that exclude nothing.
+
+    Returns:
+        Iterator over the frames, which raises an InputError if an image cannot be read or is not of the run.
+
+    Raises:
+        InputError: If the run saved no masks, or the source has fewer frames than the run had.
+    """
+    folder = run.folder / _MASKS
+    if masks and not folder.is_dir():
+        raise InputError(
+            f"{run.folder}: has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"
+        )
+    if isinstance(source, RGBDSequence) and frames.indices[-1] >= len(source):
+        raise InputError(
+            f"{source.name}: has {len(source)} frames, fewer than the run; pass the sequence of this run with --seq"
+        )
+    return _read_images(run, source, frames, folder if masks else None)
+
+
+def _read_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, masks: Path | None) -> Iterator[PosedImage]:
+    images = _read_frames(source, frames.indices)
+    for frame, stamp, T_wc in zip(images, frames.poses.stamps.tolist(), frames.poses.T_wc, strict=False):
+        if abs(frame.stamp - stamp) > _STAMP_TOLERANCE:
+            raise InputError(
+                f"{source.name}: frame {frame.index} is at {frame.stamp:.6f} s, but at {stamp:.6f} s in {run.folder};"
+                " pass the sequence of this run with --seq"
+            )
+        size = frame.depth.shape[1:]
+        static = torch.ones(size, dtype=torch.bool) if masks is None else _read_mask(masks / f"{stamp:.6f}.png", size)
+        yield PosedImage(frame, T_wc, static)
+
+
+def _read_frames(source: RGBDStream, indices: Sequence[int]) -> Iterator[RGBDFrame]:
+    if isinstance(source, RGBDSequence):
+        return map(source.__getitem__, indices)
+    wanted = set(indices)
+    return (frame for frame in islice(source, indices[-1] + 1) if frame.index in wanted)
+
+
+def _read_mask(path: Path, size: torch.Size) -> Tensor:
+    """Read the static pixels of a frame, bool, shape (H, W)."""
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if mask is None or mask.shape != size:
+        raise InputError(f"{path}: is missing, damaged or of another size; run the sequence again with --save-masks")
+    return torch.from_numpy(mask == 0)

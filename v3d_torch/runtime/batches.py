@@ -1,0 +1,50 @@
+"""Padded batches: dimensions, padding, and conversion to the arrays of a kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from v3d_torch.kernels.compiler import to_array
+
+
+def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
+    """Convert values to float64, and replace those that are padding, so that they spread neither NaN nor gradients.
+
+    Args:
+        values: Any shape.
+        valid: Mask of the values that are not padding, a shape that broadcasts; None = all.
+        filler: Number to replace padding.
+    """
+    if values.dtype != torch.float64:  # converting nothing takes time, too
+        values = values.to(torch.float64)
+    return values if valid is None else torch.where(valid, values, filler)
+
+
+def common_batch(*batches: torch.Size) -> torch.Size:
+    """Return the dimensions to which those of several batches broadcast; faster if they are equal."""
+    first, *others = batches
+    return first if all(other == first for other in others) else torch.broadcast_shapes(*batches)
+
+
+def to_rows(tensor: Tensor, batch: torch.Size) -> NDArray[Any]:
+    """Return a batch of tensors as an array with one dimension for all dimensions of the batch."""
+    return to_array(tensor.reshape(batch.numel(), *tensor.shape[len(batch) :]) if batch else tensor[None])
+
+
+def from_rows(rows: Sequence[Sequence[Any]], batch: torch.Size) -> list[Tensor]:
+    """Return the results of a kernel as tensors with the dimensions of a batch, the inverse of `to_rows`.
+
+    Args:
+        rows: Results for each problem of the batch, at least one: arrays and numbers.
+        batch: Dimensions of the batch.
+    """
+    if not batch:  # a single problem: nothing to copy
+        return [torch.from_numpy(np.asarray(each)) for each in rows[0]]
+    columns = (torch.from_numpy(np.stack(column)) for column in zip(*rows, strict=True))
+    return [column.reshape((*batch, *column.shape[1:])) for column in columns]

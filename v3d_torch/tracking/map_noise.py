@@ -1,0 +1,72 @@
+"""Noise of the map: errors of the poses of keyframes, which their landmarks pass on to frames and later keyframes.
+
+A landmark has the pose error of the keyframe that created it. A frame that is tracked with landmarks of several
+keyframes has the average of their errors, and adds its own when it becomes a keyframe. With the noise of one frame as
+the unit, numbers describe all errors: the covariance of the errors of any two keyframes. The error that a frame takes
+over from the map grows as the camera explores, and shrinks when it observes old landmarks again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class MapNoise:
+    """Covariance of the pose errors of the active keyframes, relative to the variance of a frame."""
+
+    def __init__(self) -> None:
+        self._rows = torch.zeros(0, dtype=torch.int64)  # row of the covariance, for each keyframe
+        self._covariance = torch.zeros(0, 0, dtype=torch.float64)
+
+    def __call__(self, owners: Tensor) -> float:
+        """Variance of the error that a frame takes over from the map, relative to the variance of a frame.
+
+        Args:
+            owners: Indices of the keyframes that created the landmarks of the frame, int64, shape :math:`(L,)`.
+        """
+        weights = self._weights(owners)
+        return float(weights @ self._covariance @ weights)
+
+    def add_keyframe(self, owners: Tensor, references: Tensor, variance: float = 1.0) -> None:
+        """Add the newest keyframe. Keyframes that were culled since the last call take the errors of their references.
+
+        Args:
+            owners: Indices of the keyframes that created the landmarks with which it was tracked, int64, shape
+                :math:`(L,)`; empty for the first keyframe, and for one of unknown pose.
+            references: Reference keyframe of each keyframe of the map, see `Keyframe`, int64, shape :math:`(K,)`.
+            variance: Variance of its own error, relative to the variance of a frame.
+        """
+        self._add_unrelated(len(references) - 1)
+        weights = self._weights(owners)
+        shared = self._covariance @ weights
+        own = weights @ shared + variance
+        column = torch.cat([shared, own[None]])
+        grown = torch.cat([torch.cat([self._covariance, shared[None]]), column[:, None]], dim=1)
+        rows = torch.cat([self._rows, torch.tensor([len(shared)])])
+        active, self._rows = references.unique(return_inverse=True)
+        kept = rows[active]
+        self._covariance = grown[kept][:, kept]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the covariance and the rows of the keyframes."""
+        return {"rows": self._rows, "covariance": self._covariance}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self._rows, self._covariance = state["rows"], state["covariance"]
+
+    def _add_unrelated(self, count: int) -> None:
+        """Add keyframes with independent errors until there are ``count``: those of a loaded map."""
+        missing, size = max(count - len(self._rows), 0), len(self._covariance)
+        self._rows = torch.cat([self._rows, torch.arange(size, size + missing)])
+        self._covariance = torch.block_diag(self._covariance, torch.eye(missing, dtype=torch.float64))
+
+    def _weights(self, owners: Tensor) -> Tensor:
+        """Fraction of the landmarks that each row created, float64, shape (A,); 0 without landmarks."""
+        self._add_unrelated(int(owners.max()) + 1 if len(owners) else 0)
+        counts = torch.bincount(self._rows[owners], minlength=len(self._covariance)).to(torch.float64)
+        return counts / max(len(owners), 1)

@@ -1,0 +1,111 @@
+"""Kalman filter of pose and twist of a camera, with constant velocity on SE(3) and white acceleration noise.
+
+Errors are right perturbations in the camera frame, first that of the pose, then that of the twist (Sola, Deray and
+Atchuthan, A micro Lie theory for state estimation in robotics, 2018, Sec. V).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
+
+_SPEED_SIGMA, _RATE_SIGMA = 1.0, 2.0
+"""Standard deviation of an unknown velocity, m/s and rad/s, and of the change of the velocity in one second: a hand
+stops or turns around within a second. A robot is slower, so that its states are better than their covariances say."""
+
+_TWIST_COVARIANCE = torch.tensor([_SPEED_SIGMA] * 3 + [_RATE_SIGMA] * 3, dtype=torch.float64).square().diag()
+
+
+class PoseKalmanFilter:
+    """Pose and twist of the camera. `start` gives the first pose.
+
+    Attributes:
+        stamp: Time of the state, seconds.
+        T_wc: Filtered camera-to-world pose, float64, shape :math:`(4, 4)`.
+        twist: Filtered twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
+        covariance: Covariance of the errors of pose and twist, float64, shape :math:`(12, 12)`.
+        cross_covariance: Covariance of the error of the last measured pose (rows) and that of the twist (columns),
+            float64, shape :math:`(6, 6)`.
+    """
+
+    def __init__(self) -> None:
+        self.start(0.0, torch.eye(4, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64))
+
+    def start(self, stamp: float, T_wc: Tensor, covariance: Tensor, twist: Tensor | None = None) -> None:
+        """Forget the state and start with a measured pose.
+
+        Args:
+            stamp: Time, seconds.
+            T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+            covariance: Covariance of its right perturbation, float64, shape :math:`(6, 6)`.
+            twist: Expected twist, m/s and rad/s, float64, shape :math:`(6,)`; None for zero.
+        """
+        self.stamp = stamp
+        self.T_wc = T_wc
+        self.twist = torch.zeros(6, dtype=torch.float64) if twist is None else twist
+        self.covariance = torch.block_diag(covariance, _TWIST_COVARIANCE)
+        self.cross_covariance = torch.zeros(6, 6, dtype=torch.float64)
+
+    def predict(self, stamp: float) -> None:
+        """Move the state to a later time."""
+        elapsed = stamp - self.stamp
+        self.covariance = predict_covariance(self.covariance, self.twist, elapsed)
+        self.cross_covariance = self.covariance[:6, 6:]
+        self.stamp, self.T_wc = stamp, orthonormalise(self.T_wc @ se3_exp(self.twist * elapsed))
+
+    def update(self, T_wc: Tensor, covariance: Tensor) -> None:
+        """Correct the state with a measured pose at its time.
+
+        Args:
+            T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+            covariance: Covariance of its right perturbation, float64, shape :math:`(6, 6)`.
+        """
+        P = self.covariance
+        gain = torch.linalg.solve(P[:6, :6] + covariance, P[:6]).T
+        correction = gain @ se3_log(invert(self.T_wc) @ T_wc)
+        self.T_wc = orthonormalise(self.T_wc @ se3_exp(correction[:6]))
+        self.twist = self.twist + correction[6:]
+        kept = torch.eye(12, dtype=torch.float64)  # Joseph's form stays symmetric and positive definite
+        kept[:, :6] -= gain
+        self.covariance = kept @ P @ kept.T + gain @ covariance @ gain.T
+        self.cross_covariance = covariance @ gain[6:].T
+
+    def stop(self) -> None:
+        """Set the twist to zero; its former value becomes uncertainty."""
+        self.covariance = self.covariance + torch.block_diag(torch.zeros(6, 6), self.twist.outer(self.twist))
+        self.twist = torch.zeros_like(self.twist)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all attributes."""
+        return dict(vars(self))
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        vars(self).update(state)
+
+
+def join_covariances(covariance: Tensor, cross_covariance: Tensor, twist_covariance: Tensor) -> Tensor:
+    """Covariance of the errors of pose and twist, shape :math:`(12, 12)`, from its blocks of shape :math:`(6, 6)`."""
+    return torch.cat(
+        [torch.cat([covariance, cross_covariance], dim=1), torch.cat([cross_covariance.T, twist_covariance], dim=1)]
+    )
+
+
+def predict_covariance(covariance: Tensor, twist: Tensor, elapsed: float) -> Tensor:
+    """Covariance of the errors of pose and twist after some time with unknown acceleration.
+
+    Args:
+        covariance: Covariance before, float64, shape :math:`(12, 12)`.
+        twist: Twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
+        elapsed: Time, seconds.
+    """
+    F = torch.eye(12, dtype=torch.float64)
+    F[:6, :6] = adjoint(se3_exp(-elapsed * twist))
+    F[:6, 6:].diagonal().fill_(elapsed)
+    noise = torch.tensor([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]], dtype=torch.float64)
+    return F @ covariance @ F.T + torch.kron(noise, _TWIST_COVARIANCE)

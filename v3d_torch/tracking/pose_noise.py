@@ -1,0 +1,93 @@
+"""Noise of the poses of single frames, measured from their sequence.
+
+The information matrix of a pose assumes that the errors of its features are independent. They are not: motion blur, the
+rolling shutter and errors of depth move many features together, and no residual shows it, because the pose follows
+them. But the sequence of poses shows it, because a camera moves smoothly and errors do not. The difference between a
+pose and the cubic interpolation of the two poses before and the two after it is noise, or motion that changes within a
+few frames, which counts as noise, too (difference-based variance estimation; Hall, Kay and Titterington, Biometrika
+1990).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from v3d_torch.geometry.se3 import invert, se3_log
+
+_WINDOW = 5
+"""Number of consecutive poses, of which the middle one is compared with the interpolation of the others."""
+
+_MAX_DURATION = 0.3
+"""Longest duration of a window, seconds: within it, a cubic polynomial describes the motion of a hand."""
+
+_PRIOR_RATIO = 9.0
+"""Ratio of variances that is assumed before a run shows its own: three times the nominal standard deviation."""
+
+_PRIOR_FRAMES = 5.0
+"""Weight of the prior ratio, in frames."""
+
+_MEMORY = 100.0
+"""Time constant of the average, in frames: three seconds, over which blur and the number of features change."""
+
+_MIN_RATIO = 1.0
+"""Smallest ratio. The errors of a camera at rest are constant, so its poses would seem to have no noise."""
+
+
+class PoseNoise:
+    """Ratio between the covariance of poses and the nominal one, as a matrix in coordinates whitened by the latter."""
+
+    def __init__(self) -> None:
+        self._window: list[tuple[float, Tensor, Tensor]] = []  # stamp, T_wc, nominal covariance
+        self._sum = _PRIOR_FRAMES * _PRIOR_RATIO * torch.eye(6, dtype=torch.float64)
+        self._weight = _PRIOR_FRAMES
+
+    def update(self, stamp: float, T_wc: Tensor, covariance: Tensor) -> None:
+        """Append the pose of the next frame.
+
+        Args:
+            stamp: Timestamp, seconds.
+            T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+            covariance: Nominal covariance of its right perturbation, float64, shape :math:`(6, 6)`.
+        """
+        self._window = [*self._window[1 - _WINDOW :], (stamp, T_wc, covariance)]
+        if len(self._window) < _WINDOW or stamp - self._window[0][0] > _MAX_DURATION:
+            return
+        stamps, poses, covariances = zip(*self._window, strict=True)
+        weights = _interpolation_weights(stamps)
+        residual = weights @ se3_log(invert(poses[_WINDOW // 2]) @ torch.stack(poses))
+        nominal = (weights.square()[:, None, None] * torch.stack(covariances)).sum(dim=0)
+        whitened = torch.linalg.solve_triangular(torch.linalg.cholesky(nominal), residual[:, None], upper=False)
+        self._sum = self._sum * (1 - 1 / _MEMORY) + whitened @ whitened.T
+        self._weight = self._weight * (1 - 1 / _MEMORY) + 1
+
+    def interrupt(self) -> None:
+        """Start a new sequence of poses, because a frame has none, or because the pose jumped."""
+        self._window = []
+
+    def scale(self, covariance: Tensor) -> Tensor:
+        """Covariance of a pose, given its nominal covariance, both float64 of shape :math:`(6, 6)`."""
+        ratios, axes = torch.linalg.eigh(self._sum / self._weight)
+        root = torch.linalg.cholesky(covariance) @ axes * ratios.clamp(min=_MIN_RATIO).sqrt()
+        return root @ root.T
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the last poses and the average."""
+        return {"window": self._window, "sum": self._sum, "weight": self._weight}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self._window, self._sum, self._weight = state["window"], state["sum"], state["weight"]
+
+
+def _interpolation_weights(stamps: Sequence[float]) -> Tensor:
+    """Weights of the poses in the residual: Lagrange's for the interpolation at the middle, and -1 for the middle."""
+    t = torch.tensor(stamps, dtype=torch.float64)
+    middle = len(stamps) // 2
+    others = torch.cat([t[:middle], t[middle + 1 :]])
+    ratios = (t[middle] - others)[None] / (others[:, None] - others[None]).fill_diagonal_(1.0)
+    weights = ratios.fill_diagonal_(1.0).prod(dim=1)
+    return torch.cat([weights[:middle], -torch.ones(1, dtype=torch.float64), weights[middle:]])

@@ -1,0 +1,92 @@
+"""States of the last seconds, interpolated between frames and predicted after the last one."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from torch import Tensor
+
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
+from v3d_torch.tracking.camera_state import CameraState
+
+_DURATION = 10.0
+"""Time for which states are kept, seconds, as in the transform buffer of ROS."""
+
+
+class StateHistory:
+    """States of the camera at the last frames. One thread appends them, others can read them at the same time."""
+
+    def __init__(self) -> None:
+        self._states: tuple[CameraState, ...] = ()  # replaced, never changed
+
+    def append(self, state: CameraState) -> None:
+        """Append the state at a frame, and forget those of more than 10 s before."""
+        first = bisect_right(self._states, state.stamp - _DURATION, key=_stamp)
+        self._states = (*self._states[first:], state)
+
+    def at(self, stamp: float) -> CameraState:
+        """Return the state at a time.
+
+        Between two frames the pose is interpolated along the geodesic; the covariance is an upper bound, which holds
+        for any correlation of their errors. After the last frame see `CameraState.predict`.
+
+        Args:
+            stamp: Time, seconds.
+
+        Raises:
+            InputError: If the time is before the first state that is kept, or if there is none yet.
+        """
+        states = self._states
+        if not states:
+            raise InputError(f"there is no state at {stamp:.6f} s: no frame was tracked yet; ask after the first frame")
+        if stamp < states[0].stamp:
+            raise InputError(
+                f"there is no state at {stamp:.6f} s: those of the last {_DURATION:g} s are kept, the first is at"
+                f" {states[0].stamp:.6f} s; ask for a later time"
+            )
+        index = bisect_right(states, stamp, key=_stamp) - 1
+        if index == len(states) - 1:
+            return states[-1].predict(stamp)
+        return _interpolate(states[index], states[index + 1], stamp)
+
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
+        """Transform the states into the corrected world.
+
+        Args:
+            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+        """
+        self._states = tuple(replace(state, T_wc=orthonormalise(T_new_old @ state.T_wc)) for state in self._states)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states."""
+        return {"states": list(self._states)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the states of `state_dict`."""
+        self._states = tuple(state["states"])
+
+
+def _interpolate(a: CameraState, b: CameraState, stamp: float) -> CameraState:
+    """Interpolate two states at a time between them."""
+    fraction = (stamp - a.stamp) / (b.stamp - a.stamp)
+    xi = se3_log(invert(a.T_wc) @ b.T_wc)
+    Ad_a, Ad_b = adjoint(se3_exp(-fraction * xi)), adjoint(se3_exp((1 - fraction) * xi))
+    blended = {
+        name: (1 - fraction) * Ad_a @ getattr(a, name) @ Ad_a.T + fraction * Ad_b @ getattr(b, name) @ Ad_b.T
+        for name in ("covariance", "twist_covariance", "cross_covariance")
+    }
+    return CameraState(
+        stamp=stamp,
+        T_wc=orthonormalise(a.T_wc @ se3_exp(fraction * xi)),
+        status=a.status if fraction < 0.5 else b.status,
+        twist=(1 - fraction) * a.twist + fraction * b.twist,
+        **blended,
+    )
+
+
+def _stamp(state: CameraState) -> float:
+    return state.stamp
