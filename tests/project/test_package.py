@@ -29,17 +29,7 @@ LAYERS = (
         "datasets",
         "segmentation",
     ),
-    *(
-        "objects",
-        "odometry",
-        "mapping",
-        "tracking",
-        "backend",
-        "reconstruction",
-        "occupancy",
-        "evaluation",
-        "calibration",
-    ),
+    *("objects", "odometry", "mapping", "tracking", "backend", "reconstruction", "occupancy", "evaluation"),
     *(
         "calibration",
         "frame_result",
