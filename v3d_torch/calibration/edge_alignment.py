@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -181,7 +182,10 @@ class EdgeAlignment:
 
     def _scores(self, values: Tensor) -> Tensor:
         """Normalised gradient at each boundary after it is moved, (E,)."""
-        moved = self._at_time_of_colour(float(values[2])) + values[:2] / self._stride
+        return self._gradients_at(self._at_time_of_colour(float(values[2])) + values[:2] / self._stride)
+
+    def _gradients_at(self, moved: Tensor) -> Tensor:
+        """Normalised gradient at each boundary, whose pixel is given, (E,)."""
         height, width = self._gradients.shape[2:]
         limit = torch.tensor([width - 1, height - 1], dtype=torch.float64)
         moved = moved.clamp(torch.zeros_like(limit), limit)
@@ -208,11 +212,14 @@ class EdgeAlignment:
     def _derivatives(self, values: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         """First (K, C) and second derivatives (K, C, C) of the score of each view, in units of the steps."""
 
+        pixels_at = cache(self._at_time_of_colour)  # most of the moves below keep the delay
+
         def of_views(*moves: tuple[int, int]) -> Tensor:
             moved = values.clone()
             for i, sign in moves:
                 moved[index[i]] += sign * self._steps[index[i]]
-            return torch.bincount(self._view, weights=self._scores(moved), minlength=len(self))
+            scores = self._gradients_at(pixels_at(float(moved[2])) + moved[:2] / self._stride)
+            return torch.bincount(self._view, weights=scores, minlength=len(self))
 
         count, centre = len(index), of_views()
         gradient = torch.zeros(len(self), count, dtype=torch.float64)
@@ -221,8 +228,8 @@ class EdgeAlignment:
             ahead, behind = of_views((i, 1)), of_views((i, -1))
             gradient[:, i], hessian[:, i, i] = (ahead - behind) / 2, ahead - 2 * centre + behind
             for j in range(i):
-                same, opposite = (of_views((i, 1), (j, k)) + of_views((i, -1), (j, -k)) for k in (1, -1))
-                hessian[:, i, j] = hessian[:, j, i] = (same - opposite) / 4
+                both = of_views((i, 1), (j, 1)) - 2 * centre + of_views((i, -1), (j, -1))
+                hessian[:, i, j] = hessian[:, j, i] = (both - hessian[:, i, i] - hessian[:, j, j]) / 2
         return gradient, hessian
 
 
