@@ -211,7 +211,6 @@ class EdgeAlignment:
 
     def _derivatives(self, values: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         """First (K, C) and second derivatives (K, C, C) of the score of each view, in units of the steps."""
-
         pixels_at = cache(self._at_time_of_colour)  # most of the moves below keep the delay
 
         def of_views(*moves: tuple[int, int]) -> Tensor:
