@@ -19,7 +19,7 @@ from v3d_torch.datasets.demo.sequence import write_sequence
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "walk"
-    write_sequence(folder, range(0, 40, 4))
+    write_sequence(folder, range(0, 60, 5))
     return folder
 
 
