@@ -223,8 +223,7 @@ class Pipeline:
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
-        with self.slam.timer("plausibility"):
-            self._warn(check_colour_order(self.views, self.slam.segment))
+        self._warn(check_colour_order(self.views, self.slam.segment))
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
         point_map = fuse_points(self.views, self.slam.config)
@@ -295,16 +294,15 @@ class Pipeline:
             static = result.static_without_people
             self.views.add(keyframes[-1], frame.image, frame.depth, static, frame.depth_delay)
             if not self.record.was_checked and self._own_view_count() >= _CHECKED_KEYFRAMES:
-                self._check_plausibility()
+                with self.slam.timer("plausibility"):
+                    self._check_plausibility()
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
 
     def _check_plausibility(self) -> None:
         """Check whether camera and depth agree with the map so far, and record what does not."""
         slam = self.slam
-        with slam.timer("plausibility"):
-            warnings = check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config)
+        self._warn(check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config))
         self.record.was_checked = True
-        self._warn(warnings)
 
     def _own_view_count(self) -> int:
         """Number of views of this run, without those of a known map."""
