@@ -151,12 +151,17 @@ def pnp(batch: int) -> tuple[Competitors, Error]:
     return competitors, pose_error(T_cw)
 
 
+def refinement_problem(problems: Problems) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """True poses, points and their pixels with 1 pixel of noise, and poses near the true ones."""
+    T_cw, in_camera = se3_exp(problems.normal(6)), problems.points(100)
+    uv = CAMERA.project(in_camera) + problems.normal(100, 2)
+    return T_cw, transform(invert(T_cw), in_camera), uv, se3_exp(0.02 * problems.normal(6)) @ T_cw
+
+
 def refinement(batch: int) -> tuple[Competitors, Error]:
     """A pose from 100 points, least squares of pixels. Error: pose, thousandths."""
     problems = Problems(batch)
-    T_cw, in_camera = se3_exp(problems.normal(6)), problems.points(100)
-    points, uv = transform(invert(T_cw), in_camera), CAMERA.project(in_camera) + problems.normal(100, 2)
-    start = se3_exp(0.02 * problems.normal(6)) @ T_cw
+    T_cw, points, uv, start = refinement_problem(problems)
     unit = torch.ones(batch, 100, dtype=torch.float64)
     by_theseus = peers.theseus_poses(start, points, uv, K, unit)
     competitors: Competitors = {
@@ -171,9 +176,7 @@ def refinement(batch: int) -> tuple[Competitors, Error]:
 def refinement_gradient(batch: int) -> tuple[Competitors, Error]:
     """The same, and the gradient by the weights. Error: relative difference of the gradient to ours, %."""
     problems = Problems(batch)
-    T_cw, in_camera = se3_exp(problems.normal(6)), problems.points(100)
-    points, uv = transform(invert(T_cw), in_camera), CAMERA.project(in_camera) + problems.normal(100, 2)
-    start = se3_exp(0.02 * problems.normal(6)) @ T_cw
+    T_cw, points, uv, start = refinement_problem(problems)
     weights = (0.5 + problems.uniform(100)).requires_grad_()
     by_theseus = peers.theseus_poses(start, points, uv, K, weights)
     settings = {"pixel_sigma": 100.0, "rounds": 1, "iterations": 20, "tolerance": 1e-12}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.stored import ReadGroundTruth, StoredSequence, max_broken_frames
+from v3d_torch.datasets.stored import StoredSequence, max_broken_frames
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
 
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
@@ -31,29 +29,14 @@ class ImageSequence(StoredSequence):
     The constructor of a subclass ends with `_settle_depth_scale`.
 
     Args:
-        name: Name of the sequence, used in tables.
-        stamps: Timestamps of the colour images, seconds, strictly increasing.
-        camera: Camera of all frames.
-        groundtruth: Function that reads the measured poses of the camera.
-        delays: Depth delay of each frame (depth stamp minus colour stamp), seconds; None if it is always 0.
-
-    Attributes:
-        depth_scale_note: One sentence that says how the depth scale was estimated; None if it is stated.
+        name, stamps, camera, groundtruth, delays: As for `StoredSequence`.
     """
+
+    depth_scale_note: str | None = None
+    """One sentence that says how the depth scale was estimated; None if it is stated."""
 
     registration_fix = "export depth that is registered to the colour image"
     """What to do if colour and depth have different sizes, for messages."""
-
-    def __init__(
-        self,
-        name: str,
-        stamps: Sequence[float],
-        camera: PinholeCamera,
-        groundtruth: ReadGroundTruth | None = None,
-        delays: Sequence[float] | None = None,
-    ) -> None:
-        super().__init__(name, stamps, camera, groundtruth, delays)
-        self.depth_scale_note: str | None = None
 
     def check(self, source: object, *, skip_broken: bool = False) -> None:
         """Check that all files exist, and decode the first frame, so that errors are reported before a long run.

@@ -105,7 +105,7 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
-        detected_masks = _UnionOfMasks(detected)
+        detected_masks = _unions_of_masks(detected, {track.label for track in tracks if track.missed and track.visible})
         objects = [
             TrackedObject(
                 id=track.id,
@@ -203,30 +203,17 @@ class MotionClassifier:
         return deforming or motion_state is MotionState.STATIC
 
 
-class _UnionOfMasks:
-    """Union of the masks of the tracks of each class, made when it is first asked for.
-
-    Args:
-        tracks: Tracks.
-    """
-
-    def __init__(self, tracks: Sequence[Track]) -> None:
-        self._tracks = tracks
-        self._unions: dict[int, NDArray[np.bool_]] = {}
-
-    def __getitem__(self, label: int) -> NDArray[np.bool_] | None:
-        """Return the union of a class, shape (H, W); None if there is no track of it."""
-        masks = [track.mask.numpy() for track in self._tracks if track.label == label]
-        if label not in self._unions and masks:
-            self._unions[label] = np.logical_or.reduce(masks)
-        return self._unions.get(label)
+def _unions_of_masks(tracks: Sequence[Track], labels: set[int]) -> dict[int, NDArray[np.bool_]]:
+    """Return the union of the masks of the tracks of some classes, shape (H, W), by class; without empty classes."""
+    masks = {label: [track.mask.numpy() for track in tracks if track.label == label] for label in labels}
+    return {label: np.logical_or.reduce(of_label) for label, of_label in masks.items() if of_label}
 
 
-def _visible_mask(track: Track, detected: _UnionOfMasks) -> Tensor:
+def _visible_mask(track: Track, detected: Mapping[int, NDArray[np.bool_]]) -> Tensor:
     """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
     if not track.missed:
         return track.mask
     if not track.visible:
         return torch.zeros_like(track.mask)
-    others = detected[track.label]
+    others = detected.get(track.label)
     return track.mask if others is None else torch.from_numpy(track.mask.numpy() & ~others)
