@@ -24,9 +24,10 @@ _DEPTH_TOLERANCE = 0.2
 
 
 def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, spacing: float) -> Instances:
-    """Redraw the objects that were detected in the previous frame.
+    """Redraw the objects that were detected in the previous frame and may move.
 
-    Unlabelled objects are left out, because they are found anew in the depth of each frame.
+    Unlabelled objects are left out, because they are found anew in the depth of each frame; furniture, because its
+    pixels are used for tracking.
 
     Args:
         tracks: Tracks after the previous frame.
@@ -37,7 +38,11 @@ def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: Pinhol
     Returns:
         Instances with the classes of the tracks, score 0 and empty boxes.
     """
-    detected = [track for track in tracks if not track.missed and track.newest.is_located and track.label != UNLABELLED]
+    detected = [
+        track
+        for track in tracks
+        if track.may_move and not track.missed and track.newest.is_located and track.label != UNLABELLED
+    ]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
     projected = silhouettes([track.predict_cloud(view.stamp) @ R.T + t for track in detected], camera, spacing)
     masks = [each.mask(view.depth, 0, _DEPTH_TOLERANCE, include_missing=True) for each in projected]

@@ -185,11 +185,11 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     return evidence.masked_fill(~possible, -torch.inf)
 
 
-def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    """Add up the evidence for each pair of a lost track and an instance; a lost track has no predicted mask.
+def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Add up the evidence for each pair of a track without a predicted mask and an instance.
 
     Args:
-        tracks: T lost tracks.
+        tracks: T tracks.
         detected: N instances.
         config: Gates.
 
