@@ -118,7 +118,7 @@ def test_images_of_other_libraries_become_the_same_frame(demo: RGBDSequence) -> 
         ({"camera": np.eye(3)}, "the camera is a ndarray; give a PinholeCamera"),
         (
             {"camera": PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240)},
-            "has 640x480 pixels, the camera 320x240; give the camera that took it",
+            "has 640x480 pixels, but the camera 320x240; give the camera that took it",
         ),
     ],
 )
