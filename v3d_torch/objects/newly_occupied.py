@@ -42,7 +42,7 @@ class NewlyOccupied:
         if not masks:
             return appeared.new_zeros(0, len(appeared))
         inside = np.stack([mask.numpy()[::step, ::step] for mask in masks]).reshape(len(masks), -1)
-        # float32 counts pixels exactly and is faster.
+        # float32 is exact for numbers of pixels, and faster.
         indicators = torch.cat([appeared == 1, ~appeared.isnan()]).to(torch.float32)
         counts = torch.from_numpy(inside.astype(np.float32)) @ indicators.T
         new, known = counts.to(appeared.dtype).chunk(2, dim=1)
