@@ -17,6 +17,7 @@ from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -136,6 +137,18 @@ class V3DSLAM(ReplaceableStages):
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
+
+    @property
+    def T_lw(self) -> Tensor | None:
+        """Transform from the world to the level frame, see `level_frame`, float64, shape :math:`(4, 4)`.
+
+        Up is against the measured gravity; without a measurement it is the normal of the floor in the occupancy map,
+        and follows it. None while neither is known.
+        """
+        if self.gravity is not None:
+            return level_frame(-self.gravity)
+        floor = None if self.occupancy is None else self.occupancy.floor
+        return None if floor is None else level_frame(floor.up)
 
     def __call__(self, frame: RGBDFrame) -> FrameResult:
         """Process the next frame: preprocess and track.

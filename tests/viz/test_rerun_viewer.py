@@ -30,9 +30,10 @@ from v3d_torch.cli import run
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.frame_objects import MotionState
-from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, level_frame
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.pipeline import NULL_VIEWER, Pipeline
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Trajectory
@@ -237,7 +238,7 @@ def test_free_cells_are_logged_on_the_floor(tmp_path: Path) -> None:
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     states = torch.tensor([[0, 1, -1], [0, 0, 1]], dtype=torch.int8)
     stream = open_stream(live=False, file=tmp_path / "floor.rrd")
-    log_floor(stream, OccupancyGrid(states, 0.1, (1.0, -2.0), level_frame(up, -1.5)))
+    log_floor(stream, OccupancyGrid(states, 0.1, (1.0, -2.0), level_frame(up), -1.5))
     stream.disconnect()
     (row,) = Recording(tmp_path / "floor.rrd").all("/world/occupancy/floor")
     # x of the grid is z of the world, y is -x; the floor is 1.5 m below the camera.
