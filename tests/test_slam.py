@@ -14,7 +14,9 @@ from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_seque
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.occupancy.floor import Floor
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.types import TrackingStatus
 
@@ -118,7 +120,7 @@ def test_images_of_other_libraries_become_the_same_frame(demo: RGBDSequence) -> 
         ({"camera": np.eye(3)}, "the camera is a ndarray; give a PinholeCamera"),
         (
             {"camera": PinholeCamera(260.0, 260.0, 159.5, 119.5, 320, 240)},
-            "has 640x480 pixels, the camera 320x240; give the camera that took it",
+            "has 640x480 pixels, but the camera 320x240; give the camera that took it",
         ),
     ],
 )
@@ -187,10 +189,24 @@ def test_gravity_of_the_first_frame_is_that_of_the_world(demo: RGBDSequence) -> 
         assert torch.equal(slam(frame).T_wc, without(demo[index]).T_wc)
     assert slam.gravity is not None and without.gravity is None
     torch.testing.assert_close(slam.gravity, down)
+    assert slam.T_lw is not None and without.T_lw is None
+    torch.testing.assert_close(slam.T_lw[:3, :3] @ down, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64))
     assert slam.occupancy is None or torch.equal(slam.occupancy.accelerometer, -slam.gravity)
     restored = V3DSLAM(demo.camera, config=NO_NETWORK)
     restored.load_state_dict(slam.state_dict())
     assert restored.gravity is not None and torch.equal(restored.gravity, down)
+
+
+def test_level_frame_is_that_of_the_floor_without_gravity(demo: RGBDSequence) -> None:
+    config = load_config(None, ("segmentation.source=none", "occupancy.enabled=true"))
+    slam = V3DSLAM(demo.camera, config=config)
+    assert slam.occupancy is not None and slam.T_lw is None
+    up = torch.tensor([0.0, -0.8, -0.6], dtype=torch.float64)
+    slam.occupancy.floor = Floor(up, -1.2, 3.0)
+    assert slam.T_lw is not None and torch.equal(slam.T_lw, level_frame(up))
+    restored = V3DSLAM(demo.camera, config=config)
+    restored.load_state_dict(slam.state_dict())
+    assert restored.T_lw is not None and torch.equal(restored.T_lw, slam.T_lw)
 
 
 def test_gravity_from_arrays_is_normalised_and_checked(demo: RGBDSequence) -> None:

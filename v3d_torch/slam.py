@@ -17,6 +17,7 @@ from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -63,23 +64,23 @@ class V3DSLAM(ReplaceableStages):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature, whose results are then checked. `compensate`, `register`, `track_map` and `loop_closer` are also used
-    inside other stages, which keep their own references. `preprocess` uses the stages that need the frame alone, and
-    can run ahead of `track`.
+    signature; the results of the replacement are checked. `compensate`, `register`, `track_map` and `loop_closer` are
+    also used inside other stages, which keep their own references to the original. `preprocess` runs the stages that
+    depend only on the frame, and can run ahead of `track`.
 
     Args:
         camera: Camera of all frames.
-        segment: Segmenter; None for that of the configuration.
+        segment: Segmenter; None to create the one named in the configuration.
         config: Configuration of all stages; None for the default.
         known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map.
 
     Attributes:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
-        states: States of the camera in the last seconds.
-        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None if no frame
-            has a measured one.
-        occupancy: Free and occupied space, in ``occupancy.map``; None if it is not configured.
+        states: States of the camera in the last 10 seconds.
+        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None until a frame
+            with measured gravity is tracked.
+        occupancy: Occupancy mapping, with the map in ``occupancy.map``; None unless ``occupancy.enabled`` is set.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -137,19 +138,31 @@ class V3DSLAM(ReplaceableStages):
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
 
+    @property
+    def T_lw(self) -> Tensor | None:
+        """Transform from the world to the level frame, see `level_frame`, float64, shape :math:`(4, 4)`.
+
+        Up is against the measured gravity; without a measurement it is the normal of the floor in the occupancy map,
+        and follows it. None while neither is known.
+        """
+        if self.gravity is not None:
+            return level_frame(-self.gravity)
+        floor = None if self.occupancy is None else self.occupancy.floor
+        return None if floor is None else level_frame(floor.up)
+
     def __call__(self, frame: RGBDFrame) -> FrameResult:
         """Process the next frame: preprocess and track.
 
         Raises:
             InputError: If the frame is not valid, of another camera, or not later than the previous one.
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         preprocessed = self.preprocess(frame, self.predictions[0])
         self.advance_predictions()
         return self.track(preprocessed)
 
     def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
-        """Run the stages that need the frame alone; the state of the tracking stages is neither read nor changed.
+        """Run the stages that depend only on the frame; the state of the tracking stages is neither read nor changed.
 
         `segment_instances` and `extract_features` are independent of each other and can run in different threads.
 
@@ -159,14 +172,14 @@ class V3DSLAM(ReplaceableStages):
 
         Raises:
             InputError: If the frame is not valid or of another camera.
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         self.check(frame)
         segmentation = self.segment_instances(frame, prediction)
         return PreprocessedFrame(frame, self.extract_features(frame), lambda: segmentation)
 
     def check(self, frame: RGBDFrame) -> None:
-        """Check a frame before it is preprocessed.
+        """Check that a frame is valid and of this camera; `preprocess` does this first.
 
         Raises:
             InputError: If the frame is not valid or of another camera.
@@ -180,12 +193,12 @@ class V3DSLAM(ReplaceableStages):
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
-            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
-                the camera; None if the pose is not known.
-            is_due: False to leave the frame out; None to leave out all but every ``segmentation.interval``-th frame.
+            prediction: Pose prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter computes the
+                roll of the camera; None if the pose is not known.
+            is_due: False to skip the frame; None to segment only every ``segmentation.interval``-th frame.
 
         Raises:
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         if is_due is None:
             is_due = frame.index % self.config.segmentation.interval == 0
@@ -275,7 +288,7 @@ class V3DSLAM(ReplaceableStages):
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
-        """Apply the pending result of the back end. `track` does this; call it once after the last frame."""
+        """Apply the pending result of the back end. `track` does this in every frame; call it after the last frame."""
         result = self.back_end.result()
         if result is None:
             return
@@ -290,27 +303,28 @@ class V3DSLAM(ReplaceableStages):
     def advance_predictions(self) -> PosePrediction | None:
         """Append the prediction for the frame after the next `PREFETCHED_FRAMES`, and return it.
 
-        It is made before the next frame is tracked, whether that frame is preprocessed ahead or not.
+        Call this before each call of `track`. The predictions, and so the results, are then the same whether frames are
+        preprocessed ahead or not.
         """
         self.predictions.popleft()
         self.predictions.append(self._predict())
         return self.predictions[-1]
 
     def pose_at(self, stamp: float) -> CameraState:
-        """Return the camera at a time: interpolated between frames, predicted after the last one, with covariance.
+        """Return the state of the camera at a time: interpolated between frames, predicted after the last one.
 
         It can be called from another thread while frames are tracked.
 
         Args:
-            stamp: Time in the clock of the frames, seconds; in the last 10 s, or later than the last frame.
+            stamp: Time in the clock of the frames, seconds; at most 10 s before the last frame, or later than it.
 
         Raises:
-            InputError: If the time is earlier, or before the first frame.
+            InputError: If the time is earlier, or no frame has been tracked.
         """
         return self.states.at(stamp)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that changes from frame to frame, between two frames.
+        """Return the state that changes from frame to frame. Call it between two frames.
 
         Raises:
             ConfigError: If a stage was replaced by one without state_dict.
@@ -320,7 +334,7 @@ class V3DSLAM(ReplaceableStages):
         return {**state, **own, "gravity": self.gravity}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`; the next frames give the same results as without the interruption."""
+        """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
         for name, component in self._stateful_components().items():
             component.load_state_dict(state[name])
         self.loop_closer.rebuild(each for each in self.map.active_keyframes if each is not self.back_end.keyframe)
@@ -355,14 +369,14 @@ class V3DSLAM(ReplaceableStages):
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_located else None
 
     def _update_gravity(self, frame: RGBDFrame, T_new_old: Tensor | None) -> None:
-        """Take over the first measured gravity; move it with a guessed world frame when the camera is first found."""
+        """Store the first measured gravity in the world frame; rotate it with later corrections of the world frame."""
         if frame.gravity is not None and self.gravity is None:
             self.gravity = self.poses.T_cw[:3, :3].T @ frame.gravity
         elif T_new_old is not None and self.gravity is not None:
             self.gravity = T_new_old[:3, :3] @ self.gravity
 
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
-        """Move everything outside the map that is stored in the world frame, after a correction of the map."""
+        """Apply a correction of the map to all other data that is stored in the world frame."""
         if T_new_old is not None:
             self.classify_motion.tracker.apply_world_correction(T_new_old)
             self.free_space_check.apply_world_correction(T_new_old)

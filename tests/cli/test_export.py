@@ -13,11 +13,11 @@ import pytest
 import torch
 from helpers.colmap_reader import read_model
 from helpers.commands import assert_error_line, files_in
+from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import export, run
 from v3d_torch.datasets import load_sequence
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.io.ply import read_ply_points
@@ -28,7 +28,7 @@ FRAMES = 12
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "walk"
-    write_sequence(folder, range(45, 45 + FRAMES))
+    copy_frames(folder, range(45, 45 + FRAMES))
     return folder
 
 
@@ -141,10 +141,10 @@ def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_pat
     assert_error_line(call(*arguments, tmp_path / "a"), "gone")
     assert call(*arguments, tmp_path / "b", "--seq", sequence).exit_code == 0
     assert len(list((tmp_path / "b" / "images").iterdir())) == 2
-    write_sequence(tmp_path / "other", range(5))
+    copy_frames(tmp_path / "other", range(5))
     for name, words in (("other", "fewer than the run"), ("later", "pass the sequence of this run with --seq")):
         if name == "later":
-            write_sequence(tmp_path / "later", range(60, 60 + FRAMES))
+            copy_frames(tmp_path / "later", range(60, 60 + FRAMES))
         assert_error_line(call(*arguments, tmp_path / f"to_{name}", "--seq", tmp_path / name), words)
 
 

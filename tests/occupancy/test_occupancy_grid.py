@@ -19,7 +19,7 @@ from v3d_torch.errors import ConfigError, OutputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.map_server import write_map_server_files
-from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, level_frame, occupancy_grid
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 
 SIZE = CONFIG.voxel_size
@@ -65,15 +65,17 @@ def test_convention_x_is_forward_and_y_is_left(chosen: OccupancyGrid) -> None:
     assert chosen.states[row, column] == VoxelState.OCCUPIED  # the high obstacle, 8 voxels to the right, 3 ahead
 
 
-@pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (0.4, 0.0, 0.2), (-math.pi / 2, 0.0, 0.0), (math.pi / 2, 0, 0)])
-def test_level_frame_is_a_rotation_with_the_floor_at_height_zero(twist: tuple[float, float, float]) -> None:
-    up = se3_exp(torch.tensor([0.0, 0.0, 0.0, *twist], dtype=torch.float64))[:3, :3] @ UP
-    T_lw = level_frame(up, -1.3)
-    torch.testing.assert_close(T_lw[:3, :3] @ T_lw[:3, :3].T, torch.eye(3, dtype=torch.float64))
-    assert torch.linalg.det(T_lw[:3, :3]).item() == pytest.approx(1.0)
-    torch.testing.assert_close(T_lw @ torch.cat([-1.3 * up, up.new_ones(1)]), T_lw.new_tensor([0, 0, 0, 1]))
-    above = T_lw @ torch.cat([-0.3 * up, up.new_ones(1)])
-    torch.testing.assert_close(above, T_lw.new_tensor([0, 0, 1, 1]))
+def test_floor_is_at_its_height_below_the_first_camera() -> None:
+    """Cells do not depend on where the world's origin is; their height is that of the floor."""
+    voxels = box_of_voxels((0, -12, 0), (20, -1, 12))
+    below = torch.tensor([0, 26, 0])
+    nothing = torch.zeros(0, 3, dtype=torch.int64)
+    grid, lower = (
+        occupancy_grid(map_of(nothing, voxels + shift), Floor(UP, -float(shift[1]) * SIZE, 1.0), HEIGHTS)
+        for shift in (0 * below, below)
+    )
+    assert torch.equal(grid.states, lower.states) and grid.origin == lower.origin and grid.height == 0
+    assert lower.height == pytest.approx(-26 * SIZE)
 
 
 def grid_of_room(T_ow: Tensor) -> OccupancyGrid:

@@ -13,6 +13,7 @@ from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.runs.state import STATE_CLASSES
@@ -171,3 +172,21 @@ def test_floor_and_grid_follow_the_accelerometer() -> None:
     torch.testing.assert_close(drive.mapper.up.direction, sideways.double())
     floor = drive.mapper.find_floor()
     assert floor is None or floor.up[0] > 0.99
+
+
+def test_floor_is_searched_again_when_the_number_of_views_has_doubled(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive, searched = Drive(OccupancyMapper(CONFIG, CAMERA)), []
+    floors = iter([None, *(Floor(torch.eye(3, dtype=torch.float64)[k], 0.0, 1.0) for k in range(2)), None])
+
+    def find_floor() -> Floor | None:
+        searched.append(len(drive.entries))
+        return next(floors)
+
+    monkeypatch.setattr(drive.mapper, "find_floor", find_floor)
+    found = []
+    for index in range(70):
+        drive.add(index, index + 1)
+        found.append(None if drive.mapper.floor is None else int(drive.mapper.floor.up.argmax()))
+    assert searched == [16, 32, 64] and found == [None] * 31 + [0] * 32 + [1] * 7
+    drive.mapper.correct(drive.poses)  # finds none, and keeps the last one
+    assert len(searched) == 4 and drive.mapper.floor is not None

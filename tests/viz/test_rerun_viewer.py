@@ -18,6 +18,7 @@ import psutil
 import pytest
 import rerun_cli
 import torch
+from helpers.demo_frames import copy_frames
 from helpers.squares import squares
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
 from matplotlib.colors import to_rgba
@@ -27,12 +28,12 @@ from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
 from v3d_torch.config.loading import load_config
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.frame_objects import MotionState
-from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, level_frame
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.pipeline import NULL_VIEWER, Pipeline
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Trajectory
@@ -237,7 +238,7 @@ def test_free_cells_are_logged_on_the_floor(tmp_path: Path) -> None:
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     states = torch.tensor([[0, 1, -1], [0, 0, 1]], dtype=torch.int8)
     stream = open_stream(live=False, file=tmp_path / "floor.rrd")
-    log_floor(stream, OccupancyGrid(states, 0.1, (1.0, -2.0), level_frame(up, -1.5)))
+    log_floor(stream, OccupancyGrid(states, 0.1, (1.0, -2.0), level_frame(up), -1.5))
     stream.disconnect()
     (row,) = Recording(tmp_path / "floor.rrd").all("/world/occupancy/floor")
     # x of the grid is z of the world, y is -x; the floor is 1.5 m below the camera.
@@ -441,7 +442,7 @@ def test_viewer_is_started_and_receives_the_run(
 
 
 def test_command_without_screen_suggests_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_sequence(tmp_path / "three", range(45, 48))
+    copy_frames(tmp_path / "three", range(45, 48))
     for name in list(os.environ):
         if "DISPLAY" in name or "WAYLAND" in name:
             monkeypatch.delenv(name)

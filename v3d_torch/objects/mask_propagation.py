@@ -1,9 +1,9 @@
 """Propagation of object masks to a frame without segmentation.
 
-A network that sees every second frame halves the largest cost of a frame. Between two of its frames an object moves by
-a few centimetres, which its track predicts, and the depth of the new frame shows its outline: the pixels near the
-predicted points with the depth of these points. The objects of propagated masks are measured like those of the network,
-so that centroids, votes and Chamfer distances use the new depth and not a prediction.
+Segmentation of every second frame halves the largest cost of a frame. In the frame between, the track of an object
+predicts its points, and the depth image gives its outline: the pixels near the predicted points that have the depth of
+these points. Objects of propagated masks are measured like objects of network masks, so that centroids, votes and
+Chamfer distances come from the depth of the frame and not from a prediction.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _DEPTH_TOLERANCE = 0.2
 
 
 def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, spacing: float) -> Instances:
-    """Redraw the objects that were detected in the previous frame and may move.
+    """Compute the masks of detected objects that may move from the depth of the current frame.
 
-    Unlabelled objects are left out, because they are found anew in the depth of each frame; furniture, because its
-    pixels are used for tracking.
+    Unlabelled objects are left out, because they are detected in the depth of every frame. Furniture is left out,
+    because tracking uses its pixels.
 
     Args:
         tracks: Tracks after the previous frame.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 
@@ -20,20 +20,20 @@ _MIN_FREE = 0.5
 class OccupancyGrid:
     """Cells of the floor with the state of the space above them.
 
-    The level frame has its origin on the floor below the first camera, x forward, y left and z up (REP 103 of ROS).
-
     Attributes:
         states: Values of `VoxelState`, int8, shape :math:`(H, W)`: row along y, column along x, from the smallest
             coordinates on.
         cell_size: Side of a cell, metres.
         origin: Coordinates (x, y) of the corner of the first cell, level frame, metres.
-        T_lw: World to level frame, float64, shape :math:`(4, 4)`.
+        T_lw: World to the level frame of the floor, see `level_frame`, float64, shape :math:`(4, 4)`.
+        height: Coordinate z of the floor, level frame, metres; that of the first camera is 0.
     """
 
     states: Tensor
     cell_size: float
     origin: tuple[float, float]
     T_lw: Tensor
+    height: float
 
     def states_at(self, points: Tensor) -> Tensor:
         """State of the cell below each point.
@@ -44,28 +44,12 @@ class OccupancyGrid:
         Returns:
             Values of `VoxelState`, int8, shape :math:`(...)`; unknown outside of the grid.
         """
-        level = points.to(torch.float64) @ self.T_lw[:3, :3].T + self.T_lw[:3, 3]
+        level = points.to(torch.float64) @ self.T_lw[:3, :3].T
         column, row = ((level[..., :2] - level.new_tensor(self.origin)) / self.cell_size).floor().long().unbind(dim=-1)
         inside = (row >= 0) & (row < self.states.shape[0]) & (column >= 0) & (column < self.states.shape[1])
         states = torch.full_like(row, VoxelState.UNKNOWN, dtype=torch.int8)
         states[inside] = self.states[row[inside], column[inside]]
         return states
-
-
-def level_frame(up: Tensor, offset: float) -> Tensor:
-    """Transform from the world to the level frame of a plane ``up @ p = offset``, float64, shape :math:`(4, 4)`.
-
-    Args:
-        up: Unit vector, world frame, float64, shape :math:`(3,)`.
-        offset: Distance of the plane from the world's origin along ``up``, metres.
-    """
-    # The world frame is that of the first camera: its optical axis is z. A camera that looks up or down has y instead.
-    forward = up.new_tensor([0.0, 0.0, 1.0] if abs(float(up[2])) < math.cos(math.radians(10)) else [0.0, 1.0, 0.0])
-    x = torch.nn.functional.normalize(forward - (forward @ up) * up, dim=0)
-    T_lw = torch.eye(4, dtype=torch.float64)
-    T_lw[:3, :3] = torch.stack([x, torch.linalg.cross(up, x), up])
-    T_lw[2, 3] = -offset
-    return T_lw
 
 
 def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, float] | None = None) -> OccupancyGrid:
@@ -85,11 +69,11 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
     size, (low, high) = occupancy.config.voxel_size, heights or occupancy.config.obstacle_heights
     if not low < high:
         raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest")
-    T_lw = level_frame(floor.up, floor.offset)
+    T_lw, low, high = level_frame(floor.up), low + floor.offset, high + floor.offset
     occupied = _between(occupancy.occupied_points, T_lw, low, high)
     known = torch.cat([occupied, _between(occupancy.free_points, T_lw, low, high)])
     if len(known) == 0:
-        return OccupancyGrid(torch.zeros(0, 0, dtype=torch.int8), size, (0.0, 0.0), T_lw)
+        return OccupancyGrid(torch.zeros(0, 0, dtype=torch.int8), size, (0.0, 0.0), T_lw, floor.offset)
     first = (known.amin(dim=0) / size).floor().to(torch.int64)
     columns, rows = ((known.amax(dim=0) / size).floor().to(torch.int64) - first + 1).tolist()
     centres = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).flip(1).to(torch.float64)
@@ -98,15 +82,15 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
     count = torch.zeros(len(centres), dtype=torch.int64)
     for z in levels.tolist():
         points = torch.cat([centres, centres.new_full((len(centres), 1), z)], dim=1)
-        count += occupancy.states((points - T_lw[:3, 3]) @ T_lw[:3, :3]) == VoxelState.FREE
+        count += occupancy.states(points @ T_lw[:3, :3]) == VoxelState.FREE
     states = torch.where(count >= _MIN_FREE * len(levels), VoxelState.FREE, VoxelState.UNKNOWN).to(torch.int8)
     column, row = ((occupied / size).floor().to(torch.int64) - first).unbind(dim=1)
     states[row * columns + column] = VoxelState.OCCUPIED
     x, y = (first * size).tolist()
-    return OccupancyGrid(states.reshape(rows, columns), size, (x, y), T_lw)
+    return OccupancyGrid(states.reshape(rows, columns), size, (x, y), T_lw, floor.offset)
 
 
 def _between(points: Tensor, T_lw: Tensor, low: float, high: float) -> Tensor:
-    """Coordinates x and y of the world points (N, 3) between two heights, level frame, (M, 2)."""
-    level = points @ T_lw[:3, :3].T + T_lw[:3, 3]
+    """Coordinates x and y of the world points (N, 3) between two coordinates z, level frame, (M, 2)."""
+    level = points @ T_lw[:3, :3].T
     return level[(level[:, 2] >= low) & (level[:, 2] <= high), :2]

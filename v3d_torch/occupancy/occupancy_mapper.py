@@ -28,6 +28,10 @@ _CHECK_INTERVAL = 10
 _MAX_DISPLACEMENT = 0.5
 """Largest displacement of a view with which the map stays as it is, voxels."""
 
+_FIRST_SEARCH = 16
+"""Number of views after which the floor is first searched: a second and a half. It is searched again whenever their
+number has doubled, because a search takes up to a tenth of a second."""
+
 _REBUILD_VIEWS = 4
 """Views that are added again with each new view while the map is rebuilt: a rebuild is spread over many frames."""
 
@@ -47,6 +51,7 @@ class OccupancyMapper:
         map: The occupancy map.
         accelerometer: Unit vector against gravity in the frame of the first camera, float64, shape :math:`(3,)`, as an
             accelerometer at rest measures it; None without accelerometer.
+        floor: Floor of the map when it was last found; None before.
     """
 
     def __init__(self, config: OccupancyConfig, camera: PinholeCamera, accelerometer: Tensor | None = None) -> None:
@@ -54,6 +59,7 @@ class OccupancyMapper:
         self._camera = camera
         self.accelerometer = accelerometer
         self.map = OccupancyMap(config)
+        self.floor: Floor | None = None
         self._store = ViewStore(config.max_views)
         self._count = 0
         self._up_votes: Tensor | None = None
@@ -92,9 +98,11 @@ class OccupancyMapper:
         if self._rebuilt is None and self._count % _CHECK_INTERVAL == 0:
             self._begin_rebuild(poses)
         self._continue_rebuild(_REBUILD_VIEWS + 1)
+        if self._count >= _FIRST_SEARCH and self._count.bit_count() == 1:
+            self.floor = self.find_floor() or self.floor
 
     def find_floor(self) -> Floor | None:
-        """Find the floor of the map; None if none is visible. It takes a tenth of a second."""
+        """Find the floor of the map as it is now; None if none is visible. It takes up to a tenth of a second."""
         return find_floor(self.map, self.up)
 
     def grid(self, heights: tuple[float, float] | None = None) -> OccupancyGrid | None:
@@ -107,7 +115,7 @@ class OccupancyMapper:
         return None if floor is None else occupancy_grid(self.map, floor, heights)
 
     def correct(self, poses: PoseHistory) -> None:
-        """Apply all corrections of the poses at once; call this after the last frame.
+        """Apply all corrections of the poses at once, and search the floor; call this after the last frame.
 
         Args:
             poses: Poses of all frames.
@@ -115,6 +123,7 @@ class OccupancyMapper:
         self._continue_rebuild(len(self._store))
         self._begin_rebuild(poses)
         self._continue_rebuild(len(self._store))
+        self.floor = self.find_floor() or self.floor
 
     def state_dict(self) -> dict[str, Any]:
         """Return the map, the stored views, and the state of a rebuild."""
@@ -122,6 +131,7 @@ class OccupancyMapper:
             "map": self.map.state_dict(),
             "store": self._store.state_dict(),
             "count": self._count,
+            "floor": self.floor,
             "up_votes": self._up_votes,
             "rebuilt": None if self._rebuilt is None else self._rebuilt.state_dict(),
             "rebuilt_views": self._rebuilt_views,
@@ -132,7 +142,7 @@ class OccupancyMapper:
         self.map.load_state_dict(state["map"])
         self._store.load_state_dict(state["store"])
         self._count, self._rebuilt_views = state["count"], state["rebuilt_views"]
-        self._up_votes = state["up_votes"]
+        self._up_votes, self.floor = state["up_votes"], state["floor"]
         self._rebuilt = None
         if state["rebuilt"] is not None:
             self._rebuilt = OccupancyMap(self._config)

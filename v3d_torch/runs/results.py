@@ -195,6 +195,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "readout": slam.map.readout.seconds,
         "warnings": run.warnings,
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
+        "T_lw": None if (T_lw := slam.T_lw) is None else T_lw.tolist(),
         "failure": failure,
         "latency": run.live.latency_statistics(),
         "dropped": run.live.dropped,

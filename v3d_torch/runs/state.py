@@ -18,6 +18,7 @@ from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
@@ -31,7 +32,7 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 STATE_CLASSES: tuple[type, ...] = (
     *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus, CameraState),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
-    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView),
+    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView, Floor),
 )
 """Classes of the package that a saved state can contain; others are not read."""
 

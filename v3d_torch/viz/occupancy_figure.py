@@ -11,8 +11,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.occupancy.floor import Floor
-from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, level_frame, occupancy_grid
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.types import Trajectory
 
@@ -44,7 +45,7 @@ def draw_occupancy(
         floor: Floor of the map, or None.
         title: Title of the figure.
     """
-    T_lw = level_frame(up, 0.0) if floor is None else level_frame(floor.up, floor.offset)
+    T_lw = level_frame(up if floor is None else floor.up)
     path = _to_level(trajectory.T_wc[:, :3, 3], T_lw)
     known = _to_level(torch.cat([occupancy.occupied_points, occupancy.free_points]), T_lw)
     corners = torch.cat([path, known])[:, :2]
@@ -56,8 +57,11 @@ def draw_occupancy(
         _draw_grid(panels[0], occupancy_grid(occupancy, floor))
         bottom, top = occupancy.config.obstacle_heights
         panels[0].set_title(f"obstacles {bottom:.2f} to {top:.2f} m above the floor", fontsize=10)
-    height = sum(occupancy.config.obstacle_heights) / 2 if floor is not None else float(path[:, 2].median())
-    place = f"{height:.2f} m above the floor" if floor is not None else "at the height of the camera (no visible floor)"
+    if floor is None:
+        height, place = float(path[:, 2].median()), "at the height of the camera (no visible floor)"
+    else:
+        above = sum(occupancy.config.obstacle_heights) / 2
+        height, place = floor.offset + above, f"{above:.2f} m above the floor"
     _draw_slice(panels[-1], occupancy, T_lw, height, low, high)
     panels[-1].set_title(f"distance to obstacles {place}", fontsize=10)
     for axes in panels:
@@ -84,12 +88,12 @@ def _draw_grid(axes: Axes, grid: OccupancyGrid) -> None:
 
 
 def _draw_slice(axes: Axes, occupancy: OccupancyMap, T_lw: Tensor, height: float, low: Tensor, high: Tensor) -> None:
-    """Draw the distance to obstacles at a height, with a contour every quarter of a metre."""
+    """Draw the distance to obstacles at a coordinate z of the level frame, with a contour every quarter of a metre."""
     step = max(occupancy.config.voxel_size, float((high - low).max()) / _MAX_PIXELS)
     (left, bottom), (right, top) = low.tolist(), high.tolist()
     x, y = (torch.arange(*ends, step, dtype=torch.float64) for ends in ((left, right), (bottom, top)))
     points = torch.stack([*torch.meshgrid(x, y, indexing="xy"), x.new_full((len(y), len(x)), height)], dim=-1)
-    points = (points - T_lw[:3, 3]) @ T_lw[:3, :3]
+    points = points @ T_lw[:3, :3]
     distance, maximum = occupancy.distance(points).numpy(), occupancy.config.max_distance
     edges = (left - step / 2, float(x[-1]) + step / 2, bottom - step / 2, float(y[-1]) + step / 2)
     image = axes.imshow(distance, vmin=0, vmax=maximum, cmap="viridis", origin="lower", extent=edges)
@@ -102,4 +106,4 @@ def _draw_slice(axes: Axes, occupancy: OccupancyMap, T_lw: Tensor, height: float
 
 
 def _to_level(points: Tensor, T_lw: Tensor) -> Tensor:
-    return points @ T_lw[:3, :3].T + T_lw[:3, 3]
+    return points @ T_lw[:3, :3].T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.errors import OutputError
 from v3d_torch.export.ros.bag_file import BagFile
 from v3d_torch.export.ros.bag_viewer import BagViewer
-from v3d_torch.export.ros.frames import camera_in_map, points_in_map
+from v3d_torch.export.ros.frames import camera_in_map, map_frame, points_in_map
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.pipeline import Pipeline
@@ -37,6 +38,7 @@ from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame
 
 CONFIG = load_config(overrides=["mapping.max_keyframe_interval=5"])
+AS_SEEN = map_frame(None)
 EVERY_FRAME = ("/tf", "/odom", "/camera/color/camera_info", "/objects")
 
 
@@ -105,11 +107,11 @@ def test_times_are_those_of_the_frames_and_never_decrease(messages: Messages) ->
 
 def test_convention_tf_tree_gives_the_pose_of_each_frame(messages: Messages, recorded: Recorded) -> None:
     for (_, tf), T_wc in zip(messages["/tf"], recorded.T_wc, strict=True):
-        np.testing.assert_allclose(lookup(tf, "map", "camera_link"), camera_in_map(T_wc), atol=1e-9)
+        np.testing.assert_allclose(lookup(tf, "map", "camera_link"), camera_in_map(T_wc, AS_SEEN), atol=1e-9)
         # A point 2 m in front of the optical frame, 1 m right of its centre, is in map where the world has it.
         point = torch.tensor([1.0, 0.0, 2.0, 1.0], dtype=torch.float64)
         in_map = lookup(tf, "map", "camera_color_optical_frame") @ point.numpy()
-        np.testing.assert_allclose(in_map[:3], points_in_map((T_wc @ point)[:3]), atol=1e-9)
+        np.testing.assert_allclose(in_map[:3], points_in_map((T_wc @ point)[:3], AS_SEEN), atol=1e-9)
 
 
 def test_odometry_agrees_with_tf_and_moves_to_the_right(messages: Messages) -> None:
@@ -143,13 +145,13 @@ def test_path_has_all_frames_at_the_end(messages: Messages, recorded: Recorded) 
     poses = messages["/path"][-1][1].poses
     assert [stamp_of(each.header) for each in poses] == pytest.approx(trajectory.stamps.tolist())
     written = np.array([matrix_of(each.pose) for each in poses])
-    np.testing.assert_allclose(written, camera_in_map(trajectory.T_wc), atol=1e-9)
+    np.testing.assert_allclose(written, camera_in_map(trajectory.T_wc, AS_SEEN), atol=1e-9)
     assert [len(message.poses) for _, message in messages["/path"][:2]] == [1, 2]
 
 
 def test_clouds_lie_on_the_wall_without_people(messages: Messages, recorded: Recorded) -> None:
     points, colours = points_of(messages["/cloud_map"][0][1])
-    np.testing.assert_array_equal(points, points_in_map(recorded.point_map.points))
+    np.testing.assert_array_equal(points, points_in_map(recorded.point_map.points, AS_SEEN))
     np.testing.assert_array_equal(colours, recorded.point_map.colours)
     assert np.abs(points[:, 0] - WALL).max() < 0.02
     for _, cloud in messages["/cloud"]:
@@ -203,8 +205,25 @@ def test_correction_of_the_map_changes_map_to_odom_only(tmp_path: Path) -> None:
     np.testing.assert_allclose(lookup(after, "odom", "camera_link"), lookup(before, "odom", "camera_link"), atol=1e-9)
     moved = np.linalg.norm(lookup(after, "map", "odom")[:3, 3] - lookup(before, "map", "odom")[:3, 3])
     assert moved > 0.4
-    expected = camera_in_map(invert(slam.poses.T_cw))
+    expected = camera_in_map(invert(slam.poses.T_cw), AS_SEEN)
     np.testing.assert_allclose(lookup(after, "map", "camera_link"), expected, atol=1e-9)
+
+
+def test_map_and_odom_are_level_from_the_first_frame_on_if_gravity_is_measured(tmp_path: Path) -> None:
+    """The camera is pitched downwards by 30 degrees."""
+    down = torch.tensor([0.0, 3**0.5 / 2, 0.5], dtype=torch.float64)
+
+    class Pitched(Wall):
+        def __getitem__(self, index: int) -> RGBDFrame:
+            frame = super().__getitem__(index)
+            return replace(frame, gravity=down) if index == 0 else frame
+
+    run = Recorded(tmp_path / "run.mcap", Pitched())
+    assert run.pipeline.slam.T_lw is not None
+    for (_, tf), T_wc in zip(read_with_mcap(run.path)["/tf"], run.T_wc, strict=True):
+        for frame in ("map", "odom"):
+            gravity = lookup(tf, frame, "camera_color_optical_frame")[:3, :3] @ T_wc[:3, :3].T.numpy() @ down.numpy()
+            np.testing.assert_allclose(gravity, [0, 0, -1], atol=1e-3 if frame == "odom" else 1e-9)
 
 
 def test_lost_camera_has_camera_info_only(tmp_path: Path) -> None:

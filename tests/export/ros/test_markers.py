@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from v3d_torch.export.ros.frames import map_frame
 from v3d_torch.export.ros.markers import Marker, object_markers
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 
@@ -24,7 +25,8 @@ def make_object(state: MotionState, cloud: Tensor = CLOUD, centroid: Tensor | No
 
 def markers_of(*objects: TrackedObject, velocity: Tensor | None = None) -> dict[str, Any]:
     velocities = {} if velocity is None else {7: velocity}
-    first, *others = object_markers(2.5, FrameObjects(list(objects), ~MASK, ~MASK, []), velocities).markers
+    shown = FrameObjects(list(objects), ~MASK, ~MASK, [])
+    first, *others = object_markers(2.5, shown, velocities, map_frame(None)).markers
     assert first.action == Marker.DELETEALL
     assert all(each.action == Marker.ADD and each.header.frame_id == "map" for each in others)
     return {each.ns: each for each in others}

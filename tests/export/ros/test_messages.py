@@ -69,11 +69,11 @@ def test_transforms_and_path_have_the_given_poses() -> None:
 
 def test_occupancy_grid_has_its_cells_row_by_row_and_the_pose_of_the_corner_of_the_first_one() -> None:
     states = torch.tensor([[-1, 0, 1], [0, 0, 1]], dtype=torch.int8)
-    grid = OccupancyGrid(states, cell_size=0.05, origin=(-1.0, 2.0), T_lw=T[0])
+    grid = OccupancyGrid(states, cell_size=0.05, origin=(-1.0, 2.0), T_lw=T[0], height=-1.3)
     message = round_trip(occupancy_grid(2.5, "map", grid, T[1]))
     assert (message.header.frame_id, message.info.width, message.info.height) == ("map", 3, 2)
     assert message.data.tolist() == [-1, 0, 100, 0, 0, 100] and message.info.resolution == np.float32(0.05)
-    corner = T[1] @ torch.linalg.inv(T[0]) @ torch.tensor([-1.0, 2.0, 0.0, 1.0], dtype=torch.float64)
+    corner = T[1] @ torch.linalg.inv(T[0]) @ torch.tensor([-1.0, 2.0, -1.3, 1.0], dtype=torch.float64)
     pose = matrix_of(message.info.origin)
     np.testing.assert_allclose(pose[:3, 3], corner[:3], atol=1e-12)
     np.testing.assert_allclose(pose[:3, :3], (T[1] @ torch.linalg.inv(T[0]))[:3, :3], atol=1e-12)

@@ -1,10 +1,11 @@
 """Coordinate frames of the messages, as REP 103 and REP 105 of ROS define them.
 
 ======================================  ============================================================================
-``map``                                 Fixed frame of the map: x forward, y left and z up as the first camera sees
-                                        them. It is level if the first camera is.
+``map``                                 Fixed frame of the map: the level frame (`level_frame`), with x forward from
+                                        the first camera, y left, z up. While up is not known, the first camera counts
+                                        as level.
 ``odom``                                Frame in which the camera moves without jumps; ``map`` to ``odom`` holds the
-                                        corrections of the map.
+                                        corrections of the map. Its origin and its yaw are those of the first camera.
 ``camera_link``                         Colour camera with x forward, y left, z up.
 ``camera_color_optical_frame``          Colour camera with x right, y down, z forward: the camera frame of this package.
 ======================================  ============================================================================
@@ -15,6 +16,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, orthonormalise
 
 MAP, ODOM = "map", "odom"
@@ -31,40 +33,48 @@ T_LINK_OPTICAL = torch.tensor(
 )
 """Transform from ``camera_color_optical_frame`` to ``camera_link``, float64, shape :math:`(4, 4)`."""
 
-T_MAP_WORLD = T_LINK_OPTICAL
-"""Transform from the world frame of a run, the optical frame of its first camera, to ``map``."""
+
+def map_frame(T_lw: Tensor | None) -> Tensor:
+    """Transform from the world frame of a run to ``map``, float64, shape :math:`(4, 4)`.
+
+    Args:
+        T_lw: Transform to the level frame, see `V3DSLAM.T_lw`; None while it is not known.
+    """
+    return T_LINK_OPTICAL if T_lw is None else T_lw
 
 
-def camera_in_map(T_wc: Tensor) -> Tensor:
+def camera_in_map(T_wc: Tensor, T_mw: Tensor) -> Tensor:
     """Pose of ``camera_link`` in ``map``.
 
     Args:
         T_wc: Camera-to-world poses, float64, shape :math:`(..., 4, 4)`.
+        T_mw: Transform from the world frame to ``map``, float64, shape :math:`(4, 4)`.
 
     Returns:
         Transforms from ``camera_link`` to ``map``, float64, shape :math:`(..., 4, 4)`.
     """
-    return T_MAP_WORLD @ T_wc @ invert(T_LINK_OPTICAL)
+    return T_mw @ T_wc @ invert(T_LINK_OPTICAL)
 
 
-def points_in_map(points: Tensor) -> Tensor:
-    """Transform points from the world frame to ``map``.
+def points_in_map(points: Tensor, T_mw: Tensor) -> Tensor:
+    """Transform points, or directions, from the world frame to ``map``, which has the same origin.
 
     Args:
         points: Points, world frame, metres, shape :math:`(..., 3)`.
+        T_mw: Transform from the world frame to ``map``, float64, shape :math:`(4, 4)`.
 
     Returns:
-        Points, metres, shape :math:`(..., 3)`.
+        Points, metres, shape and dtype of ``points``.
     """
-    x, y, z = points.unbind(dim=-1)
-    return torch.stack([z, -x, -y], dim=-1)  # the rotation of T_MAP_WORLD
+    return points @ T_mw[:3, :3].T.to(points.dtype)
 
 
 class OdometryFrame:
     """Frame ``odom``: the sum of the camera's motions, each measured in the map as it was then.
 
-    It begins at the first frame. When bundle adjustment or a loop moves the map, the camera stays where it is in
-    ``odom``, and the pose of ``odom`` in ``map`` changes.
+    It begins at the first camera, with its yaw, and with z up as in ``map`` at that time. When bundle adjustment or a
+    loop moves the map, or when ``map`` is turned because up has become known, the camera stays where it is in ``odom``,
+    and the pose of ``odom`` in ``map`` changes.
 
     Attributes:
         T_ol: Pose of ``camera_link`` in ``odom``, float64, shape :math:`(4, 4)`.
@@ -74,6 +84,7 @@ class OdometryFrame:
     def __init__(self) -> None:
         self.T_ol = torch.eye(4, dtype=torch.float64)
         self.T_mo = torch.eye(4, dtype=torch.float64)
+        self._is_empty = True
 
     def update(self, T_mp: Tensor, T_ml: Tensor) -> None:
         """Move the camera to the next frame.
@@ -83,5 +94,8 @@ class OdometryFrame:
                 the first frame the pose of this frame.
             T_ml: Pose of ``camera_link`` at this frame, in the current map, float64, shape :math:`(4, 4)`.
         """
+        if self._is_empty:
+            T_mc = T_ml @ T_LINK_OPTICAL
+            self.T_ol, self._is_empty = level_frame(T_mc[2, :3]) @ invert(T_LINK_OPTICAL), False
         self.T_ol = orthonormalise(self.T_ol @ invert(T_mp) @ T_ml)
         self.T_mo = T_ml @ invert(self.T_ol)

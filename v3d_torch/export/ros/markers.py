@@ -32,7 +32,7 @@ _ORIGIN, _UNIT = torch.zeros(3), torch.ones(3)
 
 
 def object_markers(
-    stamp: float, objects: FrameObjects, velocities: Mapping[int, Tensor]
+    stamp: float, objects: FrameObjects, velocities: Mapping[int, Tensor], T_mw: Tensor
 ) -> ros.visualization_msgs__msg__MarkerArray:
     """Make the markers of a frame, in ``map``. The first one removes those of the frame before.
 
@@ -43,18 +43,19 @@ def object_markers(
         objects: Objects of the frame.
         velocities: Velocity of objects, world frame, m/s, float64, shape :math:`(3,)`, by id. Dynamic objects get an
             arrow.
+        T_mw: Transform from the world frame to ``map``, float64, shape :math:`(4, 4)`.
     """
     markers = [_marker(stamp, "", 0, Marker.CUBE, "unknown", action=Marker.DELETEALL)]
     for each in objects.objects:
         if len(each.cloud) and bool(each.centroid.isfinite().all()):
-            markers += _box_and_name(stamp, each)
+            markers += _box_and_name(stamp, each, T_mw)
             if each.motion_state is MotionState.DYNAMIC and each.id in velocities:
-                markers.append(_arrow(stamp, each, velocities[each.id]))
+                markers.append(_arrow(stamp, each, velocities[each.id], T_mw))
     return ros.visualization_msgs__msg__MarkerArray(markers)  # type: ignore[arg-type]  # rosbags annotates an old Marker
 
 
-def _box_and_name(stamp: float, each: TrackedObject) -> list[Marker]:
-    low, high = _bounds(each)
+def _box_and_name(stamp: float, each: TrackedObject, T_mw: Tensor) -> list[Marker]:
+    low, high = _bounds(each, T_mw)
     state = each.motion_state.value
     centre, size = (low + high) / 2, (high - low).clamp(min=_MIN_SIZE)
     above, letters = torch.cat([centre[:2], high[2:] + _NAME_HEIGHT]), torch.full((3,), _NAME_HEIGHT)
@@ -65,9 +66,9 @@ def _box_and_name(stamp: float, each: TrackedObject) -> list[Marker]:
     ]
 
 
-def _arrow(stamp: float, each: TrackedObject, velocity: Tensor) -> Marker:
-    start = points_in_map(each.centroid)
-    end = start + points_in_map(velocity)  # map and world have the same origin
+def _arrow(stamp: float, each: TrackedObject, velocity: Tensor, T_mw: Tensor) -> Marker:
+    start = points_in_map(each.centroid, T_mw)
+    end = start + points_in_map(velocity, T_mw)
     return _marker(
         *(stamp, "velocities", each.id, Marker.ARROW, each.motion_state.value),
         size=torch.tensor(_ARROW),
@@ -75,13 +76,13 @@ def _arrow(stamp: float, each: TrackedObject, velocity: Tensor) -> Marker:
     )
 
 
-def _bounds(each: TrackedObject) -> tuple[Tensor, Tensor]:
+def _bounds(each: TrackedObject, T_mw: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest and largest coordinates of an object in ``map``, shape (3,) each.
 
     The cloud of a missed object is that of its last detection: it is moved to the predicted centroid.
     """
-    cloud = points_in_map(each.cloud)
-    motion = points_in_map(each.centroid) - cloud.mean(dim=0) if each.missed else 0.0
+    cloud = points_in_map(each.cloud, T_mw)
+    motion = points_in_map(each.centroid, T_mw) - cloud.mean(dim=0) if each.missed else 0.0
     return cloud.amin(dim=0) + motion, cloud.amax(dim=0) + motion
 
 

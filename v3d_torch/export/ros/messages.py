@@ -171,7 +171,7 @@ def occupancy_grid(stamp: float, frame: str, grid: OccupancyGrid, T_fw: Tensor) 
         T_fw: Transform from the world frame to that frame, float64, shape :math:`(4, 4)`.
     """
     T_lg = torch.eye(4, dtype=torch.float64)
-    T_lg[:2, 3] = torch.tensor(grid.origin, dtype=torch.float64)
+    T_lg[:3, 3] = torch.tensor([*grid.origin, grid.height], dtype=torch.float64)
     height, width = grid.states.shape
     values = torch.tensor([_OCCUPANCY[state] for state in VoxelState], dtype=torch.int8)
     return ros.nav_msgs__msg__OccupancyGrid(

@@ -13,7 +13,8 @@
 ``/map``                          ``nav_msgs/OccupancyGrid``, at the end      the floor, if an occupancy map is grown
 ================================  ==========================================  =====================================
 
-While the camera is lost, only ``/camera/color/camera_info`` has messages.
+While the camera is lost, only ``/camera/color/camera_info`` has messages. ``map`` turns against ``odom`` when the floor
+has shown where up is; a measured gravity is known at the first frame.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class RunMessages:
         self._camera = camera
         self._odometry_frame = frames.OdometryFrame()
         self._previous: int | None = None  # position in the pose history
+        self._T_mw = frames.map_frame(None)  # as at the last frame
 
     def of_frame(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM) -> Iterator[TopicMessage]:
         """Yield the messages of a frame.
@@ -77,14 +79,15 @@ class RunMessages:
         yield "/camera/color/camera_info", camera_info(stamp, frames.OPTICAL, self._camera)
         if slam.poses.status is TrackingStatus.LOST:
             return
+        self._T_mw = frames.map_frame(slam.T_lw)
         yield from self._pose_messages(stamp, slam)
         velocities = {track.id: track.velocity for track in slam.classify_motion.tracker.tracks}
-        yield "/objects", object_markers(stamp, objects, velocities)
+        yield "/objects", object_markers(stamp, objects, velocities, self._T_mw)
         keyframes = slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             yield "/cloud", self._cloud(frame, objects.static_without_people)
             own = [each for each in slam.map.active_keyframes if not each.is_from_earlier_run]
-            T_ml = frames.camera_in_map(invert(stack_poses(own)))
+            T_ml = frames.camera_in_map(invert(stack_poses(own)), self._T_mw)
             yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)
 
     def of_end(self, slam: V3DSLAM, point_map: PointMap) -> Iterator[TopicMessage]:
@@ -94,18 +97,18 @@ class RunMessages:
             slam: System after at least one frame.
             point_map: Map of the static scene.
         """
-        stamp, trajectory = slam.poses.stamp, slam.poses.trajectory()
-        yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc))
-        points = frames.points_in_map(point_map.points)
+        stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), self._T_mw
+        yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw))
+        points = frames.points_in_map(point_map.points, T_mw)
         yield "/cloud_map", point_cloud(stamp, frames.MAP, points, point_map.colours)
         if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
-            yield "/map", occupancy_grid(stamp, frames.MAP, grid, frames.T_MAP_WORLD)
+            yield "/map", occupancy_grid(stamp, frames.MAP, grid, T_mw)
 
     def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
         odometry_frame, state = self._odometry_frame, slam.states.at(stamp)
         newest = len(slam.poses) - 1
         previous = newest if self._previous is None else self._previous
-        odometry_frame.update(*frames.camera_in_map(invert(slam.poses.poses_of([previous, newest]))))
+        odometry_frame.update(*frames.camera_in_map(invert(slam.poses.poses_of([previous, newest])), self._T_mw))
         self._previous = newest
         tree = {
             (frames.MAP, frames.ODOM): odometry_frame.T_mo,

@@ -37,7 +37,7 @@ def log_floor(stream: rr.RecordingStream, grid: OccupancyGrid) -> None:
     """
     row, column = torch.nonzero(grid.states == VoxelState.FREE).unbind(dim=1)
     cells = torch.stack([column, row], dim=1).to(torch.float64) + 0.5
-    level = torch.cat([cells * grid.cell_size + cells.new_tensor(grid.origin), cells.new_zeros(len(cells), 1)], dim=1)
-    points = (level - grid.T_lw[:3, 3]) @ grid.T_lw[:3, :3]
+    xy, z = cells * grid.cell_size + cells.new_tensor(grid.origin), cells.new_full((len(cells), 1), grid.height)
+    points = torch.cat([xy, z], dim=1) @ grid.T_lw[:3, :3]
     free = rr.Points3D(points.numpy(), colors=[rgba("tab:green")], radii=grid.cell_size / 2)
     stream.log("world/occupancy/floor", free)
