@@ -61,6 +61,11 @@ class PreprocessedFrame:
     read_times: dict[str, StageTime] = field(default_factory=dict)
 
     @property
+    def times(self) -> dict[str, StageTime]:
+        """Time of reading and of the extraction, by stage."""
+        return {**self.read_times, **self.extraction.times}
+
+    @property
     def segmentation(self) -> Segmentation:
         """Instances of the frame. Waits for the segmentation if it is not complete yet."""
         return self._segmentation()

@@ -13,23 +13,27 @@ from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError
+from v3d_torch.features.features import Features
 from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import orthonormalise
+from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.objects.feature_support import FeatureSupport
-from v3d_torch.objects.free_space_check import FreeSpaceCheck
+from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.unlabelled import unlabelled_instances
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+from v3d_torch.occupancy.up_direction import estimate_up
 from v3d_torch.odometry.motion_estimator import MotionEstimator
-from v3d_torch.odometry.odometry import Odometry, TrackedFrame
+from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
@@ -45,6 +49,8 @@ from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
 from v3d_torch.tracking.state_estimator import StateEstimator
 from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import (
+    FramePose,
+    Instances,
     RGBDFrame,
     Segmenter,
     Stateful,
@@ -226,26 +232,20 @@ class V3DSLAM(ReplaceableStages):
         Raises:
             InputError: If the frame is not later than the previous one.
         """
-        frame, depth, all_features = preprocessed.frame, preprocessed.extraction.depth, preprocessed.extraction.features
+        frame, depth = preprocessed.frame, preprocessed.extraction.depth
         check_order(frame, self.poses.stamp)
-        self.timer.add({**preprocessed.read_times, **preprocessed.extraction.times})
+        self.timer.add(preprocessed.times)
         with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
-            velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
-            features = self.compensate(all_features, depth, frame.depth_delay, velocity, self.map.readout)
-            motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
-        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
-            view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
+            features = self._compensate(preprocessed.extraction.features, preprocessed, prediction.velocity)
+            T_cp, current = prediction.motion_until(frame.stamp), TrackedFrame(frame, depth, features)
+            motion = self.odometry(self._previous, current, T_cp, prediction.velocity)
+        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
+            view = self.free_space_check.make_view(frame.stamp, depth, self._compose_pose(motion))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)
-        segmentation = preprocessed.segmentation  # III-A: waits for the network if it runs beside the stages before
-        self._segmenter_state = segmentation.segmenter_state
-        self.timer.add(segmentation.times)
+        segmentation = self._wait_for_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
-            instances = segmentation.instances
-            if instances is None:
-                instances = self.classify_motion.propagate_instances(view)
-            if self.config.segmentation.source != "none":
-                instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
+            instances = self._complete_instances(segmentation.instances, view, occupied)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
             appearance = self.describe_appearance(frame.image, clouds.cloud_pixels)
@@ -255,36 +255,26 @@ class V3DSLAM(ReplaceableStages):
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
+            static = self._compensate(preprocessed.extraction.features[is_static], preprocessed, motion.velocity)
             landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
-            static = all_features[is_static]
-            static = self.compensate(static, depth, frame.depth_delay, motion.velocity, self.map.readout)
-            T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
-            pose = self.track_camera(static, depth, T_cw, landmarks, motion, self.poses)
+            pose = self.track_camera(static, depth, self._compose_pose(motion), landmarks, motion, self.poses)
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
             self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
-            reference = self.track_camera.reference_keyframe(pose)
-            keyframe = self.mapper(frame, static, pose, reference)
-            T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
-            self._apply_world_correction(T_new_old)
-            self._update_gravity(frame, T_new_old)
+            keyframe = self._extend_map(frame, static, pose, motion)
             if pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
-            if keyframe is not None:
-                self.back_end.submit(keyframe)
         with self.timer("tracking"):  # covariance of the pose, velocity of the camera
             references = None if keyframe is None else self.map.references
             state = self.estimate_state(pose, motion, self.poses, owners, references)
             self.states.append(state)
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
-                if self.gravity is not None:
-                    self.occupancy.accelerometer = -self.gravity
-                votes = up_votes(self._segmenter_state)
-                self.occupancy(depth, objects.static_mask, self.poses, votes)
+                up = estimate_up(self.gravity, up_votes(self._segmenter_state))
+                self.occupancy(depth, objects.static_mask, self.poses, up)
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
@@ -362,6 +352,43 @@ class V3DSLAM(ReplaceableStages):
             if not is_stateful(component):
                 raise ConfigError(f"{name} was replaced by a stage without state_dict; its state cannot be saved")
         return components
+
+    def _compensate(self, features: Features, preprocessed: PreprocessedFrame, velocity: Tensor) -> Features:
+        """Move features to where they would be without rolling shutter and depth delay, see `TimeCompensation`."""
+        depth, delay = preprocessed.extraction.depth, preprocessed.frame.depth_delay
+        return self.compensate(features, depth, delay, velocity, self.map.readout)
+
+    def _compose_pose(self, motion: CameraMotion) -> Tensor:
+        """Compose the pose of the previous frame with the motion since then: world to camera, float64, (4, 4)."""
+        return orthonormalise(motion.T_cp @ self.poses.T_cw)
+
+    def _wait_for_segmentation(self, preprocessed: PreprocessedFrame) -> Segmentation:
+        """Return the segmentation; the network can run beside the stages before."""
+        segmentation = preprocessed.segmentation
+        self._segmenter_state = segmentation.segmenter_state
+        self.timer.add(segmentation.times)
+        return segmentation
+
+    def _complete_instances(self, instances: Instances | None, view: DepthView, occupied: NewlyOccupied) -> Instances:
+        """Redraw the previous objects in a frame without segmentation, and add moving regions without a class."""
+        if instances is None:
+            instances = self.classify_motion.propagate_instances(view)
+        if self.config.segmentation.source == "none":
+            return instances
+        return instances.concatenate(self.propose_unlabelled(occupied, instances, view.depth))
+
+    def _extend_map(
+        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
+    ) -> Keyframe | None:
+        """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
+        reference = self.track_camera.reference_keyframe(pose)
+        keyframe = self.mapper(frame, features, pose, reference)
+        T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
+        self._apply_world_correction(T_new_old)
+        self._update_gravity(frame, T_new_old)
+        if keyframe is not None:
+            self.back_end.submit(keyframe)
+        return keyframe
 
     def _predict(self) -> PosePrediction | None:
         """Predict the motion of the camera; None if it has not been localised in a known map yet."""

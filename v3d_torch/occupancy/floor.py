@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from v3d_torch.occupancy.gravity import UpDirection
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
+from v3d_torch.occupancy.up_direction import UpDirection
 
 _MAX_VOXELS = 8192
 """Voxels that are used, which bounds the time; of more, every n-th is used."""

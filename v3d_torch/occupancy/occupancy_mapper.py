@@ -12,10 +12,10 @@ from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.floor import Floor, find_floor
-from v3d_torch.occupancy.gravity import UpDirection, estimate_up
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.range_view import RangeView
+from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 from v3d_torch.occupancy.view_store import ViewStore, displacement
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import TrackingStatus
@@ -49,20 +49,18 @@ class OccupancyMapper:
 
     Attributes:
         map: The occupancy map.
-        accelerometer: Unit vector against gravity in the frame of the first camera, float64, shape :math:`(3,)`, as an
-            accelerometer at rest measures it; None without accelerometer.
+        up: Approximate up direction, which `find_floor` refines.
         floor: Floor of the map when it was last found; None before.
     """
 
-    def __init__(self, config: OccupancyConfig, camera: PinholeCamera, accelerometer: Tensor | None = None) -> None:
+    def __init__(self, config: OccupancyConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._camera = camera
-        self.accelerometer = accelerometer
         self.map = OccupancyMap(config)
+        self.up = estimate_up()
         self.floor: Floor | None = None
         self._store = ViewStore(config.max_views)
         self._count = 0
-        self._up_votes: Tensor | None = None
         self._rebuilt: OccupancyMap | None = None
         self._rebuilt_views = 0
 
@@ -71,21 +69,16 @@ class OccupancyMapper:
         """True while the map is rebuilt after a correction of the poses."""
         return self._rebuilt is not None
 
-    @property
-    def up(self) -> UpDirection:
-        """Approximate up direction, which `find_floor` refines."""
-        return estimate_up(self.accelerometer, self._up_votes)
-
-    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up_votes: Tensor | None = None) -> None:
+    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up: UpDirection | None = None) -> None:
         """Add a frame, if it is due and its pose is known.
 
         Args:
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             poses: Poses of all frames up to this one.
-            up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None without.
+            up: Up direction as it is known now; None if nothing new is known.
         """
-        self._up_votes = up_votes
+        self.up = up or self.up
         frame = len(poses) - 1
         if frame % self._config.interval != 0 or not _is_reliable(poses):
             return
@@ -132,7 +125,7 @@ class OccupancyMapper:
             "store": self._store.state_dict(),
             "count": self._count,
             "floor": self.floor,
-            "up_votes": self._up_votes,
+            "up": self.up,
             "rebuilt": None if self._rebuilt is None else self._rebuilt.state_dict(),
             "rebuilt_views": self._rebuilt_views,
         }
@@ -142,7 +135,7 @@ class OccupancyMapper:
         self.map.load_state_dict(state["map"])
         self._store.load_state_dict(state["store"])
         self._count, self._rebuilt_views = state["count"], state["rebuilt_views"]
-        self._up_votes, self.floor = state["up_votes"], state["floor"]
+        self.up, self.floor = state["up"], state["floor"]
         self._rebuilt = None
         if state["rebuilt"] is not None:
             self._rebuilt = OccupancyMap(self._config)

@@ -1,4 +1,4 @@
-"""Up direction of the world, from an accelerometer, from people and objects, or from the first camera."""
+"""Up direction of the world, from measured gravity, from people and objects, or from the first camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-_ACCELEROMETER_TOLERANCE = math.radians(5)
+_GRAVITY_TOLERANCE = math.radians(5)
 """Error of an accelerometer's up direction: bias and acceleration of a camera that is moved by hand."""
 
 _IMAGE_TOLERANCE = math.radians(50)
@@ -32,17 +32,16 @@ class UpDirection(NamedTuple):
     tolerance: float
 
 
-def estimate_up(accelerometer: Tensor | None = None, votes: Tensor | None = None) -> UpDirection:
+def estimate_up(gravity: Tensor | None = None, votes: Tensor | None = None) -> UpDirection:
     """Choose the most accurate source of the up direction. The floor then refines it, see `find_floor`.
 
     Args:
-        accelerometer: Unit vector against gravity in the frame of the first camera, which is the world frame, as an
-            accelerometer at rest measures it, shape :math:`(3,)`; None without accelerometer.
+        gravity: Measured direction of gravity, world frame, shape :math:`(3,)`; None if it is not measured.
         votes: Sum of the votes of the segmentation for the up direction, world frame, shape :math:`(3,)`; see
             `UprightSegmenter`. None if there are none.
     """
-    if accelerometer is not None:
-        return UpDirection(normalize(accelerometer.to(torch.float64), dim=0), _ACCELEROMETER_TOLERANCE)
+    if gravity is not None:
+        return UpDirection(-normalize(gravity.to(torch.float64), dim=0), _GRAVITY_TOLERANCE)
     if votes is not None and float(votes.norm()) >= _MIN_VOTES:
         return UpDirection(normalize(votes.to(torch.float64), dim=0), _IMAGE_TOLERANCE)
     return UpDirection(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), _IMAGE_TOLERANCE)
