@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from helpers.commands import assert_error_line, command
+from helpers.commands import assert_error_line, command, environment
 from helpers.demo_frames import copy_frames
+from helpers.walls import Slide
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
 from v3d_torch.datasets.demo.sequence import FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.datasets.tum_writer import TUMWriter
 
 FRAMES = 24
 
@@ -63,6 +69,28 @@ def test_stored_run_has_states_without_latency(sequence: Path, tmp_path: Path) -
     assert (metrics["latency"], metrics["dropped"], metrics["gravity"]) == (None, 0, None)
     quaternions = states[["qx", "qy", "qz", "qw"]].to_numpy()
     assert np.allclose(np.linalg.norm(quaternions, axis=1), 1)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGSTOP")
+def test_camera_is_tracked_again_within_a_second_after_the_process_was_stopped_for_one(tmp_path: Path) -> None:
+    """As by a scheduler or a suspended computer; the camera moves on meanwhile. A mask is written per tracked frame."""
+    slide, folder, out = Slide(0, 320, step=4), tmp_path / "slide", tmp_path / "out"
+    with TUMWriter(folder, slide.camera, slide.groundtruth) as writer:
+        for index in range(len(slide)):
+            writer.add(slide[index])
+    options = ["--seq", folder, "--segmenter", "none", "--realtime", "--save-masks", "--out", out]
+    with subprocess.Popen(command(*options), env=environment(), stdout=subprocess.DEVNULL) as process:  # noqa: S603
+        while len(masks := sorted((out / "masks").glob("*.png"))) < 3:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(1)
+        process.send_signal(signal.SIGCONT)
+        assert process.wait(timeout=300) == 0
+    states, metrics = pd.read_parquet(out / "states.parquet"), json.loads((out / "metrics.json").read_text())
+    assert metrics["failure"] is None and metrics["processed"] + metrics["dropped"] == metrics["frames"] == len(slide)
+    later = states[states["stamp"] > float(masks[-1].stem) + 2]
+    assert len(later) and set(later["status"]) == {"tracked"}
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ ROOT = PACKAGE.parent
 SOURCES = (
     *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "constraints.txt"),
     "mkdocs.yml",
-    *("v3d_torch", "tests", "benchmarks", "notebooks", "docs"),
+    *("v3d_torch", "tests", "benchmarks", "notebooks", "examples", "docs"),
 )
 """Files and folders of a checkout, without the leftovers of builds and runs."""
 

@@ -101,8 +101,16 @@ class RunMessages:
         yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw))
         points = frames.points_in_map(point_map.points, T_mw)
         yield "/cloud_map", point_cloud(stamp, frames.MAP, points, point_map.colours)
+        yield from self.of_grid(slam)
+
+    def of_grid(self, slam: V3DSLAM) -> Iterator[TopicMessage]:
+        """Yield the occupancy grid, if there is one; finding its floor takes up to a tenth of a second.
+
+        Args:
+            slam: System after at least one frame.
+        """
         if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
-            yield "/map", occupancy_grid(stamp, frames.MAP, grid, T_mw)
+            yield "/map", occupancy_grid(slam.poses.stamp, frames.MAP, grid, self._T_mw)
 
     def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
         odometry_frame, state = self._odometry_frame, slam.states.at(stamp)

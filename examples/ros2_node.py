@@ -1,0 +1,98 @@
+"""ROS 2 node: `LiveSLAM` on the topics of an RGB-D camera; publishes poses, static clouds and a grid for planners.
+
+It has not been tried with an installed ROS: the tests run it with stand-ins for the modules of ROS.
+
+``python examples/ros2_node.py`` subscribes to ``camera/color/image_raw``, ``camera/color/camera_info`` and
+``camera/aligned_depth_to_color/image_raw``; other names are given by ``--ros-args -r OLD:=NEW``. It publishes ``/tf``,
+``/odom``, ``/objects``, ``/cloud``, ``/path`` (see `v3d_torch.export.ros.run_messages`) and, every few seconds,
+``/map``. The camera driver should not publish transforms of its own (``publish_tf:=false``). Parameters: ``config``,
+name or file of a configuration; ``set``, list of values such as ``segmentation.source=none``.
+"""
+
+from __future__ import annotations
+
+from queue import SimpleQueue
+from threading import Thread
+
+import message_filters
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.wait_for_message import wait_for_message
+from rosbags.typesys import Stores, get_typestore
+from rosidl_runtime_py.utilities import get_message
+from sensor_msgs.msg import CameraInfo, Image
+
+import v3d_torch as v3d
+from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
+from v3d_torch.export.ros.run_messages import Message, RunMessages
+
+COLOUR, DEPTH = "camera/color/image_raw", "camera/aligned_depth_to_color/image_raw"
+INFO = "camera/color/camera_info"
+
+GRID_INTERVAL = 90
+"""Tracked frames between two grids: a grid takes a tenth of a second."""
+
+
+class SlamNode(Node):
+    """Puts the images of the camera into a queue, and publishes the results of a system."""
+
+    def __init__(self) -> None:
+        super().__init__("v3d_slam")
+        config = self.declare_parameter("config", "realtime").value
+        overrides = self.declare_parameter("set", ["occupancy.enabled=true"]).value
+        _, info = wait_for_message(CameraInfo, self, INFO)
+        K = info.k
+        self.camera = v3d.PinholeCamera(
+            *(K[0], K[4], K[2], K[5], info.width, info.height),
+            tuple(info.d),
+            depth_scale=1000,  # REP 118: whole numbers are millimetres
+            distortion_model=info.distortion_model,
+        )
+        self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
+        self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
+        self._count = 0
+        self._messages = RunMessages(self.camera)
+        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._topics = {}
+        colour, depth = (
+            message_filters.Subscriber(self, Image, topic, qos_profile=qos_profile_sensor_data)
+            for topic in (COLOUR, DEPTH)
+        )
+        self._images = message_filters.ApproximateTimeSynchronizer([colour, depth], queue_size=5, slop=0.02)
+        self._images.registerCallback(self._add_frame)
+
+    def publish_result(self, result: v3d.LiveResult) -> None:
+        """Publish the messages of a tracked frame, and sometimes the grid."""
+        for topic, message in self._messages.of_frame(result.frame, result, self.slam):
+            if not topic.endswith("camera_info"):  # the driver publishes it
+                self._publish(topic, message)
+        if len(self.slam.poses) % GRID_INTERVAL == 0:
+            for topic, message in self._messages.of_grid(self.slam):
+                self._publish(topic, message)
+
+    def _add_frame(self, colour: Image, depth: Image) -> None:
+        stamps = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
+        rgb, measured = decode_colour_message(colour, COLOUR), decode_depth_message(depth, DEPTH)
+        frame = v3d.RGBDFrame.from_arrays(
+            *(self._count, stamps[0], rgb.permute(1, 2, 0), measured, self.camera), depth_delay=stamps[1] - stamps[0]
+        )
+        self._count += 1
+        self.frames.put(frame)
+
+    def _publish(self, topic: str, message: Message) -> None:
+        if topic not in self._topics:
+            self._topics[topic] = self.create_publisher(get_message(message.__msgtype__), topic, 10)
+        self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
+
+
+def main() -> None:
+    """Run until ROS is shut down."""
+    rclpy.init()
+    node = SlamNode()
+    Thread(target=lambda: (rclpy.spin(node), node.frames.put(None)), daemon=True).start()
+    v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)
+
+
+if __name__ == "__main__":
+    main()

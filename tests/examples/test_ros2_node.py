@@ -1,0 +1,89 @@
+"""The ROS 2 node with stand-ins for the modules of ROS, on images along the wall."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import time
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.bag_messages import matrix_of
+from helpers.bags import MessageFactory
+from helpers.fake_ros import FakeROS, Pair
+from helpers.wall_run import CAMERA, FRAMES, STEP, WALL, Wall
+from rosbags.typesys import Stores, get_typestore
+
+from v3d_torch.export.ros.frames import map_frame
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
+from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+
+NODE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
+
+
+def images(node: Any) -> Iterator[Pair]:
+    """Yield the images along the wall, each after the one before was tracked, as the real messages hold them."""
+    factory, wall = MessageFactory("mcap"), Wall()
+    for index in range(FRAMES):
+        frame, stamp = wall[index], 5 + index / 10
+        colour = factory.image(stamp, "rgb8", frame.image.permute(1, 2, 0).numpy())
+        depth = factory.image(stamp + 0.01, "16UC1", np.full((240, 320), 1000 * WALL, np.uint16))
+        for message in (colour, depth):
+            object.__setattr__(message, "data", array("B", message.data.tobytes()))
+        yield colour, depth
+        while len(node.slam.poses) <= index:
+            time.sleep(0.001)
+
+
+@pytest.fixture(scope="module")
+def ros() -> FakeROS:
+    """ROS after the node has run."""
+    k = [CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1]
+    info = MessageFactory("mcap").info(CAMERA.width, CAMERA.height, k, [0.0] * 5, [0.0] * 12)
+    settings = ["segmentation.source=none", "mapping.max_keyframe_interval=5", "occupancy.enabled=true"]
+    ros = FakeROS(info, images, {"set": settings})
+    with pytest.MonkeyPatch.context() as patch:
+        for name, module in ros.modules().items():
+            patch.setitem(sys.modules, name, module)
+        example = runpy.run_path(str(NODE))
+        example["main"].__globals__["GRID_INTERVAL"] = FRAMES
+        cells = OccupancyGrid(torch.zeros(3, 4, dtype=torch.int8), 0.05, (0.0, 0.0), map_frame(None), -1.2)
+        patch.setattr(OccupancyMapper, "grid", lambda self: cells)  # a wall has no floor
+        example["main"]()
+    return ros
+
+
+def test_node_subscribes_to_colour_and_aligned_depth(ros: FakeROS) -> None:
+    assert ros.subscribed == ["camera/color/image_raw", "camera/aligned_depth_to_color/image_raw"]
+
+
+def test_node_publishes_poses_path_and_clouds_in_the_types_of_ros(ros: FakeROS) -> None:
+    kinds = {topic: {kind for kind, _ in messages} for topic, messages in ros.published.items()}
+    assert kinds == {
+        "/tf": {"tf2_msgs/msg/TFMessage"},
+        "/odom": {"nav_msgs/msg/Odometry"},
+        "/objects": {"visualization_msgs/msg/MarkerArray"},
+        "/cloud": {"sensor_msgs/msg/PointCloud2"},
+        "/path": {"nav_msgs/msg/Path"},
+        "/map": {"nav_msgs/msg/OccupancyGrid"},
+    }
+    assert len(ros.published["/tf"]) == len(ros.published["/odom"]) == FRAMES
+    assert len(ros.published["/map"]) == 1
+    assert len(ros.published["/path"]) == len(ros.published["/cloud"]) >= 2
+
+
+def test_odometry_follows_the_camera_to_the_right(ros: FakeROS) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    poses = [store.deserialize_cdr(message, kind) for kind, message in ros.published["/odom"]]
+    assert [pose.header.stamp.sec for pose in poses] == [5] * 10 + [6] * (FRAMES - 10)
+    right = [-matrix_of(pose.pose.pose)[1, 3] for pose in poses]  # y points left
+    np.testing.assert_allclose(right, np.arange(FRAMES) * STEP * WALL / CAMERA.fx, atol=0.02)
+
+
+def test_node_is_shorter_than_a_hundred_lines() -> None:
+    assert len(NODE.read_text().splitlines()) < 100
