@@ -1,4 +1,4 @@
-"""2D occupancy grid above the floor of an occupancy map, as planners of wheeled robots use it."""
+"""2D occupancy grid above the floor of an occupancy map, for planners of wheeled robots."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 
 _MIN_FREE = 0.5
-"""Smallest fraction of the heights above a free cell that was observed as free: a ray high above it is not enough."""
+"""Minimum fraction of the heights above a free cell that was observed as free; a single ray high above it is not
+enough."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ def level_frame(up: Tensor, offset: float) -> Tensor:
         up: Unit vector, world frame, float64, shape :math:`(3,)`.
         offset: Distance of the plane from the world's origin along ``up``, metres.
     """
-    # The world frame is that of the first camera: its optical axis is z. A camera that looks up or down has y instead.
+    # The world frame is that of the first camera, whose optical axis is z. For a camera that looks up or down, use y.
     forward = up.new_tensor([0.0, 0.0, 1.0] if abs(float(up[2])) < math.cos(math.radians(10)) else [0.0, 1.0, 0.0])
     x = torch.nn.functional.normalize(forward - (forward @ up) * up, dim=0)
     T_lw = torch.eye(4, dtype=torch.float64)

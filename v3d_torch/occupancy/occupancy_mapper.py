@@ -1,4 +1,4 @@
-"""Growth of the occupancy map frame by frame, and its correction when the poses of the frames are corrected."""
+"""Occupancy mapping: integration of frames, and correction of the map when poses are corrected."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from v3d_torch.types import TrackingStatus
 _LOG = logging.getLogger(__name__)
 
 _CHECK_INTERVAL = 10
-"""Views between two checks whether poses were corrected: about a second."""
+"""Number of views between two checks for corrected poses: about a second."""
 
 _MAX_DISPLACEMENT = 0.5
-"""Largest displacement of a view with which the map stays as it is, voxels."""
+"""Maximum displacement of a view that does not cause a rebuild of the map, voxels."""
 
 _REBUILD_VIEWS = 4
-"""Views that are added again with each new view while the map is rebuilt: a rebuild is spread over many frames."""
+"""Number of stored views that are added with each new view during a rebuild, which is spread over many frames."""
 
 
 class OccupancyMapper:
     """Adds frames to an occupancy map.
 
-    The range views that were added are stored. When bundle adjustment or a loop has moved one of them by more than half
-    a voxel, the map is rebuilt from all of them beside the current map, a few views per frame, and then replaces it.
-    A map after a rebuild is the map that the corrected poses would have given from the start.
+    All added range views are stored. When bundle adjustment or a loop has moved one of them by more than half a voxel,
+    a new map is built from all views, a few per frame, and then replaces the current map. It equals the map that the
+    corrected poses would have given from the start.
 
     Args:
         config: Occupancy map.
@@ -77,7 +77,8 @@ class OccupancyMapper:
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             poses: Poses of all frames up to this one.
-            up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None without.
+            up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None if there are
+                none.
         """
         self._up_votes = up_votes
         frame = len(poses) - 1

@@ -1,10 +1,10 @@
-"""Coordinate frames of the messages, as REP 103 and REP 105 of ROS define them.
+"""Coordinate frames of the messages, according to REP 103 and REP 105 of ROS.
 
 ======================================  ============================================================================
-``map``                                 Fixed frame of the map: x forward, y left and z up as the first camera sees
-                                        them. It is level if the first camera is.
-``odom``                                Frame in which the camera moves without jumps; ``map`` to ``odom`` holds the
-                                        corrections of the map.
+``map``                                 Fixed frame of the map: x forward, y left and z up of the first camera. It is
+                                        level if the first camera is level.
+``odom``                                Frame in which the camera moves without jumps; the transform from ``map`` to
+                                        ``odom`` contains the corrections of the map.
 ``camera_link``                         Colour camera with x forward, y left, z up.
 ``camera_color_optical_frame``          Colour camera with x right, y down, z forward: the camera frame of this package.
 ======================================  ============================================================================
@@ -61,10 +61,10 @@ def points_in_map(points: Tensor) -> Tensor:
 
 
 class OdometryFrame:
-    """Frame ``odom``: the sum of the camera's motions, each measured in the map as it was then.
+    """Frame ``odom``: the product of the camera's motions, each measured in the map at the time of the motion.
 
-    It begins at the first frame. When bundle adjustment or a loop moves the map, the camera stays where it is in
-    ``odom``, and the pose of ``odom`` in ``map`` changes.
+    Its origin is the first frame. When bundle adjustment or a loop moves the map, the pose of the camera in ``odom``
+    stays the same, and the pose of ``odom`` in ``map`` changes.
 
     Attributes:
         T_ol: Pose of ``camera_link`` in ``odom``, float64, shape :math:`(4, 4)`.
