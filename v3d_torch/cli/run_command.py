@@ -261,7 +261,7 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
         text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
         table.add_row("latency", text)
         rejected = f", {record.rejected} late or out of order" if record.rejected else ""
-        table.add_row("left out", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
+        table.add_row("dropped", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")

@@ -22,7 +22,7 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Segmenter
 
 _MAX_RUNS = 4
-"""Maximum number of runs. With a wrong focal length matches are missing; the next run, with a better one, finds more."""
+"""Maximum number of runs. With a wrong focal length matches are missing; the next run with a better one finds more."""
 
 _CONVERGED = 0.5
 """Maximum change of an estimate between two runs at convergence, in standard deviations."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 _BOX = 4
-"""Rows of the raw predictions that hold the box; class scores and mask coefficients follow."""
+"""Number of rows of the raw predictions for the box; class scores and mask coefficients follow."""
 
 _MARGIN = 2
 """Cells around a cell that its box and mask coefficients depend on: one for each of two 3x3 convolutions."""
