@@ -113,9 +113,9 @@ def calibration_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield "## Calibration"
     text = (
         "`v3d-torch calibrate --segmenter none` estimates the camera from the images, starting with a deliberately"
-        " wrong camera file. An estimate is taken if the recording determines it within its tolerance, and if it differs"
-        " significantly from the given value. The right values of a recording are those of its data set, which can"
-        " differ by some pixels from the truth."
+        " wrong camera file. An estimate is taken if the recording determines it within its tolerance, and if it"
+        " differs significantly from the given value. The right values of a recording are those of its data set, which"
+        " can differ by some pixels from the truth."
     )
     yield from part(text, flat(rows_of(measurements), columns.CALIBRATION), measurements, "sequence")
 
