@@ -172,7 +172,7 @@ def test_map_without_common_landmarks_gives_a_note(results: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("file", "words"),
     [
-        ("map_masks", "has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"),
+        ("map_masks", "has no masks; run the sequence again with --save-masks, or do not mask with --no-masks"),
         ("request.yaml", "request.yaml: cannot be read"),
         ("metrics.json", "has no results of a run"),
         ("map.ply", "map.ply: is missing, because the run did not end"),
@@ -192,7 +192,7 @@ def test_unsuitable_options_and_folders_are_errors(results: Path, tmp_path: Path
     done = call(results, "--format", "colmap", "--out", tmp_path / "full")
     assert_error_line(done, "already exists and is not an empty folder; choose another folder with --out")
     done = call(results, "--format", "tum", "--out", tmp_path / "out", "--no-masks")
-    assert_error_line(done, "--format tum: has masks and the images as recorded; remove --no-masks and --undistort")
+    assert_error_line(done, "--format tum: needs masks and the recorded images; remove --no-masks and --undistort")
     copy = tmp_path / "live"
     shutil.copytree(results, copy)
     (copy / "request.yaml").write_text(

@@ -115,7 +115,7 @@ def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Pat
     assert len(same) > 35
     assert [name for name in same if (tmp_path / "out" / name).read_bytes() != (first_out / name).read_bytes()] == []
     done = call_here(*arguments, "--out", "again", cwd=tmp_path)
-    assert_error_line(done, "run.mcap: exists already; delete it, or choose another file")
+    assert_error_line(done, "run.mcap: already exists; delete it, or choose another file")
     assert not (tmp_path / "again").exists()
 
 

@@ -13,16 +13,16 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 
 class RealtimePlayback:
-    """Live stream of the frames of a source: each frame comes when its stamp is due, counted from the first one.
+    """Live stream of the frames of a source: each frame arrives at the time of its stamp, relative to the first frame.
 
-    A frame counts as captured when it is due, also if reading it took longer.
+    A frame counts as captured when it is due, even if reading it took longer.
 
     Args:
         source: Source of frames.
         clock: Clock of the computer.
 
     Raises:
-        InputError: If the source is live already.
+        InputError: If the source is already live.
     """
 
     def __init__(self, source: RGBDStream, clock: Clock = MONOTONIC_CLOCK) -> None:

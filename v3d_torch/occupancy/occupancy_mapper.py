@@ -1,4 +1,4 @@
-"""Growth of the occupancy map frame by frame, and its correction when the poses of the frames are corrected."""
+"""Occupancy mapping: integration of frames, and correction of the map when poses are corrected."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from v3d_torch.types import TrackingStatus
 _LOG = logging.getLogger(__name__)
 
 _CHECK_INTERVAL = 10
-"""Views between two checks whether poses were corrected: about a second."""
+"""Number of views between two checks for corrected poses: about a second."""
 
 _MAX_DISPLACEMENT = 0.5
-"""Largest displacement of a view with which the map stays as it is, voxels."""
+"""Maximum displacement of a view that does not cause a rebuild of the map, voxels."""
 
 _FIRST_SEARCH = 16
 """Number of views after which the floor is first searched: a second and a half. It is searched again whenever their
 number has doubled, because a search takes up to a tenth of a second."""
 
 _REBUILD_VIEWS = 4
-"""Views that are added again with each new view while the map is rebuilt: a rebuild is spread over many frames."""
+"""Number of stored views that are added with each new view during a rebuild, which is spread over many frames."""
 
 
 class OccupancyMapper:
     """Adds frames to an occupancy map.
 
-    The range views that were added are stored. When bundle adjustment or a loop has moved one of them by more than half
-    a voxel, the map is rebuilt from all of them beside the current map, a few views per frame, and then replaces it.
-    A map after a rebuild is the map that the corrected poses would have given from the start.
+    All added range views are stored. When bundle adjustment or a loop has moved one of them by more than half a voxel,
+    a new map is built from all views, a few per frame, and then replaces the current map. It equals the map that the
+    corrected poses would have given from the start.
 
     Args:
         config: Occupancy map.

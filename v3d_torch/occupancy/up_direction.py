@@ -13,11 +13,11 @@ _GRAVITY_TOLERANCE = math.radians(5)
 """Error of an accelerometer's up direction: bias and acceleration of a camera that is moved by hand."""
 
 _IMAGE_TOLERANCE = math.radians(50)
-"""Error of an up direction that is known to a quarter turn of the image only, and not known across the image: a camera
-that looks up or down, or is rolled, by less. The normals of walls are then farther from it than that of the floor."""
+"""Error of an up direction that is known only to a quarter turn of the image: the camera can look up or down, or be
+rolled, by less than this. The normals of walls are then farther from the direction than the normal of the floor."""
 
 _MIN_VOTES = 3.0
-"""Length of the sum of votes from which on it is more reliable than the first camera, in detections of score 1."""
+"""Minimum length of the sum of votes to be more reliable than the first camera, in detections of score 1."""
 
 
 class UpDirection(NamedTuple):

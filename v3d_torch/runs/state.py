@@ -58,7 +58,7 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
 
     Args:
         path: File.
-        segment: Segmenter; None for that of the configuration.
+        segment: Segmenter; None to create the one named in the configuration.
 
     Raises:
         InputError: If the file is missing, damaged, not a saved state, or from another version.
