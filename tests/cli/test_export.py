@@ -148,7 +148,7 @@ def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_pat
         assert_error_line(call(*arguments, tmp_path / f"to_{name}", "--seq", tmp_path / name), words)
 
 
-def test_broken_frames_that_the_run_passed_over_are_left_out(sequence: Path, tmp_path: Path) -> None:
+def test_broken_frames_that_the_run_skipped_are_left_out(sequence: Path, tmp_path: Path) -> None:
     shutil.copytree(sequence, tmp_path / "walk")
     broken = sorted((tmp_path / "walk" / "rgb").iterdir())[2]
     broken.write_bytes(b"")

@@ -36,7 +36,7 @@ def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(run.app, command(*arguments)[3:], env={"COLUMNS": "120", "NO_COLOR": "1"})
 
 
-def test_run_reports_latency_frames_left_out_and_accuracy(sequence: Path, tmp_path: Path) -> None:
+def test_run_reports_latency_dropped_frames_and_accuracy(sequence: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = call("--seq", sequence, "--segmenter", "none", "--realtime", "--out", out)
     assert done.exit_code == 0, done.output

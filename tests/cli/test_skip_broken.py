@@ -79,7 +79,7 @@ def assert_same_results(out: Path, expected: Path) -> None:
         assert first[key] == second[key], key
 
 
-def test_broken_frames_are_passed_over_and_counted(broken: Path, serial: tuple[Path, Result]) -> None:
+def test_broken_frames_are_skipped_and_counted(broken: Path, serial: tuple[Path, Result]) -> None:
     out, done = serial
     assert (done.exit_code, done.stderr) == (0, "")
     metrics = json.loads((out / "metrics.json").read_text())

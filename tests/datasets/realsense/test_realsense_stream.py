@@ -291,7 +291,7 @@ def test_run_command_on_a_live_camera_ends_with_ctrl_c_and_results(
     assert metrics["frames"] == metrics["processed"] + metrics["dropped"]
     assert metrics["processed"] == metrics["tracked"] >= 3
     assert 0 <= metrics["latency"]["median"] <= metrics["latency"]["p95"] <= metrics["latency"]["max"]
-    assert "latency" in done.output and "left out" in done.output
+    assert "latency" in done.output and "dropped" in done.output
     assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
 
 
