@@ -145,6 +145,18 @@ class V3DSLAM(ReplaceableStages):
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
 
     @property
+    def up(self) -> Tensor:
+        """Direction against gravity as it is known now, unit vector, world frame, float64, shape :math:`(3,)`.
+
+        It comes from measured gravity, else from the floor in the occupancy map, else from the segmentation, else from
+        the first image. Boxes of objects need it: ``result.objects[0].box(slam.up)``.
+        """
+        floor = None if self.occupancy is None else self.occupancy.floor
+        if self.gravity is None and floor is not None:
+            return floor.up
+        return estimate_up(self.gravity, up_votes(self._segmenter_state)).direction
+
+    @property
     def T_lw(self) -> Tensor | None:
         """Transform from the world to the level frame, see `level_frame`, float64, shape :math:`(4, 4)`.
 

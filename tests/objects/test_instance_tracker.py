@@ -179,8 +179,8 @@ def test_partial_view_changes_the_prediction_less() -> None:
         cut(Board(0.0))
         grown(Board(0.0, width=0.2))
     (same,), (part,) = grown(half), cut(half)
-    assert float(same.predict_centroid(0.5)[0]) < -0.05
-    assert abs(float(part.predict_centroid(0.5)[0])) < 0.5 * abs(float(same.predict_centroid(0.5)[0]))
+    assert float(same.predict_state(0.5).position[0]) < -0.05
+    assert abs(float(part.predict_state(0.5).position[0])) < 0.5 * abs(float(same.predict_state(0.5).position[0]))
     assert abs(float(part.velocity[0])) < 0.5 * abs(float(same.velocity[0]))
 
 
@@ -497,7 +497,7 @@ def test_world_correction_moves_the_whole_track(xi: tuple[float, ...]) -> None:
     assert [track.id for track in old] == [track.id for track in new] == [1, 2]
     for a, b in zip(old, new, strict=True):
         torch.testing.assert_close(a.velocity, b.velocity, rtol=0.0, atol=1e-6)
-        torch.testing.assert_close(a.predict_centroid(0.5), b.predict_centroid(0.5), rtol=0.0, atol=1e-6)
+        torch.testing.assert_close(a.predict_state(0.5).position, b.predict_state(0.5).position, rtol=0.0, atol=1e-6)
         for s, r in zip(a.detections, b.detections, strict=True):
             torch.testing.assert_close(s.centroid, r.centroid, rtol=0.0, atol=1e-6)
             torch.testing.assert_close(s.cloud, r.cloud, rtol=0.0, atol=1e-5)
@@ -542,7 +542,7 @@ def test_equal_stamps_keep_id_and_velocity() -> None:
         (track,) = track_boards(Board(0.03 * frame), stamp=0.03 * frame)
     assert track.id == 1
     assert float((track.velocity - torch.tensor([1.0, 0.0, 0.0])).norm()) < 0.2
-    assert float(track.predict_centroid(0.27)[0]) == pytest.approx(0.27, abs=0.03)
+    assert float(track.predict_state(0.27).position[0]) == pytest.approx(0.27, abs=0.03)
 
 
 def test_result_of_a_frame_is_not_changed_by_the_next_frame() -> None:
@@ -567,6 +567,6 @@ def test_state_dict_continues_with_identical_results() -> None:
             assert [(t.id, t.missed, t.label) for t in tracks] == [(t.id, t.missed, t.label) for t in others]
             for track, other in zip(tracks, others, strict=True):
                 assert torch.equal(track.mask, other.mask) and torch.equal(track.velocity, other.velocity)
-                assert torch.equal(track.predict_centroid(1.0), other.predict_centroid(1.0))
+                assert torch.equal(track.predict_state(1.0).position, other.predict_state(1.0).position)
                 assert len(track.detections) == len(other.detections)
     assert [track.id for track in tracks] == [1, 2, 3]

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import lstsq
+from scipy.stats import chi2
 
 from v3d_torch.config import TrackerConfig
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.object_state import ObjectState
 
 
 @settings(max_examples=20, deadline=None)
@@ -33,12 +38,43 @@ def test_kalman_filter_equals_least_squares(steps: list[tuple[float, float, floa
         right += [0.0, 0.0, x / sigma]
     position, velocity = lstsq(np.stack(rows), np.array(right))[0][-2:]
     expected = torch.tensor([position + 0.2 * velocity, 2.0, 3.0], dtype=torch.float64)
-    torch.testing.assert_close(motion.predict(stamp + 0.2), expected, rtol=0.0, atol=1e-7)
-    torch.testing.assert_close(motion.velocity, torch.tensor([velocity, 0.0, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(motion.state.predict(stamp + 0.2).position, expected, rtol=0.0, atol=1e-7)
+    torch.testing.assert_close(motion.state.velocity, torch.tensor([velocity, 0.0, 0.0], dtype=torch.float64))
 
 
 def test_kalman_filter_limits_the_speed() -> None:
     motion = ConstantVelocityKalmanFilter(TrackerConfig(max_speed=2.0))
     for frame in range(10):
         motion.update(0.1 * frame, torch.tensor([0.9, 0.0, 1.2], dtype=torch.float64) * frame, 0.05)
-    torch.testing.assert_close(motion.velocity, torch.tensor([1.2, 0.0, 1.6], dtype=torch.float64))
+    torch.testing.assert_close(motion.state.velocity, torch.tensor([1.2, 0.0, 1.6], dtype=torch.float64))
+
+
+def test_covariance_of_the_filter_is_that_of_its_errors() -> None:
+    """Monte Carlo: walks with white acceleration noise; 500 errors of position and velocity, whitened."""
+    generator, config = np.random.default_rng(0), TrackerConfig(max_speed=1e6, acceleration_noise=2.0)
+    dt, sigma, squared = 0.1, 0.05, []
+    noise = 2.0**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    step = np.linalg.cholesky(noise)
+    for _ in range(500):
+        motion = ConstantVelocityKalmanFilter(config)
+        position, velocity = np.zeros(3), generator.normal(size=3)
+        for k in range(15):
+            measured = position + sigma * generator.normal(size=3)
+            motion.update(k * dt, torch.from_numpy(measured), sigma)
+            change = step @ generator.normal(size=(2, 3))
+            position, velocity = position + dt * velocity + change[0], velocity + change[1]
+        predicted = motion.state.predict(15 * dt)
+        error = np.concatenate([predicted.position.numpy() - position, predicted.velocity.numpy() - velocity])
+        squared.append(error @ np.linalg.solve(predicted.covariance.numpy(), error))
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(squared)) / len(squared)
+    assert low < np.mean(squared) < high
+
+
+def test_state_is_transformed_with_the_world() -> None:
+    T = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.4, 0.5, -0.6], dtype=torch.float64))
+    position, velocity = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    state = ObjectState(1.0, position, velocity, (1.0, 0.1, 2.0), 2.0)
+    later, moved = state.predict(1.7), state.transform(T).predict(1.7)
+    torch.testing.assert_close(moved.position, T[:3, :3] @ later.position + T[:3, 3])
+    assert moved.variances == later.variances
+    assert torch.equal(state.covariance, state.covariance.T) and state.sigmas == (1.0, math.sqrt(2.0))

@@ -22,6 +22,7 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import NumericsError
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runs.numerics_check import CheckedSLAM, CheckedStage, check_finite
 from v3d_torch.runs.request import RunRequest
@@ -113,7 +114,8 @@ OBJECT_WITHOUT_CLOUD = TrackedObject(
     id=0,
     label=0,
     mask=torch.zeros(480, 640, dtype=torch.bool),
-    centroid=torch.full((3,), math.nan, dtype=torch.float64),
+    state=ObjectState(0.0, torch.full((3,), math.nan, dtype=torch.float64), torch.zeros(3), (1.0, 0.0, 1.0), 2.0),
+    history=(),
     votes=0,
     chamfer=math.nan,
     motion_state=MotionState.UNKNOWN,

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import torch
 from torch import Tensor
 
+from v3d_torch.objects.object_state import ObjectState
+from v3d_torch.objects.upright_box import UprightBox, upright_box
 from v3d_torch.segmentation.coco import class_name
 
 
@@ -27,7 +30,8 @@ class TrackedObject:
         id: Number of the object.
         label: COCO class index; see `name` for the class name.
         mask: Pixels of the object, bool, shape :math:`(H, W)`.
-        centroid: Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown.
+        state: Position and velocity with their covariance at the time of the frame.
+        history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the baselines.
         chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured,
             for example because the object is dynamic.
@@ -39,12 +43,31 @@ class TrackedObject:
     id: int
     label: int
     mask: Tensor
-    centroid: Tensor
+    state: ObjectState
+    history: tuple[ObjectState, ...]
     votes: int
     chamfer: float
     motion_state: MotionState
     missed: bool
     cloud: Tensor
+
+    @property
+    def centroid(self) -> Tensor:
+        """Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown."""
+        return self.state.position
+
+    def box(self, up: Tensor) -> UprightBox | None:
+        """Return the upright box around the cloud; None without a cloud or a centroid.
+
+        The cloud of a missed object is moved to the predicted centroid.
+
+        Args:
+            up: Direction against gravity, world frame, shape :math:`(3,)`, such as `V3DSLAM.up`.
+        """
+        if not len(self.cloud) or not self.state.is_known:
+            return None
+        motion = self.centroid - self.cloud.to(torch.float64).mean(dim=0) if self.missed else torch.zeros(3)
+        return upright_box(self.cloud + motion, up, self.state.velocity)
 
     @property
     def name(self) -> str:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 
 _CENTROID_SIGMA = 0.05
@@ -32,6 +33,9 @@ _APPEARANCE_RATE = 0.1
 
 _HISTORY = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""
+
+_STATE_HISTORY, _HISTORY_INTERVAL = 10.0, 0.1 - 1e-3
+"""Length of the history of states, and minimum time between two of them, seconds: for planners and drawings."""
 
 STAMP_TOLERANCE = 1e-3
 """Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
@@ -86,6 +90,7 @@ class Track:
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
+        history: States after detections of the last 10 s, oldest first.
     """
 
     id: int
@@ -108,6 +113,7 @@ class Track:
     last_deforming: float = -torch.inf
 
     def __post_init__(self, config: TrackerConfig) -> None:
+        self.history: list[ObjectState] = []
         self._filter = ConstantVelocityKalmanFilter(config)
         self._max_points = 1
 
@@ -124,7 +130,7 @@ class Track:
     @property
     def velocity(self) -> Tensor:
         """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
-        return self._filter.velocity
+        return self._filter.state.velocity
 
     def detection_pair(self, baseline: float) -> tuple[Detection3D, Detection3D] | None:
         """Return the newest detection and an earlier one to compare it with.
@@ -141,16 +147,13 @@ class Track:
                 return (previous, current) if previous.is_located and current.is_located else None
         return None
 
-    def predict_centroid(self, stamp: float) -> Tensor:
-        """Predict the position with constant velocity (paper, Sec. II).
+    def predict_state(self, stamp: float) -> ObjectState:
+        """Predict position and velocity with constant velocity (paper, Sec. II).
 
         Args:
             stamp: Timestamp, seconds.
-
-        Returns:
-            Position, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
         """
-        return self._filter.predict(stamp)
+        return self._filter.state.predict(stamp)
 
     def predict_cloud(self, stamp: float) -> Tensor:
         """Predict the cloud: the newest cloud, moved with constant velocity.
@@ -184,6 +187,7 @@ class Track:
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self._centroid_sigma(detection))
         self.vacant_time = 0.0
+        self._remember_state()
         self.detections.append(detection)
         oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
@@ -261,9 +265,17 @@ class Track:
         """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
         self._filter.apply_world_correction(T_new_old)
+        self.history = [state.transform(T_new_old) for state in self.history]
         self.detections = [
             Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
         ]
+
+    def _remember_state(self) -> None:
+        """Append the state to the history, at the rate of the history, and drop the states that are too old."""
+        state = self._filter.state
+        if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
+            oldest = state.stamp - _STATE_HISTORY
+            self.history = [each for each in self.history if each.stamp >= oldest] + [state]
 
     def _centroid_sigma(self, detection: Detection3D) -> float:
         """Return the standard deviation of each coordinate of the centroid of a detection, metres."""

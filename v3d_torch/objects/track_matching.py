@@ -228,7 +228,7 @@ def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
 
 def _within_gate(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Mask of the pairs whose distance is within the maximum motion of the track, bool, shape (T, N)."""
-    predicted = torch.stack([track.predict_centroid(detected.stamp) for track in tracks])
+    predicted = torch.stack([track.predict_state(detected.stamp).position for track in tracks])
     observed = torch.stack([detection.centroid for detection in detected.detections])
     elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
     return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * elapsed

@@ -15,6 +15,7 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.live_slam import LiveResult
 from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
+from v3d_torch.objects.upright_box import UprightBox
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame, TrackingStatus
@@ -94,8 +95,9 @@ class FrameTimes:
 class ObjectTable(TensorTable):
     """Objects of all frames, one row per frame and object.
 
-    The columns are the index and timestamp of the frame, and id, COCO class, centroid (world frame, metres), votes,
-    Chamfer distance, position of the motion state in `MotionState`, and true if the network missed the object.
+    The columns are the index and timestamp of the frame, and id, COCO class, centroid and velocity (world frame, metres
+    and seconds) with the standard deviation of each coordinate, upright box (centre, size, yaw), votes, Chamfer
+    distance, position of the motion state in `MotionState`, and true if the network missed the object.
     """
 
     def __init__(self) -> None:
@@ -105,14 +107,17 @@ class ObjectTable(TensorTable):
             id=((), torch.int64),
             label=((), torch.int64),
             centroid=((3,), torch.float64),
+            velocity=((3,), torch.float64),
+            sigmas=((2,), torch.float64),
+            box=((7,), torch.float64),
             votes=((), torch.int64),
             chamfer=((), torch.float64),
             motion_state=((), torch.int64),
             missed=((), torch.bool),
         )
 
-    def append_objects(self, frame: RGBDFrame, objects: Sequence[TrackedObject]) -> None:
-        """Append the objects of a frame."""
+    def append_objects(self, frame: RGBDFrame, objects: Sequence[TrackedObject], up: Tensor) -> None:
+        """Append the objects of a frame; `up` is the direction against gravity in the world frame, shape (3,)."""
         if not objects:
             return
         self.append(
@@ -121,6 +126,9 @@ class ObjectTable(TensorTable):
             id=torch.tensor([each.id for each in objects]),
             label=torch.tensor([each.label for each in objects]),
             centroid=torch.stack([each.centroid for each in objects]),
+            velocity=torch.stack([each.state.velocity for each in objects]),
+            sigmas=torch.tensor([each.state.sigmas for each in objects], dtype=torch.float64),
+            box=torch.tensor([_box_values(each.box(up)) for each in objects], dtype=torch.float64),
             votes=torch.tensor([each.votes for each in objects]),
             chamfer=torch.tensor([each.chamfer for each in objects], dtype=torch.float64),
             motion_state=torch.tensor([_MOTION_STATES.index(each.motion_state) for each in objects]),
@@ -130,6 +138,11 @@ class ObjectTable(TensorTable):
     def count_motion_states(self) -> dict[MotionState, int]:
         """Return the number of rows with each motion state, in the order of their first row."""
         return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
+
+
+def _box_values(box: UprightBox | None) -> list[float]:
+    """Return centre, size and yaw of a box; NaN without a box."""
+    return [torch.nan] * 7 if box is None else [*box.T_wb[:3, 3].tolist(), *box.size.tolist(), box.yaw]
 
 
 class StateTable(TensorTable):

@@ -33,7 +33,7 @@ MAY_BE_NAN = frozenset(
     {
         "InstanceClouds.centroid",  # of a cloud with too few points
         "NewlyOccupied.appeared",  # if it is not known
-        "TrackedObject.centroid",  # of an object that never had a clean cloud
+        "ObjectState.position",  # of an object that never had a clean cloud
         "TrackedObject.chamfer",  # if it was not measured
     }
 )

@@ -49,6 +49,12 @@ _LOG = logging.getLogger(__name__)
 
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
+_STATE_COLUMNS = (
+    *("vx", "vy", "vz", "position_sigma", "velocity_sigma"),
+    *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
+)
+"""Columns of velocity, uncertainty and box of an object."""
+
 _DYNAMICS = pa.schema(
     [
         ("frame", pa.int64()),
@@ -58,6 +64,7 @@ _DYNAMICS = pa.schema(
         ("x", pa.float64()),
         ("y", pa.float64()),
         ("z", pa.float64()),
+        *((name, pa.float64()) for name in _STATE_COLUMNS),
         ("votes", pa.int64()),
         ("chamfer", pa.float64()),
         ("motion_state", pa.string()),
@@ -82,7 +89,7 @@ def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Eval
     """
     trajectory, evaluation = _write_tables(folder, pipeline)
     _write_maps(folder, pipeline, trajectory, point_map)
-    draw_run(folder / "figures", pipeline, trajectory)
+    draw_run(folder / "figures", pipeline, trajectory, point_map)
     _write_metrics(folder, pipeline, evaluation, pipeline.record.failure)
     return evaluation
 
@@ -147,6 +154,7 @@ def _frame_table(pipeline: Pipeline) -> pa.Table:
 def _object_table(dynamics: ObjectTable) -> pa.Table:
     """Return the table of objects: one row per frame and object."""
     x, y, z = dynamics["centroid"].T
+    state = torch.cat([dynamics["velocity"], dynamics["sigmas"], dynamics["box"]], dim=1)
     states = [state.value for state in MotionState]
     columns = {
         "frame": dynamics["frame"],
@@ -156,6 +164,7 @@ def _object_table(dynamics: ObjectTable) -> pa.Table:
         "x": x,
         "y": y,
         "z": z,
+        **dict(zip(_STATE_COLUMNS, state.T, strict=True)),
         "votes": dynamics["votes"],
         "chamfer": dynamics["chamfer"],
         "motion_state": [states[code] for code in dynamics["motion_state"].tolist()],

@@ -17,6 +17,7 @@ from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.range_view import RangeView
@@ -33,7 +34,8 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 STATE_CLASSES: tuple[type, ...] = (
     *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus, CameraState),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
-    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView, Floor, UpDirection),
+    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig),
+    *(RangeView, Floor, UpDirection),
 )
 """Classes of the package that a saved state can contain; others are not read."""
 

@@ -11,22 +11,25 @@ from v3d_torch.geometry.camera import BackProjector
 from v3d_torch.objects.frame_objects import TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
+from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure
 from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.object_overlay import Overlay, save_mask_figure
+from v3d_torch.viz.objects_figure import draw_objects
 from v3d_torch.viz.occupancy_figure import draw_occupancy
 from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 from v3d_torch.viz.voting import save_voting_figure
 
 
-def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
-    """Draw trajectory, masks, occupancy map, and the votes and clouds of the most dynamic frame, if there are any.
+def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:
+    """Draw trajectory, masks, objects, occupancy map, and votes and clouds of the most dynamic frame, if there are any.
 
     Args:
         folder: Folder of the images.
         pipeline: Pipeline after the run.
         trajectory: Poses of all frames.
+        point_map: Static map.
 
     Raises:
         OutputError: If an image cannot be written.
@@ -37,6 +40,9 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory) -> None:
         images = [snapshot.frame.image for snapshot in record.snapshots]
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
         save_mask_figure(images, overlays, folder / "masks.png")
+    if len(record.dynamics):
+        figure = draw_objects(record.dynamics, trajectory, point_map.points, pipeline.slam.up, sequence.name)
+        save_figure(figure, folder / "objects.png")
     mapper = pipeline.slam.occupancy
     if mapper is not None and not mapper.map.is_empty:
         up, floor = mapper.up.direction, mapper.find_floor()

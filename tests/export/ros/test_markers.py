@@ -11,22 +11,33 @@ from torch import Tensor
 from v3d_torch.export.ros.frames import map_frame
 from v3d_torch.export.ros.markers import Marker, object_markers
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
+from v3d_torch.objects.object_state import ObjectState
 
 MASK = torch.zeros(2, 2, dtype=torch.bool)
-CLOUD = torch.tensor([[1.0, -0.5, 4.0], [2.0, 0.5, 4.5], [1.2, 1.5, 4.1]])
+CLOUD = torch.cartesian_prod(torch.tensor([1.0, 2.0]), torch.tensor([-0.5, 1.5]), torch.tensor([4.0, 4.5]))
 """Points right of the camera, 2 m high: x from 1 to 2, y (down) from -0.5 to 1.5, z from 4 to 4.5."""
 
 
-def make_object(state: MotionState, cloud: Tensor = CLOUD, centroid: Tensor | None = None, **other: Any) -> Any:
+UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+AT_REST = torch.zeros(3, dtype=torch.float64)
+
+
+def make_object(
+    state: MotionState,
+    cloud: Tensor = CLOUD,
+    centroid: Tensor | None = None,
+    velocity: Tensor = AT_REST,
+    **other: Any,
+) -> Any:
     centroid = cloud.mean(dim=0).to(torch.float64) if centroid is None else centroid
+    motion = ObjectState(2.5, centroid, velocity, (0.01, 0.0, 0.04), 2.0)
     values = {"id": 7, "label": 0, "mask": MASK, "votes": 0, "chamfer": 0.0, "missed": False, **other}
-    return TrackedObject(motion_state=state, cloud=cloud, centroid=centroid, **values)
+    return TrackedObject(motion_state=state, cloud=cloud, state=motion, history=(), **values)
 
 
-def markers_of(*objects: TrackedObject, velocity: Tensor | None = None) -> dict[str, Any]:
-    velocities = {} if velocity is None else {7: velocity}
+def markers_of(*objects: TrackedObject) -> dict[str, Any]:
     shown = FrameObjects(list(objects), ~MASK, ~MASK, [])
-    first, *others = object_markers(2.5, shown, velocities, map_frame(None)).markers
+    first, *others = object_markers(2.5, shown, UP, map_frame(None)).markers
     assert first.action == Marker.DELETEALL
     assert all(each.action == Marker.ADD and each.header.frame_id == "map" for each in others)
     return {each.ns: each for each in others}
@@ -40,8 +51,10 @@ def test_convention_box_encloses_the_cloud_in_map() -> None:
     box = markers_of(make_object(MotionState.STATIC))["boxes"]
     assert (box.type, box.id) == (Marker.CUBE, 7)
     assert components(box.pose.position) == pytest.approx([4.25, -1.5, -0.5])  # forward, left, up
-    assert components(box.scale) == pytest.approx([0.5, 1.0, 2.0])
-    assert box.pose.orientation.w == 1
+    assert components(box.scale) == pytest.approx([1.0, 0.5, 2.0])  # at rest, forward is the longer side: to the left
+    assert abs(box.pose.orientation.z) == pytest.approx(0.5**0.5) and abs(box.pose.orientation.w) == pytest.approx(
+        0.5**0.5
+    )
 
 
 def test_box_of_missed_object_is_at_its_predicted_centroid() -> None:
@@ -60,11 +73,11 @@ def test_name_is_above_the_box_in_the_colour_of_the_motion_state() -> None:
 
 def test_velocity_of_dynamic_object_is_an_arrow_to_its_place_a_second_later() -> None:
     velocity = torch.tensor([-1.0, 0.0, 0.5], dtype=torch.float64)  # to the left and away
-    markers = markers_of(make_object(MotionState.DYNAMIC), velocity=velocity)
+    markers = markers_of(make_object(MotionState.DYNAMIC, velocity=velocity))
     start, end = markers["velocities"].points
-    assert components(start) == pytest.approx([4.2, -1.4, -0.5])
+    assert components(start) == pytest.approx([4.25, -1.5, -0.5])
     assert [b - a for a, b in zip(components(start), components(end), strict=True)] == pytest.approx([0.5, 1.0, 0.0])
-    assert "velocities" not in markers_of(make_object(MotionState.STATIC), velocity=velocity)
+    assert "velocities" not in markers_of(make_object(MotionState.STATIC, velocity=velocity))
 
 
 def test_objects_without_centroid_or_cloud_have_no_markers() -> None:

@@ -81,8 +81,7 @@ class RunMessages:
             return
         self._T_mw = frames.map_frame(slam.T_lw)
         yield from self._pose_messages(stamp, slam)
-        velocities = {track.id: track.velocity for track in slam.classify_motion.tracker.tracks}
-        yield "/objects", object_markers(stamp, objects, velocities, self._T_mw)
+        yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
         keyframes = slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             yield "/cloud", self._cloud(frame, objects.static_without_people)

@@ -44,7 +44,8 @@ class RerunViewer:
     ========================================  ==========================================================================
     ``world/camera``                          pose of the frame, T_wc
     ``world/camera/image``                    pinhole; below it ``rgb``, ``depth``, ``masks`` and boxes of ``objects``
-    ``world/objects``, ``world/centroids``    clouds and centroids of the objects; their class is the motion state
+    ``world/objects``, ``world/centroids``    clouds and centroids of the objects; their class is the motion state;
+                                              ``boxes``; ``paths`` of the last seconds
     ``world/votes``                           lines of votes for dynamic objects; other votes: ``without_effect``
     ``world/map``                             ``landmarks`` and ``keyframes``, logged again after each new keyframe;
                                               ``points`` of the static scene, at the end
@@ -98,7 +99,7 @@ class RerunViewer:
             is_keyframe = bool(keyframes) and keyframes[-1].frame == frame.index
             T_wc = invert(slam.poses.T_cw)
             self._log_camera(frame, T_wc)
-            log_objects(self._stream, objects)
+            log_objects(self._stream, objects, slam.up)
             if self._pending_keyframe is not None:
                 self._log_map(slam)
             else:

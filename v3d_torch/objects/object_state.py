@@ -1,0 +1,72 @@
+"""State of an object: position and velocity with their covariance, and its prediction with constant velocity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ObjectState:
+    """Position and velocity of an object at one time, as its Kalman filter estimates them.
+
+    The three axes are independent and have the same covariance, because the errors of centroids come from the visible
+    part of the object and have no preferred direction.
+
+    Attributes:
+        stamp: Timestamp, seconds.
+        position: Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
+        velocity: World frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid.
+        variances: Of each axis: variance of the position, covariance of position and velocity, variance of the
+            velocity; square metres, m^2/s and m^2/s^2.
+        acceleration_noise: Square root of the spectral density of the acceleration, m/s^1.5: the uncertainty that a
+            prediction adds.
+    """
+
+    stamp: float
+    position: Tensor
+    velocity: Tensor
+    variances: tuple[float, float, float]
+    acceleration_noise: float
+
+    @cached_property
+    def is_known(self) -> bool:
+        """True once a centroid has been measured."""
+        return bool(torch.isfinite(self.position).all())
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Standard deviation of each coordinate of the position, metres, and of the velocity, m/s."""
+        return math.sqrt(self.variances[0]), math.sqrt(self.variances[2])
+
+    @property
+    def covariance(self) -> Tensor:
+        """Covariance of position and velocity, in this order, float64, shape :math:`(6, 6)`."""
+        pp, pv, vv = self.variances
+        of_axis = self.position.new_tensor([[pp, pv], [pv, vv]])
+        return torch.kron(of_axis, torch.eye(3, dtype=self.position.dtype))
+
+    def predict(self, stamp: float) -> ObjectState:
+        """Predict the state with constant velocity and white acceleration noise.
+
+        Args:
+            stamp: Timestamp, not earlier than that of the state, seconds.
+        """
+        dt, noise = stamp - self.stamp, self.acceleration_noise**2
+        pp, pv, vv = self.variances
+        pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
+        variances = pp, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
+        return replace(self, stamp=stamp, position=self.position + self.velocity * dt, variances=variances)
+
+    def transform(self, T_new_old: Tensor) -> ObjectState:
+        """Transform the state into another world frame; the covariance is the same in all of them.
+
+        Args:
+            T_new_old: Transform from the old to the new world frame, float64, shape :math:`(4, 4)`.
+        """
+        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        return replace(self, position=R @ self.position + t, velocity=R @ self.velocity)

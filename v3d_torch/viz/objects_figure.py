@@ -1,0 +1,99 @@
+"""Figure of the objects of a run from above: their paths and boxes in the room, with the path of the camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from v3d_torch.geometry.level_frame import level_frame
+from v3d_torch.objects.frame_objects import MotionState
+from v3d_torch.pipeline.run_record import ObjectTable
+from v3d_torch.segmentation.coco import class_name
+from v3d_torch.types import Trajectory
+from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MAX_POINTS = 60_000
+"""Number of points of the static map that are drawn."""
+
+_MIN_FRAMES = 5
+"""Objects of fewer frames are not drawn: most are false detections."""
+
+_STATES = tuple(MotionState)
+
+
+def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, up: Tensor, title: str = "") -> Figure:
+    """Draw the objects of a run from above, in the level frame.
+
+    A line is the path of an object, in the colour of its motion state in each frame. Its last box is outlined, with its
+    name, and an arrow to where it would be a second later if it is dynamic. Static points of the map are grey.
+
+    Args:
+        objects: Objects of all frames.
+        trajectory: Poses of all frames.
+        points: Points of the static map, world frame, metres, shape :math:`(P, 3)`.
+        up: Direction against gravity, world frame, shape :math:`(3,)`.
+        title: Title of the figure.
+    """
+    R_lw = level_frame(up)[:3, :3]
+    figure = Figure(figsize=(7.5, 6.5), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    background = points[:: max(1, len(points) // _MAX_POINTS)].to(torch.float64) @ R_lw.T
+    x, y, _ = background.T.numpy()
+    axes.scatter(x, y, s=0.3, color="#c8c8c8", linewidths=0, rasterized=True)
+    x, y, _ = (trajectory.T_wc[:, :3, 3] @ R_lw.T).T.numpy()
+    axes.plot(x, y, color="tab:blue", linewidth=1.2, label="camera path")
+    ids, counts = np.unique(objects["id"].numpy(), return_counts=True)
+    for number in ids[counts >= _MIN_FRAMES].tolist():
+        _draw_object(axes, objects, objects["id"].numpy() == number, R_lw)
+    for state, colour in MOTION_STATE_COLOURS.items():
+        axes.plot([], [], color=colour, label=state)
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.grid(True, linewidth=0.4, alpha=0.5)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    axes.set_title(title, parse_math=False)  # the name of a folder may contain dollar signs
+    return figure
+
+
+def _draw_object(axes: Axes, objects: ObjectTable, rows: NDArray[np.bool_], R_lw: Tensor) -> None:
+    """Draw path, last box and velocity of one object."""
+    centroid = (objects["centroid"][rows] @ R_lw.T)[:, :2].numpy()
+    colours = [MOTION_STATE_COLOURS[_STATES[code].value] for code in objects["motion_state"][rows].tolist()]
+    segments = np.stack([centroid[:-1], centroid[1:]], axis=1)
+    axes.add_collection(LineCollection(list(segments), colors=colours[1:], linewidths=1.5))
+    box = objects["box"][rows]
+    known = box[:, 0].isfinite().nonzero()[:, 0]
+    if not len(known):
+        return
+    last = int(known[-1])
+    name = f"{class_name(int(objects['label'][rows][last]))} {int(objects['id'][rows][last])}"
+    outline = box_outline(box[last], R_lw)
+    axes.plot(*outline.T, color=colours[last], linewidth=1.0)
+    axes.annotate(name, outline.max(axis=0), fontsize=6, color=colours[last])
+    if colours[last] == MOTION_STATE_COLOURS["dynamic"]:
+        x, y = (R_lw @ objects["velocity"][rows][last])[:2].tolist()
+        arrow = {"arrowstyle": "->", "color": colours[last]}
+        axes.annotate("", centroid[last] + (x, y), centroid[last], arrowprops=arrow)
+
+
+def box_outline(box: Tensor, R_lw: Tensor) -> NDArray[np.float64]:
+    """Return the closed outline of a box from above, level frame, metres, shape :math:`(5, 2)`.
+
+    Args:
+        box: Centre (world frame), size and yaw of an `UprightBox`, float64, shape :math:`(7,)`.
+        R_lw: Rotation from the world to the level frame, float64, shape :math:`(3, 3)`.
+    """
+    centre, (length, width), yaw = (R_lw @ box[:3])[:2].numpy(), box[3:5].tolist(), float(box[6])
+    forward, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1)]) / 2
+    return np.asarray(centre + signs[:, :1] * length * forward + signs[:, 1:] * width * left)
