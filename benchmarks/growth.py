@@ -19,7 +19,7 @@ import torch
 from command import make_parser, publish
 from contenders.ours import Ours
 from heading import make_heading
-from replay import Replay, forth_and_back
+from replay import Replay, back_and_forth
 from sequences import locate_sequence
 from storage import Measurement, Row
 from tables import flat
@@ -70,7 +70,7 @@ class LongRun:
 
 def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
     """Play a sequence forwards and backwards, and measure every block of frames."""
-    system = Ours(Replay(sequence, forth_and_back(len(sequence), frames)), "v3d_torch", seed=0)
+    system = Ours(Replay(sequence, back_and_forth(len(sequence), frames)), "v3d_torch", seed=0)
     slam = system.slam
 
     def take_snapshot() -> Snapshot:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from replay import forth_and_back
+from replay import back_and_forth
 
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.segmentation import MaskFolder
@@ -43,7 +43,7 @@ class Case:
 
 def covered(count: int, before: int, gap: int, after: int) -> Case:
     """Cover the camera for some frames."""
-    shown = forth_and_back(count, before + gap + after)
+    shown = back_and_forth(count, before + gap + after)
     shown[before : before + gap] = gap * [COVERED]
     positions = list(range(len(shown)))
     return Case(f"{gap} covered", shown, positions, positions, before, before + gap)
@@ -51,16 +51,16 @@ def covered(count: int, before: int, gap: int, after: int) -> Case:
 
 def dropped(count: int, before: int, gap: int, after: int) -> Case:
     """Drop frames."""
-    shown, positions = forth_and_back(count, before + gap + after), list(range(before + gap + after))
+    shown, positions = back_and_forth(count, before + gap + after), list(range(before + gap + after))
     del shown[before : before + gap], positions[before : before + gap]
     return Case(f"{gap} dropped", shown, positions, positions, before, before)
 
 
 def elsewhere(count: int, before: int, after: int) -> Case:
     """Move the camera to another part of the sequence and back, each from one frame to the next."""
-    path = forth_and_back(count, before + after)
+    path = back_and_forth(count, before + after)
     first = max(count - AWAY, 0)
-    shown = [*path[:before], *(first + index for index in forth_and_back(count - first, AWAY)), *path[before:]]
+    shown = [*path[:before], *(first + index for index in back_and_forth(count - first, AWAY)), *path[before:]]
     plain = [*range(before), *(AWAY * [NO_POSITION]), *range(before, before + after)]
     return Case(f"{AWAY} elsewhere", shown, list(range(len(shown))), plain, before, before + AWAY)
 
@@ -68,7 +68,7 @@ def elsewhere(count: int, before: int, after: int) -> Case:
 def uninterrupted(count: int, frames: int) -> Case:
     """Play the sequence without interruption."""
     positions = list(range(frames))
-    return Case("none", forth_and_back(count, frames), positions, positions, frames, frames)
+    return Case("none", back_and_forth(count, frames), positions, positions, frames, frames)
 
 
 class InterruptedFrames:

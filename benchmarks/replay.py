@@ -33,7 +33,7 @@ class Replay(StoredSequence):
         return frame.image, frame.depth
 
 
-def forth_and_back(count: int, frames: int) -> list[int]:
+def back_and_forth(count: int, frames: int) -> list[int]:
     """Return ``frames`` indices that run through ``count`` frames forwards, backwards, forwards and so on."""
     period = max(2 * (count - 1), 1)
     return [min(index % period, period - index % period) for index in range(frames)]

@@ -70,9 +70,9 @@ class V3DSLAM(ReplaceableStages):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature; the results of the replacement are checked. `compensate`, `register`, `track_map` and `loop_closer` are
-    also used inside other stages, which keep their own references to the original. `preprocess` runs the stages that
-    depend only on the frame, and can run ahead of `track`.
+    signature; the results of the replacement are checked. `compensate`, `estimate_motion`, `track_map` and
+    `loop_closer` are also used inside other stages, which keep their own references to the original. `preprocess` runs
+    the stages that depend only on the frame, and can run ahead of `track`.
 
     Args:
         camera: Camera of all frames.
@@ -115,8 +115,8 @@ class V3DSLAM(ReplaceableStages):
         self.detect_features = ORB(config.features, camera)
         # Motion of the camera since the previous frame
         self.compensate = TimeCompensation(config, camera)
-        self.register = MotionEstimator(config.odometry, config.features, camera, config.seed)
-        self.odometry = Odometry(config, camera, self.register)
+        self.estimate_motion = MotionEstimator(config.odometry, config.features, camera, config.seed)
+        self.odometry = Odometry(config, camera, self.estimate_motion)
         # Objects
         free_space = config.objects.free_space
         self.free_space_check = FreeSpaceCheck(free_space, camera)
@@ -127,7 +127,7 @@ class V3DSLAM(ReplaceableStages):
         # Camera pose and map
         local_keyframes = config.tracking.local_keyframes
         self.track_map = MapTracker(config.tracking, config.features, camera)
-        self.loop_closer = LoopCloser(config.loop, self.register, self.track_map, local_keyframes)
+        self.loop_closer = LoopCloser(config.loop, self.estimate_motion, self.track_map, local_keyframes)
         self.track_camera = CameraTracker(self.track_map, self.loop_closer, self.map, local_keyframes)
         self.refine_previous = PreviousFrameRefinement(
             self.compensate, self.track_map, self.map, refine_pose=config.rolling_shutter.enabled
@@ -136,7 +136,7 @@ class V3DSLAM(ReplaceableStages):
         self.states = StateHistory()
         self.mapper = Mapper(config, camera, self.map)
         self.back_end = BackEnd(config, camera, self.map, self.loop_closer)
-        self.loop_closer.rebuild(self.map.active_keyframes)
+        self.loop_closer.rebuild_database(self.map.active_keyframes)
         # Free and occupied space
         self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
         self.gravity: Tensor | None = None
@@ -339,7 +339,8 @@ class V3DSLAM(ReplaceableStages):
         """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
         for name, component in self._stateful_components().items():
             component.load_state_dict(state[name])
-        self.loop_closer.rebuild(each for each in self.map.active_keyframes if each is not self.back_end.keyframe)
+        pending = self.back_end.keyframe
+        self.loop_closer.rebuild_database(each for each in self.map.active_keyframes if each is not pending)
         self._previous, self.gravity = state["previous"], state["gravity"]
         self.predictions = deque(state["predictions"])
         self._segmenter_state = state["segmenter"]
@@ -405,7 +406,7 @@ class V3DSLAM(ReplaceableStages):
     def _predict(self) -> PosePrediction | None:
         """Predict the motion of the camera; None if it has not been localised in a known map yet."""
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
-        return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_located else None
+        return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_localised else None
 
     def _update_gravity(self, frame: RGBDFrame, T_new_old: Tensor | None) -> None:
         """Store the first measured gravity in the world frame; rotate it with later corrections of the world frame."""

@@ -332,12 +332,12 @@ def test_loop_closer_that_loads_a_state_and_the_map_recognises_the_same_places(c
     loaded = make_loop_closer(load_config())
     loaded.add_keyframe(closed.map.keyframes[0])  # is replaced
     loaded.load_state_dict(state)
-    loaded.rebuild(closed.map.active_keyframes)
+    loaded.rebuild_database(closed.map.active_keyframes)
     assert loaded.loop_count == closed.loop_closer.loop_count
     features, _ = Room(seed=1).observe(lap_pose(5), seed=77)
     expected, place = (loop_closer.relocalise(features, closed.map) for loop_closer in (closed.loop_closer, loaded))
     assert expected is not None and place is not None
     assert place.keyframe is expected.keyframe
     assert torch.equal(place.tracking.T_cw, expected.tracking.T_cw)
-    loaded.rebuild([])
+    loaded.rebuild_database([])
     assert loaded.relocalise(features, closed.map) is None

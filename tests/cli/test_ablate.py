@@ -117,7 +117,7 @@ def test_results_are_identical_to_run_command(
 
 
 def test_every_ablation_config_is_a_variant_and_all_differ() -> None:
-    assert set(VARIANTS) | {"default", "realtime"} == set(CONFIGS)
+    assert set(VARIANTS) | {"realtime"} == set(CONFIGS)
     assert len({load_config(CONFIGS[variant]).model_dump_json() for variant in VARIANTS}) == len(VARIANTS)
 
 

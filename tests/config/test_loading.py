@@ -80,7 +80,7 @@ def test_empty_file_gives_the_defaults(tmp_path: Path) -> None:
 
 
 def test_every_configuration_of_the_package_loads_by_name() -> None:
-    assert {"full", "default", "paper", "baseline", "no_voting"} <= set(CONFIGS)
+    assert {"full", "paper", "baseline", "no_voting"} <= set(CONFIGS)
     for name, file in CONFIGS.items():
         assert file.is_relative_to(Path(v3d_torch.__file__).parent)  # so that it is in the wheel
         assert find_config(name) == file

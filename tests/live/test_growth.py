@@ -22,7 +22,7 @@ TURNS = 4
 GROWING = {"poses", "map"}
 
 
-def forth_and_back() -> Iterator[RGBDFrame]:
+def back_and_forth() -> Iterator[RGBDFrame]:
     walk = Walk()
     for index in range(TURNS * TURN):
         position = min(index % TURN, TURN - index % TURN)
@@ -32,7 +32,7 @@ def forth_and_back() -> Iterator[RGBDFrame]:
 def test_state_of_a_long_run_in_one_place_stays_bounded() -> None:
     slam = V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG)
     sizes: list[dict[str, int]] = []
-    for result in LiveSLAM(paced(forth_and_back(), slam), slam):
+    for result in LiveSLAM(paced(back_and_forth(), slam), slam):
         if (result.frame.index + 1) % TURN == 0:
             size = {name: stored_size(state) for name, state in slam.state_dict().items()}
             size["landmarks"], size["observations"] = len(slam.map.landmarks), len(slam.map.observations)

@@ -426,7 +426,7 @@ def test_objects_without_centroid_are_matched_by_masks() -> None:
             frame / 30, instances, InstanceBackProjector(CLOUDS, CAMERA)(depth, instances), depth, HERE
         )
         assert [track.id for track in tracks] == [1, 2]
-        assert not any(track.newest.is_located for track in tracks)
+        assert not any(track.newest.has_centroid for track in tracks)
     assert not tracks[0].velocity.any()
 
 

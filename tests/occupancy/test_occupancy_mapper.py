@@ -38,9 +38,11 @@ class Drive:
     @property
     def poses(self) -> PoseHistory:
         history = PoseHistory()
-        last_found = self.entries[-1].stamp if self.entries else -torch.inf
+        last_localised = self.entries[-1].stamp if self.entries else -torch.inf
         observed = torch.zeros(0, dtype=torch.int64)
-        history.load_state_dict({"entries": self.entries, "last_found": last_found, "observed_landmarks": observed})
+        history.load_state_dict(
+            {"entries": self.entries, "last_localised": last_localised, "observed_landmarks": observed}
+        )
         return history
 
     def add(self, first: int, last: int, status: TrackingStatus = TrackingStatus.TRACKED) -> None:

@@ -29,7 +29,7 @@ import write_page
 from contenders import OURS, vocabulary
 from contenders.process import ContenderError, Measured, measure
 from heading import Heading
-from replay import Replay, forth_and_back
+from replay import Replay, back_and_forth
 
 
 def measured(rate: float, cpu: float, **stages: float) -> Measured:
@@ -39,12 +39,12 @@ def measured(rate: float, cpu: float, **stages: float) -> Measured:
 
 class TestReplay:
     def test_forth_and_back_turns_at_the_ends(self) -> None:
-        assert forth_and_back(4, 11) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2]
+        assert back_and_forth(4, 11) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2]
 
     def test_time_advances_by_intervals_between_frames(self, moment: Path) -> None:
         sequence = load_sequence(str(moment))
         count = len(sequence)
-        replay = Replay(sequence, forth_and_back(count, 2 * count))
+        replay = Replay(sequence, back_and_forth(count, 2 * count))
         gaps = sequence.stamps.diff()
         back = gaps.flip(0)
         assert torch.allclose(replay.stamps.diff(), torch.cat([gaps, back, gaps[:1]])[: 2 * count - 1], atol=1e-5)

@@ -169,7 +169,7 @@ def test_replaced_stage_that_returns_nan_is_named_with_field_and_frame(
 @pytest.mark.parametrize(
     ("stage", "corrupt", "field"),
     [
-        ("register", lambda result: replace(result, T_ba=with_nan(result.T_ba)), "register.T_ba"),
+        ("estimate_motion", lambda result: replace(result, T_ba=with_nan(result.T_ba)), "estimate_motion.T_ba"),
         ("track_map", lambda result: replace(result, T_cw=with_nan(result.T_cw)), "track_map.T_cw"),
     ],
 )

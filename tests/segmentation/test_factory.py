@@ -13,7 +13,7 @@ from PIL import Image
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.errors import ConfigError
 from v3d_torch.segmentation import COCO_NAMES, MaskFolder, NoSegmentation, UprightSegmenter, make_segmenter
-from v3d_torch.segmentation.factory import keep_upright
+from v3d_torch.segmentation.factory import wrap_upright
 from v3d_torch.types import RGBDFrame
 
 
@@ -40,6 +40,6 @@ def test_options_of_another_source_are_rejected(tmp_path: Path) -> None:
 
 def test_only_a_configured_network_is_kept_upright() -> None:
     source = NoSegmentation()
-    assert isinstance(keep_upright(source, SegmentationConfig()), UprightSegmenter)
-    assert keep_upright(source, SegmentationConfig(upright=False)) is source
-    assert keep_upright(source, SegmentationConfig(source="masks")) is source
+    assert isinstance(wrap_upright(source, SegmentationConfig()), UprightSegmenter)
+    assert wrap_upright(source, SegmentationConfig(upright=False)) is source
+    assert wrap_upright(source, SegmentationConfig(source="masks")) is source

@@ -82,7 +82,7 @@ class LoopCloser:
         """Remove keyframes, given by their indices, from the database of place recognition."""
         self._database.remove(keyframes)
 
-    def rebuild(self, keyframes: Iterable[Keyframe]) -> None:
+    def rebuild_database(self, keyframes: Iterable[Keyframe]) -> None:
         """Replace the database of place recognition by the given keyframes.
 
         Args:

@@ -30,7 +30,7 @@ from v3d_torch.runs.console import open_sequences, run_with_progress, wide_conso
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
-from v3d_torch.segmentation import keep_upright, make_instance_source
+from v3d_torch.segmentation import make_instance_source, wrap_upright
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 _NOTE = (
@@ -96,7 +96,7 @@ def run_ablation_study(
             sources: dict[SegmentationConfig, Segmenter] = {}
             for (variant, seed), config in configs.items():
                 source = sources.setdefault(_network_config(config), CachedSegmenter(network(_network_config(config))))
-                segment = keep_upright(source, config.segmentation)
+                segment = wrap_upright(source, config.segmentation)
                 run_folder = make_result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
                 metrics, failure = _run(sequence, segment, config, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.config import Config, SegmentationConfig
-from v3d_torch.config.loading import CONFIGS, FULL, find_config, load_config
+from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError
 from v3d_torch.io.paths import expand_user
@@ -30,9 +30,8 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
     paths: dict[str, Path] = {}
     for name in names:
         path = find_config(name)
-        label = FULL if path == CONFIGS[FULL] else path.stem
-        if paths.setdefault(label, path).resolve() != path.resolve():
-            raise ConfigError(f"{name}: another configuration is also named {label}; rename the file")
+        if paths.setdefault(path.stem, path).resolve() != path.resolve():
+            raise ConfigError(f"{name}: another configuration is also named {path.stem}; rename the file")
     configs = {label: load_config(path) for label, path in paths.items()}
     return {label: single_threaded(config) for label, config in configs.items()} if one_thread else configs
 

@@ -26,10 +26,10 @@ from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import ProgressBar, print_assumptions, progress_bars, run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
+from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
-from v3d_torch.runs.stage_table import stage_table
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.viz.viewer import make_viewer
 
@@ -216,7 +216,7 @@ def _print_summary(
     if paper is not None:
         console.print(paper)
     if display.profile and record.times:
-        console.print(stage_table(record))
+        console.print(profile_table(record))
     for note in evaluation.notes if evaluation is not None else ():
         console.print(f"note: {note}", markup=False)
     for warning in record.warnings:
@@ -228,7 +228,7 @@ def _print_summary(
         frames = len(pipeline.slam.poses)
         results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"
         raise InputError(f"{record.failure} ({results})")
-    if request.load_map is not None and not pipeline.slam.poses.is_located:
+    if request.load_map is not None and not pipeline.slam.poses.is_localised:
         raise InputError(
             f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
             f" run without --load-map (the results are in {folder})"

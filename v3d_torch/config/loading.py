@@ -25,11 +25,8 @@ _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 FULL = "full"
 """Name of the default configuration."""
 
-_FOLDER = Path(__file__).parent / "yaml"
-CONFIGS: Mapping[str, Path] = {
-    FULL: _FOLDER / "default.yaml",
-    **{path.stem: path for path in sorted(_FOLDER.rglob("*.yaml"))},
-}
+_FILES = sorted((Path(__file__).parent / "yaml").rglob("*.yaml"), key=lambda path: (path.stem != FULL, path))
+CONFIGS: Mapping[str, Path] = {path.stem: path for path in _FILES}
 """Configurations of the package by name: the default (`FULL`), that of the paper and those of the ablation study."""
 
 

@@ -17,7 +17,7 @@ from v3d_torch.datasets.sequence_names import canonical_name
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import expand_user
-from v3d_torch.io.safe_yaml import parse_yaml, plain_yaml
+from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
 from v3d_torch.io.text import read_text
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
@@ -130,7 +130,7 @@ def _tum_preset(folder: Path) -> PinholeCamera | None:
 
 def _from_yaml(text: str, source: str, image_size: ImageSize | None) -> PinholeCamera:
     try:
-        tree = parse_yaml(plain_yaml(text))
+        tree = parse_yaml(to_valid_yaml(text))
     except ValueError as error:
         raise InputError(f"{source}: is not valid YAML ({error}); repair it") from error
     if not isinstance(tree, dict):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE
 from v3d_torch.errors import InputError
-from v3d_torch.io.safe_yaml import parse_yaml, plain_yaml
+from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
 from v3d_torch.io.text import numbered_lines, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
 
@@ -92,7 +92,7 @@ def read_opencv_yaml(path: Path) -> Any:
     """
     text = read_text(path, "it contains YAML written by OpenCV")
     try:
-        return parse_yaml(plain_yaml(text))
+        return parse_yaml(to_valid_yaml(text))
     except ValueError as error:
         raise InputError(f"{path}: is not valid OpenCV YAML ({error}); copy it again") from error
 

@@ -18,7 +18,7 @@ _OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
 """First line and matrix tag of OpenCV's files. Neither is valid YAML."""
 
 
-def plain_yaml(text: str) -> str:
+def to_valid_yaml(text: str) -> str:
     """Convert a file of OpenCV or ROS to a single valid YAML document, and replace odd spaces.
 
     OpenCV's own parser is not robust against damaged files. ``rostopic echo`` ends each message with ``---``.

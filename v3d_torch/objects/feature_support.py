@@ -27,12 +27,12 @@ class FeatureSupport:
 
     Attributes:
         pixel: Pixel (column, row) of each feature, int64, shape :math:`(N, 2)`.
-        inlier: Mask of the features that are matched to the previous frame and fit the camera motion, bool, shape
+        inliers: Mask of the features that are matched to the previous frame and fit the camera motion, bool, shape
             :math:`(N,)`.
     """
 
     pixel: Tensor
-    inlier: Tensor
+    inliers: Tensor
 
     def supports(
         self, masks: Sequence[Tensor], min_ratio: float = MIN_SUPPORT_RATIO, min_inliers: int = MIN_SUPPORTING_FEATURES
@@ -48,10 +48,10 @@ class FeatureSupport:
             Mask of the supported objects, bool, shape :math:`(K,)`.
         """
         if len(masks) == 0:
-            return self.inlier.new_zeros(0)
+            return self.inliers.new_zeros(0)
         index = self.pixel[:, 1] * masks[0].shape[1] + self.pixel[:, 0]
         inside = torch.stack([mask.flatten().index_select(0, index) for mask in masks])
         outside = ~inside.any(dim=0)
-        outside_ratio = (self.inlier & outside).sum() / outside.sum().clamp(min=1)
-        inliers, features = (inside & self.inlier).sum(dim=1), inside.sum(dim=1)
-        return (inliers >= min_inliers) & (inliers >= min_ratio * outside_ratio * features)
+        outside_ratio = (self.inliers & outside).sum() / outside.sum().clamp(min=1)
+        counts, features = (inside & self.inliers).sum(dim=1), inside.sum(dim=1)
+        return (counts >= min_inliers) & (counts >= min_ratio * outside_ratio * features)

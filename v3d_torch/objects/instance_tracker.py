@@ -263,7 +263,7 @@ class InstanceTracker(torch.nn.Module):
             coarse_masks: Their predicted coarse masks where there is depth, packed, shape (T, B).
             updated: Tracks that were detected.
         """
-        located = [track for track in updated if track.newest.is_located]
+        located = [track for track in updated if track.newest.has_centroid]
         if not located or not tracks:
             return [False] * len(tracks)
         common = count_common_pixels(coarse_masks, torch.stack([other.coarse_mask for other in located]))

@@ -41,7 +41,7 @@ def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: Pinhol
     detected = [
         track
         for track in tracks
-        if track.may_move and not track.missed and track.newest.is_located and track.label != UNLABELLED
+        if track.may_move and not track.missed and track.newest.has_centroid and track.label != UNLABELLED
     ]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
     projected = silhouettes([track.predict_cloud(view.stamp) @ R.T + t for track in detected], camera, spacing)

@@ -56,7 +56,7 @@ class MaskRefiner:
         # Pixels that a surface can grow over: no depth edge, and not occupied before the object appeared.
         smooth = _smooth_pixels(view.depth[0].numpy(), self._stride, config.edge_ratio)
         self._growable = smooth & ~newly_occupied.previously_occupied.numpy()
-        located = [track for track in tracks if track.newest.is_located]
+        located = [track for track in tracks if track.newest.has_centroid]
         R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
         clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in located]
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]

@@ -56,7 +56,7 @@ class Detection3D:
     cloud: Tensor
 
     @cached_property
-    def is_located(self) -> bool:
+    def has_centroid(self) -> bool:
         """True if the centroid is known."""
         return bool(torch.isfinite(self.centroid).all())
 
@@ -144,7 +144,7 @@ class Track:
         current = self.newest
         for previous in reversed(self.detections[:-1]):
             if current.stamp - previous.stamp >= baseline - STAMP_TOLERANCE:
-                return (previous, current) if previous.is_located and current.is_located else None
+                return (previous, current) if previous.has_centroid and current.has_centroid else None
         return None
 
     def predict_state(self, stamp: float) -> ObjectState:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from v3d_torch.segmentation.coco import COCO_NAMES, PERSON
-from v3d_torch.segmentation.factory import NoSegmentation, keep_upright, make_instance_source, make_segmenter
+from v3d_torch.segmentation.factory import NoSegmentation, make_instance_source, make_segmenter, wrap_upright
 from v3d_torch.segmentation.mask_files import MaskFolder
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.segmentation.yolo import YOLOSegmenter
@@ -15,7 +15,7 @@ __all__ = [
     "NoSegmentation",
     "UprightSegmenter",
     "YOLOSegmenter",
-    "keep_upright",
     "make_instance_source",
     "make_segmenter",
+    "wrap_upright",
 ]

@@ -26,10 +26,10 @@ def make_segmenter(config: SegmentationConfig, weights: Path | None = None, mask
     Use a new one for each run: `UprightSegmenter` accumulates votes over the frames of a run. Arguments and errors are
     those of `make_instance_source`.
     """
-    return keep_upright(make_instance_source(config, weights, masks_dir), config)
+    return wrap_upright(make_instance_source(config, weights, masks_dir), config)
 
 
-def keep_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
+def wrap_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
     """Wrap a network in `UprightSegmenter` if configured; return any other source unchanged."""
     return UprightSegmenter(source) if config.upright and config.source == "yolo" else source
 

@@ -77,7 +77,7 @@ class MotionModel:
         if pose.status is TrackingStatus.LOST and motion.is_measured:
             self.velocity = motion.velocity
         elif pose.status is TrackingStatus.LOST:
-            self.velocity = self.velocity * (stamp - poses.last_found < MAX_EXTRAPOLATION)
+            self.velocity = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:
             velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / elapsed
             if motion.is_measured:  # otherwise the pose can have jumped, by relocalisation

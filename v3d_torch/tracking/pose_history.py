@@ -43,13 +43,13 @@ class PoseHistory:
     """Poses of all frames in the order of time.
 
     Attributes:
-        last_found: Time of the last frame that was found, seconds; minus infinity if there is none.
+        last_localised: Time of the last frame that was found, seconds; minus infinity if there is none.
         observed_landmarks: IDs of the landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
     """
 
     def __init__(self) -> None:
         self._entries: list[PoseEntry] = []
-        self.last_found = -torch.inf
+        self.last_localised = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
 
     def __len__(self) -> int:
@@ -87,9 +87,9 @@ class PoseHistory:
         return bool(self._entries) and self._entries[-1].has_motion
 
     @property
-    def is_located(self) -> bool:
+    def is_localised(self) -> bool:
         """True if any frame was found so far."""
-        return self.last_found > -torch.inf
+        return self.last_localised > -torch.inf
 
     def append(
         self, stamp: float, pose: FramePose, motion: CameraMotion, reference: Keyframe | None, new: Keyframe | None
@@ -116,7 +116,7 @@ class PoseHistory:
         T_new_old = None
         if self.status is TrackingStatus.LOST and status is not TrackingStatus.LOST:
             correction = orthonormalise(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
-            first = not self.is_located
+            first = not self.is_localised
             self._correct_lost(correction, reference, motion.is_measured, move_all=first)
             T_new_old = correction if first else None
         if new is None:
@@ -132,7 +132,7 @@ class PoseHistory:
             self.observed_landmarks = new.observed_landmarks
         self._entries.append(entry)
         if status is not TrackingStatus.LOST:
-            self.last_found = stamp
+            self.last_localised = stamp
         return T_new_old
 
     def replace_last(self, T_cw: Tensor) -> None:
@@ -165,13 +165,13 @@ class PoseHistory:
         """Return the poses of all frames."""
         return {
             "entries": self._entries,
-            "last_found": self.last_found,
+            "last_localised": self.last_localised,
             "observed_landmarks": self.observed_landmarks,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
-        self._entries, self.last_found = list(state["entries"]), state["last_found"]
+        self._entries, self.last_localised = list(state["entries"]), state["last_localised"]
         self.observed_landmarks = state["observed_landmarks"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:

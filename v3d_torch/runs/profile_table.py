@@ -13,7 +13,7 @@ _BACK_END = ("bundle", "loop")
 """Stages that run in parallel with tracking; all other stages of a frame run one after the other."""
 
 
-def stage_table(run: RunRecord) -> Table:
+def profile_table(run: RunRecord) -> Table:
     """Return the milliseconds per frame of each stage, and of each chain of stages that run one after the other.
 
     The slowest chain limits the frame rate, independently of the number of processors. A stage that did not run on a
