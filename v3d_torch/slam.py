@@ -234,6 +234,7 @@ class V3DSLAM(ReplaceableStages):
             velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
             features = self.compensate(all_features, depth, frame.depth_delay, velocity, self.map.readout)
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
+            self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
             view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)
