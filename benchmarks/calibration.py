@@ -1,4 +1,4 @@
-"""Cameras calibrated from files that were made wrong on purpose, beside the right ones, as Markdown.
+"""Calibration of cameras from deliberately wrong camera files, compared with the right values, as Markdown.
 
 ``python benchmarks/calibration.py --seqs demo crowd_rpy`` changes the camera of each sequence, calibrates it as
 ``v3d-torch calibrate`` does, and compares each parameter with the camera before the change.
@@ -46,7 +46,7 @@ def measure(source: str, config: Config) -> Iterator[Row]:
 
         calibration = calibrate_sequence(open_sequence, NoSegmentation, config, lambda *_: lambda *_: None)
         for each in calibration.estimates:
-            if each.name in DISTORTION:  # few recordings tell it, and the right one is seldom known
+            if each.name in DISTORTION:  # few recordings determine it, and the right value is rarely known
                 continue
             (truth,) = get_values(right, math.nan if right.readout is None else right.readout, [each.name])
             yield {
@@ -62,7 +62,7 @@ def measure(source: str, config: Config) -> Iterator[Row]:
 
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = make_parser("Cameras calibrated from files that were made wrong on purpose, as Markdown.")
+    parser = make_parser("Calibration of cameras from deliberately wrong camera files, as Markdown.")
     parser.add_argument("--seqs", nargs="+", default=["demo"], help="sequences with a right camera [demo]")
     return parser
 

@@ -2,7 +2,7 @@
 
 ``python benchmarks/consistency.py --seqs fr1_rpy crowd_rpy`` runs sequences and reports the normalised estimation error
 squared (NEES; Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec.
-5.4.2) of the poses as they were known at each frame. Its expectation is the number of dimensions.
+5.4.2) of the poses at each frame, without later corrections. Its expectation is the number of dimensions.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from v3d_torch.geometry.se3 import adjoint, invert, se3_exp, se3_log
 from v3d_torch.types import Trajectory
 
 MAX_GAP = 0.05
-"""Longest time between two true poses that are interpolated, seconds."""
+"""Maximum time between two true poses for interpolation, seconds."""
 
 FIRST = 40
 """Number of poses at the start whose NEES is given on its own: the first frames are processed before the motion of the
@@ -59,7 +59,7 @@ class Errors:
 
     Attributes:
         xi: Error of each pose, see `CameraState`, float64, shape :math:`(N, 6)`.
-        covariance: Its covariance, with that of the ground truth, float64, shape :math:`(N, 6, 6)`.
+        covariance: Covariance of each error, with that of the ground truth, float64, shape :math:`(N, 6, 6)`.
     """
 
     xi: Tensor
@@ -83,8 +83,8 @@ def calibrated_errors(groundtruth: Trajectory, stamps: Tensor, T_wc: Tensor, cov
         groundtruth: True poses.
         stamps: Times of the estimate, seconds, float64, shape :math:`(N,)`.
         T_wc: Estimate, float64, shape :math:`(N, 4, 4)`.
-        covariance: Its covariance, see `CameraState`, float64, shape :math:`(N, 6, 6)`. Poses without uncertainty, such
-            as the one that defines the world, are left out.
+        covariance: Covariance of the estimate, see `CameraState`, float64, shape :math:`(N, 6, 6)`. Poses without
+            uncertainty, such as the pose that defines the world, are left out.
     """
     true = groundtruth.stamps.numpy()
     gap = np.diff(true)[np.clip(np.searchsorted(true, stamps.numpy()) - 1, 0, len(true) - 2)]

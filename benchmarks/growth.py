@@ -69,7 +69,7 @@ class LongRun:
 
 
 def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
-    """Play a sequence forth and back, and measure every block of frames."""
+    """Play a sequence forwards and backwards, and measure every block of frames."""
     system = Ours(Replay(sequence, forth_and_back(len(sequence), frames)), "v3d_torch", seed=0)
     slam = system.slam
 

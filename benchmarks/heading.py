@@ -49,7 +49,7 @@ class Heading:
 
 
 def make_heading(peers: tuple[str, ...] = ()) -> Heading:
-    """Describe this process. Call it before the first run, so that the load is that of other programs.
+    """Describe this process. Call it before the first run, so that the load excludes the benchmark.
 
     Args:
         peers: Further packages whose versions to record.

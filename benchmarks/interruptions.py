@@ -81,7 +81,7 @@ class InterruptedFrames:
     def __iter__(self) -> Iterator[RGBDFrame]:
         for index, shown in enumerate(self._shown):
             frame = self._sequence[max(shown, 0)]
-            if shown == COVERED:  # light passes through a finger
+            if shown == COVERED:  # not black, because some light passes through a finger
                 frame = replace(frame, image=torch.full_like(frame.image, 3), depth=torch.zeros_like(frame.depth))
             yield replace(frame, index=index, stamp=float(self.stamps[index]))
 

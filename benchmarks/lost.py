@@ -45,19 +45,19 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import TrackingStatus, Trajectory
 
 MAX_DISTANCE = 0.3
-"""Largest distance between two poses at the same place, metres."""
+"""Maximum distance between two poses at the same place, metres."""
 
 MAX_ANGLE = 0.26
-"""Largest angle between two poses at the same place, radians: 15 degrees, a quarter of the view of a Kinect."""
+"""Maximum angle between two poses at the same place, radians: 15 degrees, a quarter of the view of a Kinect."""
 
 MAX_RECOVERY = 10
-"""Largest number of frames to recover that passes."""
+"""Maximum number of frames to recover, for a pass."""
 
 MAX_RATIO = 1.5
-"""Largest ratio of the ATE to that of the run without interruption that passes."""
+"""Maximum ratio of the ATE to that of the run without interruption, for a pass."""
 
 MAX_ERROR = 0.1
-"""Largest error of a reliable pose that passes, metres."""
+"""Maximum error of a reliable pose, for a pass, metres."""
 
 FOUND = (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
 """Statuses of a pose that is reported as reliable."""
@@ -79,7 +79,7 @@ class Result:
 
 
 def run_case(sequence: RGBDSequence, case: Case, config: Config, masks: Path | None) -> Result:
-    """Run the system on a case; without masks no object is left out."""
+    """Run the system on a case; without masks, no object is masked."""
     set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     segment = NoSegmentation() if masks is None else InterruptedMasks(sequence, case, masks)
@@ -93,7 +93,8 @@ class Score:
     """Scores of a case.
 
     Attributes:
-        recovery: Frames from the first one at a known place to the first tracked one; None if no place was known.
+        recovery: Number of frames from the first frame at a known place to the first tracked frame; None if no place
+            was known.
         unflagged: Number of covered frames with the status tracked.
         found: Fraction of the observed frames with a reliable pose.
         ate: RMSE over these frames, metres.
@@ -151,7 +152,7 @@ def score(case: Case, result: Result, plain: Result, T_gc: Tensor) -> Score:
 
 
 def recovery(case: Case, online: Sequence[TrackingStatus], truth: Tensor) -> float | None:
-    """Return the number of frames from the first one at a known place to the first tracked one; inf for never."""
+    """Return the number of frames from the first at a known place to the first tracked frame; inf if there is none."""
     difference = se3_log(invert(truth[: case.cut])[None] @ truth[case.back :, None])
     known = (difference[..., :3].norm(dim=-1) < MAX_DISTANCE) & (difference[..., 3:].norm(dim=-1) < MAX_ANGLE)
     places = known.any(dim=1).nonzero()[:, 0].tolist()
@@ -208,7 +209,7 @@ def arguments() -> argparse.ArgumentParser:
     )
     parser.add_argument("--before", type=int, default=90, help="number of frames before the interruption [90]")
     parser.add_argument("--after", type=int, default=60, help="number of frames after the interruption [60]")
-    parser.add_argument("--masks", action="store_true", help="leave out the true masks of the sequences [no masks]")
+    parser.add_argument("--masks", action="store_true", help="mask people with the true masks [no masks]")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Problems of the camera modules, and who solves them: this package first, then other libraries."""
+"""Benchmark problems of the camera modules, each with its competitors: this package first, then other libraries."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Problems:
         self._generator = torch.Generator().manual_seed(batch)
 
     def normal(self, *shape: int) -> Tensor:
-        """Normal random numbers, a batch of the given shape."""
+        """Normally distributed random numbers, shape (B, *shape)."""
         return torch.randn(self.batch, *shape, generator=self._generator, dtype=torch.float64)
 
     def uniform(self, *shape: int) -> Tensor:
-        """Random numbers in [0, 1), a batch of the given shape."""
+        """Random numbers in [0, 1), shape (B, *shape)."""
         return torch.rand(self.batch, *shape, generator=self._generator, dtype=torch.float64)
 
     def points(self, count: int) -> Tensor:
@@ -57,7 +57,7 @@ def pose_error(true: Tensor) -> Error:
 
 
 def matching(batch: int) -> tuple[Competitors, Error]:
-    """500 descriptors with the same ones in another order, 30 of 256 bits different. Error: matches missed, %."""
+    """Matching of 500 descriptors with a permutation of them, 30 of 256 bits different. Error: missed matches, %."""
     problems = Problems(batch)
     a = (256 * problems.uniform(500, 32)).to(torch.uint8)
     order = problems.uniform(500).argsort(dim=1)
@@ -88,7 +88,7 @@ def matching(batch: int) -> tuple[Competitors, Error]:
 
 
 def essential(batch: int) -> tuple[Competitors, Error]:
-    """500 pairs with 0.5 pixels of noise and 30 % outliers. Error: norm of the difference, thousandths."""
+    """Essential matrix of 500 pairs, 0.5 pixels of noise, 30 % outliers. Error: norm of the difference, thousandths."""
     problems = Problems(batch)
     points = problems.points(500)
     step = torch.tensor([0.3, -0.1, 0.2, 0.05, 0.1, -0.05], dtype=torch.float64)
@@ -124,7 +124,7 @@ def essential(batch: int) -> tuple[Competitors, Error]:
 
 
 def pnp(batch: int) -> tuple[Competitors, Error]:
-    """500 points with 1 pixel of noise and 30 % outliers. Error: pose, thousandths."""
+    """PnP-RANSAC of 500 points with 1 pixel of noise and 30 % outliers. Error: pose, thousandths."""
     problems = Problems(batch)
     T_cw, in_camera = se3_exp(problems.normal(6)), problems.points(500)
     points, uv = transform(invert(T_cw), in_camera), CAMERA.project(in_camera) + problems.normal(500, 2)
@@ -159,7 +159,7 @@ def refinement_problem(problems: Problems) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def refinement(batch: int) -> tuple[Competitors, Error]:
-    """A pose from 100 points, least squares of pixels. Error: pose, thousandths."""
+    """Refinement of a pose with 100 points, least squares of pixels. Error: pose, thousandths."""
     problems = Problems(batch)
     T_cw, points, uv, start = refinement_problem(problems)
     unit = torch.ones(batch, 100, dtype=torch.float64)
@@ -174,7 +174,7 @@ def refinement(batch: int) -> tuple[Competitors, Error]:
 
 
 def refinement_gradient(batch: int) -> tuple[Competitors, Error]:
-    """The same, and the gradient by the weights. Error: relative difference of the gradient to ours, %."""
+    """Refinement of a pose, and its gradient by the weights. Error: relative difference to our gradient, %."""
     problems = Problems(batch)
     T_cw, points, uv, start = refinement_problem(problems)
     weights = (0.5 + problems.uniform(100)).requires_grad_()
@@ -193,7 +193,7 @@ def refinement_gradient(batch: int) -> tuple[Competitors, Error]:
 
 
 def bundle(batch: int) -> tuple[Competitors, Error]:
-    """Five poses, 60 points, 240 observations of pixels with 1 pixel of noise, Huber. Error: poses, thousandths."""
+    """Bundle adjustment of 5 poses, 60 points, 240 pixels with 1 pixel of noise, Huber. Error: poses, thousandths."""
     problems = Problems(batch)
     T_cw, points = se3_exp(0.2 * problems.normal(5, 6)), problems.points(60)
     pose, point = torch.arange(240) % 5, torch.arange(240) // 4

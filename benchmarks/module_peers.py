@@ -1,4 +1,4 @@
-"""The camera modules' problems, as other libraries state them."""
+"""Problems of the camera modules, formulated for other libraries."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Times and errors of the camera modules beside theseus, PyPose, GTSAM, OpenCV, Kornia, kornia-rs, Open3D and evo.
 
 ``python benchmarks/modules.py`` prints a table for batches of 1, 8 and 64 problems, with one thread. All competitors
-get the same problems and take turns in random order, so that a busy machine slows them alike. A time is the median over
-the turns; ``ratio`` is the median of the time of the peer over ours in the same turn: above 1 ours is faster. Peers
-without batches solve the problems one after the other. Factor graphs of GTSAM and theseus are built beforehand.
+get the same problems and take turns in random order, so that a busy machine slows all of them. A time is the median
+over the turns; ``ratio`` is the median of the peer's time divided by ours in the same turn: above 1 ours is faster.
+Peers without batches solve the problems one after the other. Factor graphs of GTSAM and theseus are built beforehand.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from timing import OURS, take_turns
 BATCHES = (1, 8, 64)
 
 MAX_SECONDS = 20.0
-"""Peers that take longer for one turn are left out of larger batches."""
+"""Maximum time of a turn, seconds; peers that take longer are left out of larger batches."""
 
 NOT_INSTALLED = (
     "gradslam 0.1.0 and PyTorch3D are no peers here: gradslam needs chamferdist, whose extension does not build without"
@@ -37,7 +37,7 @@ NOT_INSTALLED = (
 
 
 def contests(functions: list[str], batches: list[int]) -> Iterator[Row]:
-    """Yield the rows of all functions and batch sizes."""
+    """Measure all functions with all batch sizes, and yield the rows."""
     for name in functions:
         slow: set[str] = set()
         for batch in batches:

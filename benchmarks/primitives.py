@@ -1,8 +1,9 @@
 """Times of the primitives of the object stage beside scikit-learn, Open3D, SciPy, Kornia and torch.cdist.
 
 ``python benchmarks/primitives.py`` prints a table for one thread and one for two. All competitors get the same clouds
-and take turns in random order, so that a busy machine slows them alike. A time is the median over the turns; ``ratio``
-is the median of the time of the peer over ours in the same turn: above 1 ours is faster. Needs open3d and scikit-learn.
+and take turns in random order, so that a busy machine slows all of them. A time is the median over the turns; ``ratio``
+is the median of the peer's time divided by ours in the same turn: above 1 ours is faster. It needs open3d and
+scikit-learn.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ def contests() -> Iterator[tuple[str, str, Competitors]]:
 
 def main(
     threads: int = typer.Option(0, min=0, help="Threads of every competitor; 0 runs with one, then with two."),
-    turns: int = typer.Option(11, min=1, help="Smallest number of turns."),
+    turns: int = typer.Option(11, min=1, help="Minimum number of turns."),
     save: bool = typer.Option(False, "--save", help="Store the rows in benchmarks/results."),
 ) -> None:
     """Measure all primitives and print a table for each number of threads."""

@@ -1,4 +1,4 @@
-"""Frames of a sequence in a given order: its beginning, or forth and back for any number of frames."""
+"""Frames of a sequence in a given order: its beginning, or forwards and backwards for any number of frames."""
 
 from __future__ import annotations
 
@@ -34,6 +34,6 @@ class Replay(StoredSequence):
 
 
 def forth_and_back(count: int, frames: int) -> list[int]:
-    """Return ``frames`` indices that run through ``count`` frames forth, back, forth and so on."""
+    """Return ``frames`` indices that run through ``count`` frames forwards, backwards, forwards and so on."""
     period = max(2 * (count - 1), 1)
     return [min(index % period, period - index % period) for index in range(frames)]

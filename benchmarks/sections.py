@@ -51,8 +51,8 @@ def accuracy_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     text = (
         "ATE RMSE in metres, lower is better; the lowest value of a row is bold. `full` is the default"
         " configuration, `baseline` is `--segmenter none`. ORB-SLAM3 (PyPI) is pyorbslam3 with a vocabulary trained"
-        " on the sequences; it is not deterministic. A system that leaves out hard frames has a lower error, so"
-        " coverage is given if it is below 100%."
+        " on the sequences; it is not deterministic. A system that skips hard frames has a lower error, so coverage is"
+        " given if it is below 100%."
     )
     remarks = [
         f"- ORB-SLAM2, ORB-SLAM3, NGD-SLAM: {PEERS['about']}",
@@ -85,7 +85,7 @@ def growth_section(measurements: Sequence[Measurement], keyframes: Sequence[Meas
     yield "## Growth"
     if measurements:
         text = (
-            "A sequence is played forth and back. Time per frame and number of keyframes should stay constant,"
+            "A sequence is played forwards and backwards. Time per frame and number of keyframes should stay constant,"
             " because the camera observes the same room. CPU ms per frame is given for each tenth of the run."
         )
         yield from part(text, flat(rows_of(measurements), columns.GROWTH), measurements, "frames")
@@ -99,7 +99,7 @@ def growth_section(measurements: Sequence[Measurement], keyframes: Sequence[Meas
 
 def lost_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on interruptions."""
-    yield "## Lost and found"
+    yield "## Recovery of a lost camera"
     text = (
         "The camera is covered, frames are dropped, or the camera is moved elsewhere and back. A case passes if the"
         " camera is recovered within 10 frames at a known place, no covered frame is tracked, the ATE is at most 1.5"
@@ -112,9 +112,9 @@ def calibration_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on calibration."""
     yield "## Calibration"
     text = (
-        "The camera file of each sequence is made wrong, and `v3d-torch calibrate --segmenter none` estimates the"
-        " camera from the images. A parameter is taken if the recording tells it within its tolerance, and if it"
-        " differs significantly from the given one. The right values of a recording are those of its data set, which"
+        "`v3d-torch calibrate --segmenter none` estimates the camera from the images, starting with a deliberately"
+        " wrong camera file. An estimate is taken if the recording determines it within its tolerance, and if it"
+        " differs significantly from the given value. The right values of a recording are those of its data set, which"
         " can differ by some pixels from the truth."
     )
     yield from part(text, flat(rows_of(measurements), columns.CALIBRATION), measurements, "sequence")
@@ -124,7 +124,7 @@ def consistency_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the covariance of poses."""
     yield "## Covariance of poses"
     text = (
-        "Normalised estimation error squared (NEES) of the poses as they were known at each frame. Below its"
+        "Normalised estimation error squared (NEES) of the poses at each frame, without later corrections. Below its"
         " expectation, the covariance is too large; above it, too small. World, mounting on the camera and clock of the"
         " ground truth are calibrated, 13 numbers for all poses; its noise is not subtracted."
     )
@@ -136,8 +136,8 @@ def objects_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield "## Objects: masks and ids"
     text = (
         "Moving masked: fraction of the true moving pixels with depth that tracking does not use, higher is"
-        " better. Static masked: the same for static pixels, lower is better. ID switches: how often a person in"
-        " view gets another ID in 60 frames, lower is better. Each cell has the three values in this order."
+        " better. Static masked: the same for static pixels, lower is better. ID switches: number of times that a"
+        " person in view gets another ID, per 60 frames, lower is better. Each cell has the three values in this order."
     )
     rows = [
         cells | {"objects": f"{cells['moving_masked']} / {cells['static_masked']} / {cells['id_switches']}"}
@@ -155,8 +155,8 @@ def tracks_section(measurements: Sequence[Measurement]) -> Iterator[str]:
         "HOTA with its detection and association accuracy, IDF1 and MOTA by TrackEval, on masks: higher is better. ID"
         " switches in 60 frames in which a person is in view, lower is better. People's pixels in the right track:"
         " fraction of the true pixels of people that lie in the one track of this person. ByteTrack, OC-SORT and"
-        " BoT-SORT are those of the package `trackers`, fed with the same detections; of two settings the better one is"
-        " shown. The best HOTA and IDF1 of a sequence are bold."
+        " BoT-SORT are those of the package `trackers`, with the same detections; the better of two settings is shown."
+        " The best HOTA and IDF1 of a sequence are bold."
     )
     yield from part(text, tracks_table(rows_of(measurements)), measurements, "sequence")
 
@@ -188,9 +188,9 @@ def segmentation_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on segmentation networks."""
     yield "## Segmentation networks"
     text = (
-        "People's pixels found: fraction of those that the network with 32 bits at 640x480 finds on the same frames."
-        " The columns after it score the whole system as in the section on objects. ms: time of one core per frame."
-        " If the network runs on every second or third frame, objects are predicted in between."
+        "People's pixels found: relative to the pixels that the network with 32 bits at 640x480 finds on the same"
+        " frames. The columns after it score the whole system as in the section on objects. ms: time of one core per"
+        " frame. If the network runs on every second or third frame, objects are predicted in between."
     )
     yield from part(text, network_tables(rows_of(measurements)), measurements)
 
@@ -211,7 +211,7 @@ def maps_section(measurements: Sequence[Measurement], costs: Sequence[Measuremen
     if measurements:
         text = (
             "Points of the coloured map that belong to people, by the true masks, without and with the free-space"
-            " check; fewer are better. Static points lost is the price of the check."
+            ' check; fewer are better. The check also removes some static points ("static points lost").'
         )
         yield from part(text, flat(rows_of(measurements), columns.MAPS), measurements, "sequence")
     if costs:
@@ -224,9 +224,9 @@ def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measu
     yield "## Occupancy map"
     if measurements:
         text = (
-            "The map of the demo, with estimated poses and masks, against the exact surfaces of the room. A voxel that"
-            " a surface touches with a corner contains it, however little of it is seen; a sample stands for 64 pixels."
-            " Unknown space is excluded from all rows."
+            "The map of the demo, with estimated poses and masks, compared with the exact surfaces of the room. A voxel"
+            " contains a surface even if the surface only touches a corner of it and is hardly visible; a sample"
+            " represents 64 pixels. Unknown space is excluded from all rows."
         )
         yield from part(text, flat(rows_of(measurements), columns.OCCUPANCY), measurements)
     if costs:
@@ -240,7 +240,7 @@ def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measu
 def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the primitives of the object stage."""
     yield "## Primitives of the object stage"
-    text = "Median time; the ratio is the time of the competitor over ours in the same turn: above 1 ours is faster."
+    text = "Median time; ratio: time of the competitor divided by ours in the same turn, above 1 if ours is faster."
     yield from part(text, flat(rows_of(measurements), columns.PRIMITIVES), measurements)
 
 
@@ -248,8 +248,8 @@ def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the camera modules."""
     yield "## Camera modules"
     text = (
-        "Median time of a batch with one thread; the ratio is the time of the competitor over ours in the same turn:"
-        " above 1 ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
+        "Median time of a batch with one thread; ratio: time of the competitor divided by ours in the same turn, above"
+        " 1 if ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
         " GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
         " millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
         " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo,"

@@ -1,4 +1,4 @@
-"""Cost and accuracy of smaller, faster and rarer segmentation networks, as Markdown.
+"""Cost and accuracy of smaller and faster segmentation networks, and of segmentation of fewer frames, as Markdown.
 
 ``python benchmarks/segmentation.py --seqs walkers_desk crowd_rpy`` runs each sequence with the network in other
 precisions, sizes and models, and with the network on every second or third frame only; in between, objects are

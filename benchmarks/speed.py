@@ -1,7 +1,7 @@
 """Speed of the whole system beside other systems on the same frames, as Markdown.
 
-``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` runs all contenders in turn, in random order, each in a
-process of its own. `ABOUT` defines the times.
+``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` runs all contenders in turn, in random order, each in
+its own process. `ABOUT` defines the times.
 """
 
 from __future__ import annotations

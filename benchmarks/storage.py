@@ -59,7 +59,7 @@ class Measurement:
 
 
 def load(name: str, folder: Path = RESULTS) -> list[Measurement]:
-    """Load the measurements of a benchmark, the oldest first; none if there is no file."""
+    """Load the measurements of a benchmark, oldest first; an empty list if there is no file."""
     path = folder / f"{name}.json"
     if not path.is_file():
         return []

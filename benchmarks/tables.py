@@ -1,4 +1,4 @@
-"""Markdown tables of stored measurements, and lines on how they were measured."""
+"""Markdown tables of stored measurements, and lines with their provenance."""
 
 from __future__ import annotations
 

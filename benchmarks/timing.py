@@ -31,7 +31,7 @@ def timed(call: Callable[[], Result], clock: Callable[[], float] = time.perf_cou
 def take_turns(competitors: Competitors, turns: int) -> dict[str, list[float]]:
     """Measure the milliseconds of each competitor in each turn; turns are added until one second has passed."""
     times: dict[str, list[float]] = {name: [] for name in competitors}
-    shuffler = np.random.default_rng(0)  # random order: the one after the slowest has a cold cache
+    shuffler = np.random.default_rng(0)  # random order, because the competitor after the slowest has a cold cache
     end = time.perf_counter() + 1
     while len(times[OURS]) <= turns or time.perf_counter() < end:
         for name in shuffler.permutation(list(competitors)):

@@ -15,8 +15,9 @@ from v3d_torch.io.download import cache_dir
 # Commands that tests start with caches of their own share the compiled kernels; read when kernels are imported.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "kernels"))
 
+from helpers.demo_frames import copy_frames
+
 import v3d_torch.slam  # noqa: F401 - registers the kernels
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.kernels.compiler import compile_kernels
 
 torch.set_num_threads(1)
@@ -49,7 +50,7 @@ collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
 def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of six frames of the demo with true masks, in which the walker is in the middle of the room."""
     folder = tmp_path_factory.mktemp("sequences") / "moment"
-    write_sequence(folder, range(52, 58))
+    copy_frames(folder, range(52, 58))
     return folder
 
 

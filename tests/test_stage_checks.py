@@ -1,4 +1,4 @@
-"""Stages of the user: what they return is checked, with one sentence; built-in stages are called as they are."""
+"""User-defined stages: their results are checked, with one sentence as error; built-in stages are not checked."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """V3D-SLAM in batched PyTorch tensors: RGB-D tracking and mapping in rooms where people and things move.
 
-The public names are listed once, in the stub beside this file, and imported when they are first used: torch alone takes
-a second, and a command that only prints its help should not wait for it.
+The public names are listed once, in the stub beside this file, and are imported when they are first used: the import of
+torch takes a second, for which a command that only prints its help should not wait.
 """
 
 import lazy_loader

@@ -31,13 +31,13 @@ from .objects.intra_object_motion import Deformation, IntraObjectMotion, intra_o
 from .objects.largest_clusters import LargestClusters, largest_clusters
 from .objects.voting import HoughVoting, Votes, hough_vote
 from .occupancy.floor import Floor, find_floor
-from .occupancy.gravity import UpDirection, estimate_up
 from .occupancy.map_server import write_map_server_files
 from .occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from .occupancy.occupancy_io import StoredOccupancy, load_occupancy, save_occupancy
 from .occupancy.occupancy_map import OccupancyMap, VoxelState
 from .occupancy.occupancy_mapper import OccupancyMapper
 from .occupancy.octomap_file import write_octomap
+from .occupancy.up_direction import UpDirection, estimate_up
 from .odometry.dense_aligner import DenseAligner, DenseAlignment, align_depth
 from .odometry.rolling_shutter import RollingShutterCompensation, compensate_rolling_shutter
 from .optim.pose_refinement import PoseRefinement, PoseRefiner, refine_pose

@@ -2,7 +2,7 @@
 
 
 class V3DError(Exception):
-    """Base class of all errors that the user can act on. The message is one line: the path, the cause, the fix."""
+    """Base class of all errors that a user can fix. The message is one line: the path, the cause, the fix."""
 
 
 class InputError(V3DError):

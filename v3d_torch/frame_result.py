@@ -20,7 +20,7 @@ class Segmentation:
     """Result of `V3DSLAM.segment_instances`.
 
     Attributes:
-        instances: Instances of the frame; None if the segmentation leaves this frame out.
+        instances: Instances of the frame; None if the frame was not segmented.
         segmenter_state: State of the segmenter after this frame; None if it has no state.
         times: Time that each stage took.
     """
@@ -47,7 +47,7 @@ class Extraction:
 
 @dataclass(frozen=True)
 class PreprocessedFrame:
-    """Result of `V3DSLAM.preprocess`: everything that follows from the frame alone.
+    """Result of `V3DSLAM.preprocess`: everything that is computed from the frame alone.
 
     Attributes:
         frame: Frame.
@@ -59,6 +59,11 @@ class PreprocessedFrame:
     extraction: Extraction
     _segmentation: Callable[[], Segmentation]
     read_times: dict[str, StageTime] = field(default_factory=dict)
+
+    @property
+    def times(self) -> dict[str, StageTime]:
+        """Time of reading and of the extraction, by stage."""
+        return {**self.read_times, **self.extraction.times}
 
     @property
     def segmentation(self) -> Segmentation:

@@ -13,23 +13,27 @@ from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError
+from v3d_torch.features.features import Features
 from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import orthonormalise
+from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.objects.feature_support import FeatureSupport
-from v3d_torch.objects.free_space_check import FreeSpaceCheck
+from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
+from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.unlabelled import unlabelled_instances
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
+from v3d_torch.occupancy.up_direction import estimate_up
 from v3d_torch.odometry.motion_estimator import MotionEstimator
-from v3d_torch.odometry.odometry import Odometry, TrackedFrame
+from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
@@ -45,6 +49,8 @@ from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
 from v3d_torch.tracking.state_estimator import StateEstimator
 from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import (
+    FramePose,
+    Instances,
     RGBDFrame,
     Segmenter,
     Stateful,
@@ -64,23 +70,23 @@ class V3DSLAM(ReplaceableStages):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature, whose results are then checked. `compensate`, `register`, `track_map` and `loop_closer` are also used
-    inside other stages, which keep their own references. `preprocess` uses the stages that need the frame alone, and
-    can run ahead of `track`.
+    signature; the results of the replacement are checked. `compensate`, `register`, `track_map` and `loop_closer` are
+    also used inside other stages, which keep their own references to the original. `preprocess` runs the stages that
+    depend only on the frame, and can run ahead of `track`.
 
     Args:
         camera: Camera of all frames.
-        segment: Segmenter; None for that of the configuration.
+        segment: Segmenter; None to create the one named in the configuration.
         config: Configuration of all stages; None for the default.
         known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map.
 
     Attributes:
         map: Keyframes and landmarks.
         poses: Poses of all frames.
-        states: States of the camera in the last seconds.
-        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None if no frame
-            has a measured one.
-        occupancy: Free and occupied space, in ``occupancy.map``; None if it is not configured.
+        states: States of the camera in the last 10 seconds.
+        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None until a frame
+            with measured gravity is tracked.
+        occupancy: Occupancy mapping, with the map in ``occupancy.map``; None unless ``occupancy.enabled`` is set.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
 
@@ -155,14 +161,14 @@ class V3DSLAM(ReplaceableStages):
 
         Raises:
             InputError: If the frame is not valid, of another camera, or not later than the previous one.
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         preprocessed = self.preprocess(frame, self.predictions[0])
         self.advance_predictions()
         return self.track(preprocessed)
 
     def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
-        """Run the stages that need the frame alone; the state of the tracking stages is neither read nor changed.
+        """Run the stages that depend only on the frame; the state of the tracking stages is neither read nor changed.
 
         `segment_instances` and `extract_features` are independent of each other and can run in different threads.
 
@@ -172,14 +178,14 @@ class V3DSLAM(ReplaceableStages):
 
         Raises:
             InputError: If the frame is not valid or of another camera.
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         self.check(frame)
         segmentation = self.segment_instances(frame, prediction)
         return PreprocessedFrame(frame, self.extract_features(frame), lambda: segmentation)
 
     def check(self, frame: RGBDFrame) -> None:
-        """Check a frame before it is preprocessed.
+        """Check that a frame is valid and of this camera; `preprocess` does this first.
 
         Raises:
             InputError: If the frame is not valid or of another camera.
@@ -193,12 +199,12 @@ class V3DSLAM(ReplaceableStages):
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
-            prediction: Prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter takes the roll of
-                the camera; None if the pose is not known.
-            is_due: False to leave the frame out; None to leave out all but every ``segmentation.interval``-th frame.
+            prediction: Pose prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter computes the
+                roll of the camera; None if the pose is not known.
+            is_due: False to skip the frame; None to segment only every ``segmentation.interval``-th frame.
 
         Raises:
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         if is_due is None:
             is_due = frame.index % self.config.segmentation.interval == 0
@@ -226,27 +232,21 @@ class V3DSLAM(ReplaceableStages):
         Raises:
             InputError: If the frame is not later than the previous one.
         """
-        frame, depth, all_features = preprocessed.frame, preprocessed.extraction.depth, preprocessed.extraction.features
+        frame, depth = preprocessed.frame, preprocessed.extraction.depth
         check_order(frame, self.poses.stamp)
-        self.timer.add({**preprocessed.read_times, **preprocessed.extraction.times})
+        self.timer.add(preprocessed.times)
         with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
-            velocity, T_cp = prediction.velocity, prediction.motion_until(frame.stamp)
-            features = self.compensate(all_features, depth, frame.depth_delay, velocity, self.map.readout)
-            motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
+            features = self._compensate(preprocessed.extraction.features, preprocessed, prediction.velocity)
+            T_cp, current = prediction.motion_until(frame.stamp), TrackedFrame(frame, depth, features)
+            motion = self.odometry(self._previous, current, T_cp, prediction.velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
-        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene, also unlabelled ones
-            view = self.free_space_check.make_view(frame.stamp, depth, orthonormalise(motion.T_cp @ self.poses.T_cw))
+        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
+            view = self.free_space_check.make_view(frame.stamp, depth, self._compose_pose(motion))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)
-        segmentation = preprocessed.segmentation  # III-A: waits for the network if it runs beside the stages before
-        self._segmenter_state = segmentation.segmenter_state
-        self.timer.add(segmentation.times)
+        segmentation = self._wait_for_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
-            instances = segmentation.instances
-            if instances is None:
-                instances = self.classify_motion.propagate_instances(view)
-            if self.config.segmentation.source != "none":
-                instances = instances.concatenate(self.propose_unlabelled(occupied, instances, depth))
+            instances = self._complete_instances(segmentation.instances, view, occupied)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
             appearance = self.describe_appearance(frame.image, clouds.cloud_pixels)
@@ -256,40 +256,30 @@ class V3DSLAM(ReplaceableStages):
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
+            static = self._compensate(preprocessed.extraction.features[is_static], preprocessed, motion.velocity)
             landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
-            static = all_features[is_static]
-            static = self.compensate(static, depth, frame.depth_delay, motion.velocity, self.map.readout)
-            T_cw = orthonormalise(motion.T_cp @ self.poses.T_cw)
-            pose = self.track_camera(static, depth, T_cw, landmarks, motion, self.poses)
+            pose = self.track_camera(static, depth, self._compose_pose(motion), landmarks, motion, self.poses)
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
             self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
-            reference = self.track_camera.reference_keyframe(pose)
-            keyframe = self.mapper(frame, static, pose, reference)
-            T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
-            self._apply_world_correction(T_new_old)
-            self._update_gravity(frame, T_new_old)
+            keyframe = self._extend_map(frame, static, pose, motion)
             if pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
-            if keyframe is not None:
-                self.back_end.submit(keyframe)
         with self.timer("tracking"):  # covariance of the pose, velocity of the camera
             references = None if keyframe is None else self.map.references
             state = self.estimate_state(pose, motion, self.poses, owners, references)
             self.states.append(state)
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
-                if self.gravity is not None:
-                    self.occupancy.accelerometer = -self.gravity
-                votes = up_votes(self._segmenter_state)
-                self.occupancy(depth, objects.static_mask, self.poses, votes)
+                up = estimate_up(self.gravity, up_votes(self._segmenter_state))
+                self.occupancy(depth, objects.static_mask, self.poses, up)
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
-        """Apply the pending result of the back end. `track` does this; call it once after the last frame."""
+        """Apply the pending result of the back end. `track` does this in every frame; call it after the last frame."""
         result = self.back_end.result()
         if result is None:
             return
@@ -304,27 +294,28 @@ class V3DSLAM(ReplaceableStages):
     def advance_predictions(self) -> PosePrediction | None:
         """Append the prediction for the frame after the next `PREFETCHED_FRAMES`, and return it.
 
-        It is made before the next frame is tracked, whether that frame is preprocessed ahead or not.
+        Call this before each call of `track`. The predictions, and so the results, are then the same whether frames are
+        preprocessed ahead or not.
         """
         self.predictions.popleft()
         self.predictions.append(self._predict())
         return self.predictions[-1]
 
     def pose_at(self, stamp: float) -> CameraState:
-        """Return the camera at a time: interpolated between frames, predicted after the last one, with covariance.
+        """Return the state of the camera at a time: interpolated between frames, predicted after the last one.
 
         It can be called from another thread while frames are tracked.
 
         Args:
-            stamp: Time in the clock of the frames, seconds; in the last 10 s, or later than the last frame.
+            stamp: Time in the clock of the frames, seconds; at most 10 s before the last frame, or later than it.
 
         Raises:
-            InputError: If the time is earlier, or before the first frame.
+            InputError: If the time is earlier, or no frame has been tracked.
         """
         return self.states.at(stamp)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that changes from frame to frame, between two frames.
+        """Return the state that changes from frame to frame. Call it between two frames.
 
         Raises:
             ConfigError: If a stage was replaced by one without state_dict.
@@ -334,7 +325,7 @@ class V3DSLAM(ReplaceableStages):
         return {**state, **own, "gravity": self.gravity}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`; the next frames give the same results as without the interruption."""
+        """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
         for name, component in self._stateful_components().items():
             component.load_state_dict(state[name])
         self.loop_closer.rebuild(each for each in self.map.active_keyframes if each is not self.back_end.keyframe)
@@ -363,20 +354,57 @@ class V3DSLAM(ReplaceableStages):
                 raise ConfigError(f"{name} was replaced by a stage without state_dict; its state cannot be saved")
         return components
 
+    def _compensate(self, features: Features, preprocessed: PreprocessedFrame, velocity: Tensor) -> Features:
+        """Move features to where they would be without rolling shutter and depth delay, see `TimeCompensation`."""
+        depth, delay = preprocessed.extraction.depth, preprocessed.frame.depth_delay
+        return self.compensate(features, depth, delay, velocity, self.map.readout)
+
+    def _compose_pose(self, motion: CameraMotion) -> Tensor:
+        """Compose the pose of the previous frame with the motion since then: world to camera, float64, (4, 4)."""
+        return orthonormalise(motion.T_cp @ self.poses.T_cw)
+
+    def _wait_for_segmentation(self, preprocessed: PreprocessedFrame) -> Segmentation:
+        """Return the segmentation; the network can run beside the stages before."""
+        segmentation = preprocessed.segmentation
+        self._segmenter_state = segmentation.segmenter_state
+        self.timer.add(segmentation.times)
+        return segmentation
+
+    def _complete_instances(self, instances: Instances | None, view: DepthView, occupied: NewlyOccupied) -> Instances:
+        """Redraw the previous objects in a frame without segmentation, and add moving regions without a class."""
+        if instances is None:
+            instances = self.classify_motion.propagate_instances(view)
+        if self.config.segmentation.source == "none":
+            return instances
+        return instances.concatenate(self.propose_unlabelled(occupied, instances, view.depth))
+
+    def _extend_map(
+        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
+    ) -> Keyframe | None:
+        """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
+        reference = self.track_camera.reference_keyframe(pose)
+        keyframe = self.mapper(frame, features, pose, reference)
+        T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
+        self._apply_world_correction(T_new_old)
+        self._update_gravity(frame, T_new_old)
+        if keyframe is not None:
+            self.back_end.submit(keyframe)
+        return keyframe
+
     def _predict(self) -> PosePrediction | None:
         """Predict the motion of the camera; None if it has not been localised in a known map yet."""
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_located else None
 
     def _update_gravity(self, frame: RGBDFrame, T_new_old: Tensor | None) -> None:
-        """Take over the first measured gravity; move it with a guessed world frame when the camera is first found."""
+        """Store the first measured gravity in the world frame; rotate it with later corrections of the world frame."""
         if frame.gravity is not None and self.gravity is None:
             self.gravity = self.poses.T_cw[:3, :3].T @ frame.gravity
         elif T_new_old is not None and self.gravity is not None:
             self.gravity = T_new_old[:3, :3] @ self.gravity
 
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
-        """Move everything outside the map that is stored in the world frame, after a correction of the map."""
+        """Apply a correction of the map to all other data that is stored in the world frame."""
         if T_new_old is not None:
             self.classify_motion.tracker.apply_world_correction(T_new_old)
             self.free_space_check.apply_world_correction(T_new_old)

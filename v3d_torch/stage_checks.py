@@ -1,4 +1,4 @@
-"""Checks of what stages of the user return, before another stage of `V3DSLAM` fails on it."""
+"""Checks of the results of user-defined stages, so that errors name the stage that caused them."""
 
 from __future__ import annotations
 
@@ -68,18 +68,18 @@ _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] |
     "track_camera": (FramePose, lambda features, *_: {"N": len(features)}),
     **dict.fromkeys(("motion_model", "refine_previous", "mapper", "back_end", "loop_closer")),
 }
-"""Result of each stage, and the function that returns the sizes that the arguments determine; None if a result is not
-checked."""
+"""Expected result of each stage, and a function that returns the sizes given by the stage's arguments; None if the
+result is not checked."""
 
 
 class ReplaceableStages:
-    """Base class of `V3DSLAM`. A stage that is set again is one of the user, and what it returns is checked."""
+    """Base class of `V3DSLAM`: stages are attributes that can be replaced; results of the replacements are checked."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute.
 
         Raises:
-            ConfigError: If a stage that is called is replaced by a value that cannot be called.
+            ConfigError: If a callable stage is replaced by a value that is not callable.
         """
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
@@ -87,15 +87,15 @@ class ReplaceableStages:
 
 
 class ReplacedStage(StageProxy):
-    """Stage of the user. Types, shapes, dtypes and devices of its results are checked.
+    """Proxy of a user-defined stage that checks types, shapes, dtypes and devices of its results.
 
     Args:
-        stage: Stage.
-        name: Name of its attribute.
-        replaced: Stage that was there before.
+        stage: User-defined stage.
+        name: Name of its attribute in `V3DSLAM`.
+        replaced: Original stage of that name.
 
     Raises:
-        ConfigError: If the stage before can be called, and this one cannot.
+        ConfigError: If the original stage is callable and this one is not.
     """
 
     _OWN = StageProxy._OWN | {"_replaced"}
@@ -110,7 +110,7 @@ class ReplacedStage(StageProxy):
         """Return an attribute of the stage.
 
         Raises:
-            ConfigError: If the stage lacks a method of the stage before that others use.
+            ConfigError: If the stage lacks a public method of the original stage.
         """
         try:
             return super().__getattr__(name)

@@ -77,14 +77,14 @@ class RGBDFrame:
                 are accepted.
             depth: Depth registered to the colour image, shape :math:`(H, W)`: metres if floating point, else in the
                 units of the camera; 0 or NaN = no measurement.
-            camera: Camera of both images, which gives the unit and the correction of depth in whole numbers.
+            camera: Camera of both images. Its depth scale and depth correction are applied to depth in whole numbers.
             depth_delay: Time of the depth image minus time of the colour image, seconds.
             gravity: Direction of gravity in the camera frame, of any length, shape :math:`(3,)`; None if it was not
                 measured. An accelerometer at rest measures the opposite direction.
 
         Raises:
-            InputError: If an image or the gravity has the wrong shape, type or size, if depth has whole numbers and the
-                camera no depth scale, or if a time is not a finite number.
+            InputError: If an image or the gravity has the wrong shape, type or size, if depth is in whole numbers but
+                the camera has no depth scale, or if a time is not a finite number.
         """
         colour, measured = _array(image), _array(depth)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
@@ -109,7 +109,7 @@ class RGBDFrame:
             raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
         if camera is not None and colour.shape[:2] != (camera.height, camera.width):
             raise InputError(
-                f"frame {index}: has {colour.shape[1]}x{colour.shape[0]} pixels, the camera"
+                f"frame {index}: has {colour.shape[1]}x{colour.shape[0]} pixels, but the camera"
                 f" {camera.width}x{camera.height}; give the camera that took it"
             )
         scale = camera.depth_scale if camera is not None else None
@@ -131,7 +131,7 @@ class RGBDFrame:
 
 
 def _array(image: object) -> NDArray[Any]:
-    """Return an image as an array; a tensor can have a dtype that NumPy lacks, or require gradients."""
+    """Return an image as an array; floating-point tensors become float32, because NumPy lacks some of their dtypes."""
     if isinstance(image, Tensor):
         image = image.detach()
         return (image.to(torch.float32) if image.is_floating_point() else image).numpy()
@@ -139,7 +139,7 @@ def _array(image: object) -> NDArray[Any]:
 
 
 def _unit_vector(vector: NDArray[Any], index: int) -> Tensor:
-    """Return the gravity of a frame with length 1."""
+    """Return the direction of gravity in a frame as a unit vector."""
     if vector.shape != (3,) or vector.dtype.kind not in "fiu" or not 0 < np.linalg.norm(vector) < np.inf:
         raise InputError(f"frame {index}: the gravity is {vector.tolist()!r}; give a vector of 3 numbers, not zero")
     return torch.from_numpy(vector / np.linalg.norm(vector.astype(np.float64)))
@@ -229,8 +229,8 @@ def is_stateful(component: object) -> bool:
 def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
     """Return the state of a segmenter; None if it has no state.
 
-    The state_dict of a torch module holds its weights, which are constant and too large to be copied for each frame, so
-    it does not count as state.
+    A torch module counts as stateless: its state_dict holds its weights, which are constant and too large to copy in
+    each frame.
     """
     has_state = is_stateful(segmenter) and not isinstance(segmenter, nn.Module)
     return cast("Stateful", segmenter).state_dict() if has_state else None
@@ -243,7 +243,7 @@ def restore_segmenter(segmenter: object, state: Mapping[str, Any] | None) -> Non
 
 
 def _has(value: object, *methods: str) -> bool:
-    """Check for methods by name; since Python 3.12, isinstance does not find those that a proxy forwards."""
+    """Check for methods by name: since Python 3.12, isinstance does not find the methods that a proxy forwards."""
     return all(callable(getattr(value, method, None)) for method in methods)
 
 
@@ -268,8 +268,8 @@ class FramePose:
         status: Source of the pose.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
-        information: Information matrix of the left perturbation of ``T_cw`` if the errors of all features were
-            independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
+        information: Information matrix of the left perturbation of ``T_cw``, under the assumption that the errors of
+            the features are independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
     """
 
     status: TrackingStatus

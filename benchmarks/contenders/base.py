@@ -9,7 +9,7 @@ from v3d_torch.types import Trajectory
 
 
 class Contender(Protocol):
-    """System that is ready to run: everything that a user loads once is loaded."""
+    """System that is ready to run: everything that is loaded once per process is loaded."""
 
     @property
     def stages(self) -> Mapping[str, float]:

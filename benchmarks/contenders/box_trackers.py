@@ -21,7 +21,7 @@ SETTINGS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
         "BoT-SORT": {"high_conf_det_threshold": 0.4, "track_activation_threshold": 0.4},
     },
 }
-"""Settings of each tracker in addition to its defaults; of all, the benchmark shows the best for each sequence."""
+"""Settings of each tracker in addition to its defaults; the benchmark shows the best setting for each sequence."""
 
 
 class BoxTracker:

@@ -71,7 +71,7 @@ class OrbSlam3:
 
 
 def wait_for_threads(pause: float = 0.5) -> None:
-    """Wait until this process is idle: ``shutdown`` only asks the threads to end."""
+    """Wait until this process is idle, because ``shutdown`` does not wait for the threads."""
     busy = True
     while busy:
         start = time.process_time()
@@ -85,7 +85,7 @@ def frame_rate(sequence: RGBDSequence) -> int:
 
 
 def settings(camera: PinholeCamera, fps: int) -> str:
-    """Return the settings file: the given camera, the rest as in ORB-SLAM3's example for TUM sequences.
+    """Return the settings file: the given camera, and all other values of ORB-SLAM3's example for TUM sequences.
 
     The depth factor is 1 because depth is passed in metres.
     """

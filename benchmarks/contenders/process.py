@@ -1,4 +1,4 @@
-"""Runs of contenders, each in a new process, so that its threads, memory, output and crashes affect nothing else."""
+"""Runs of contenders, each in a new process, so that threads, memory, output and crashes do not affect other runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.types import Trajectory
 
 TIMEOUT = 3600
-"""Longest run time of a process, seconds; a longer one is considered to hang."""
+"""Timeout of a process, seconds; a process that takes longer is considered to hang."""
 
 
 class ContenderError(Exception):

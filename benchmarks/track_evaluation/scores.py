@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from track_evaluation.truth import IGNORED, TruePeople
 
 _MAX_IGNORED = 0.5
-"""A track of which a larger fraction lies on pixels that are not evaluated is left out in that frame."""
+"""Maximum fraction of a track on pixels that are not evaluated; with more, the track is left out in that frame."""
 
 
 @dataclass(frozen=True)

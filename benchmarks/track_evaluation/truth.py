@@ -25,8 +25,8 @@ IGNORED = 255
 """Value of the pixels in `TruePeople.owner` that are not evaluated."""
 
 MIN_SECONDS_IN_VIEW = 0.5
-"""People who are in view for less time in the whole sequence are not evaluated, seconds: most are shoes that the masks
-show apart from their person."""
+"""Minimum time in view of evaluated people in the whole sequence, seconds. Most people with less time are shoes that
+have their own id in the masks."""
 
 _SECOND_PERSON = 1000
 """The second person of a split id gets the id plus this number."""

@@ -1,4 +1,4 @@
-"""Each warning on a map and views that contradict the camera, and none where they agree."""
+"""Plausibility checks: each warning for a map and views that contradict the camera, and none if they agree."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def test_noise_is_estimated_from_the_residuals() -> None:
 
 
 def test_uncertainty_agrees_with_the_errors_over_many_maps() -> None:
-    """Mean squared errors in standard deviations (NEES). The jackknife of few blocks is on the safe side."""
+    """Mean squared errors in standard deviations (NEES). The jackknife of few blocks overestimates the covariance."""
     names, squared = ("fx", "cx", "k1"), []
     expected = torch.tensor(get_values(TRUE, 0.0, names))
     for seed in range(12):

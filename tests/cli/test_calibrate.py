@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import assert_error_line
+from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import calibrate
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.demo.sequence import write_sequence
 
 
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "walk"
-    write_sequence(folder, range(0, 60, 5))
+    copy_frames(folder, range(0, 60, 5))
     return folder
 
 

@@ -13,11 +13,11 @@ import pytest
 import torch
 from helpers.colmap_reader import read_model
 from helpers.commands import assert_error_line, files_in
+from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import export, run
 from v3d_torch.datasets import load_sequence
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.io.ply import read_ply_points
@@ -28,7 +28,7 @@ FRAMES = 12
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "walk"
-    write_sequence(folder, range(45, 45 + FRAMES))
+    copy_frames(folder, range(45, 45 + FRAMES))
     return folder
 
 
@@ -141,10 +141,10 @@ def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_pat
     assert_error_line(call(*arguments, tmp_path / "a"), "gone")
     assert call(*arguments, tmp_path / "b", "--seq", sequence).exit_code == 0
     assert len(list((tmp_path / "b" / "images").iterdir())) == 2
-    write_sequence(tmp_path / "other", range(5))
+    copy_frames(tmp_path / "other", range(5))
     for name, words in (("other", "fewer than the run"), ("later", "pass the sequence of this run with --seq")):
         if name == "later":
-            write_sequence(tmp_path / "later", range(60, 60 + FRAMES))
+            copy_frames(tmp_path / "later", range(60, 60 + FRAMES))
         assert_error_line(call(*arguments, tmp_path / f"to_{name}", "--seq", tmp_path / name), words)
 
 
@@ -172,7 +172,7 @@ def test_map_without_common_landmarks_gives_a_note(results: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("file", "words"),
     [
-        ("map_masks", "has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"),
+        ("map_masks", "has no masks; run the sequence again with --save-masks, or do not mask with --no-masks"),
         ("request.yaml", "request.yaml: cannot be read"),
         ("metrics.json", "has no results of a run"),
         ("map.ply", "map.ply: is missing, because the run did not end"),
@@ -192,7 +192,7 @@ def test_unsuitable_options_and_folders_are_errors(results: Path, tmp_path: Path
     done = call(results, "--format", "colmap", "--out", tmp_path / "full")
     assert_error_line(done, "already exists and is not an empty folder; choose another folder with --out")
     done = call(results, "--format", "tum", "--out", tmp_path / "out", "--no-masks")
-    assert_error_line(done, "--format tum: has masks and the images as recorded; remove --no-masks and --undistort")
+    assert_error_line(done, "--format tum: needs masks and the recorded images; remove --no-masks and --undistort")
     copy = tmp_path / "live"
     shutil.copytree(results, copy)
     (copy / "request.yaml").write_text(

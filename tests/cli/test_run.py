@@ -21,11 +21,12 @@ import plyfile
 import pytest
 from helpers.bag_messages import read_with_mcap
 from helpers.commands import RUN_FILES, assert_error_line, call, command, environment, files_in
+from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
 from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
-from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE, write_sequence
+from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 
 OBJECT_FILES = {"figures/voting.png", "figures/clusters.png"}
@@ -49,7 +50,7 @@ def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One second of the demo in TUM layout, in which the walker crosses the room."""
     folder = tmp_path_factory.mktemp("sequences") / "second"
-    write_sequence(folder, range(45, 75))
+    copy_frames(folder, range(45, 75))
     return folder
 
 
@@ -114,7 +115,7 @@ def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Pat
     assert len(same) > 35
     assert [name for name in same if (tmp_path / "out" / name).read_bytes() != (first_out / name).read_bytes()] == []
     done = call_here(*arguments, "--out", "again", cwd=tmp_path)
-    assert_error_line(done, "run.mcap: exists already; delete it, or choose another file")
+    assert_error_line(done, "run.mcap: already exists; delete it, or choose another file")
     assert not (tmp_path / "again").exists()
 
 

@@ -13,12 +13,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from helpers.commands import assert_error_line, command, environment
+from helpers.demo_frames import copy_frames
 from helpers.walker_folder import write_walker
 from helpers.walls import Slide
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
-from v3d_torch.datasets.demo.sequence import FRAME_RATE, write_sequence
+from v3d_torch.datasets.demo.sequence import FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
 
@@ -28,7 +29,7 @@ FRAMES = 24
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequences") / "second"
-    write_sequence(folder, range(45, 45 + FRAMES))
+    copy_frames(folder, range(45, 45 + FRAMES))
     return folder
 
 

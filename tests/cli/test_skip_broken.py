@@ -1,4 +1,4 @@
-"""Option ``--skip-broken``: broken frames are passed over, up to a limit."""
+"""Option ``--skip-broken``: broken frames are skipped, up to a limit."""
 
 from __future__ import annotations
 
@@ -98,10 +98,10 @@ def test_each_broken_frame_has_one_warning_on_the_console_and_in_the_log(
     out, done = serial
     log = (out / "run.log").read_text()
     for index, reason in BROKEN.items():
-        warning = f"frame {index} is broken and passed over: {broken}/{reason}"
+        warning = f"frame {index} is broken and skipped: {broken}/{reason}"
         assert done.stdout.count(f"warning: {warning}") == log.count(f"WARNING {warning}") == 1
     assert done.stdout.count("warning: ") == log.count(" WARNING ") == len(BROKEN)
-    assert f"{len(GOOD)} of {FRAMES}, {len(BROKEN)} broken ones passed over" in done.stdout
+    assert f"{len(GOOD)} of {FRAMES}, {len(BROKEN)} broken ones skipped" in done.stdout
 
 
 def test_threads_give_the_same_bytes(broken: Path, serial: tuple[Path, Result], tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_too_many_broken_frames_end_the_run_and_keep_its_results(tmp_path: Path)
     last = f"{sequence}/depth/1305031103.400000.png: is listed but does not exist; copy the whole sequence again"
     assert_error_line(
         done,
-        f"error: {last}; 11 of 18 frames are broken, and --skip-broken passes over 10 at most (the results of the 4"
+        f"error: {last}; 11 of 18 frames are broken, and --skip-broken skips at most 10 (the results of the 4"
         f" frames before are in {out}; resume with --resume {out})",
     )
     assert len((out / "trajectory.txt").read_text().splitlines()) == 4
@@ -190,11 +190,11 @@ def test_batch_passes_over_broken_frames_and_keeps_finished_runs(
     finished = (tmp_path / "out" / "good" / "baseline" / "seed0" / "metrics.json").stat().st_mtime_ns
     done = call_batch("--resume", "--skip-broken")
     assert done.exit_code == 0, done.stderr
-    assert "bad, baseline, seed 0: ATE" in done.stdout and "m, 1 broken frame passed over" in done.stdout
+    assert "bad, baseline, seed 0: ATE" in done.stdout and "m, 1 broken frame skipped" in done.stdout
     assert (tmp_path / "out" / "good" / "baseline" / "seed0" / "metrics.json").stat().st_mtime_ns == finished
     log = (tmp_path / "out" / "bad" / "baseline" / "seed0" / "run.log").read_text()
-    assert "resumed after 4 frames" in log and log.count("is broken and passed over") == 1
+    assert "resumed after 4 frames" in log and log.count("is broken and skipped") == 1
     runs = pq.read_table(tmp_path / "out" / "runs.parquet").to_pandas().set_index("sequence")
     assert runs["skipped"].to_dict() == {"good": 0, "bad": 1}
-    # A run that passed over frames is finished, and is not run again.
+    # A run that skipped frames is finished, and is not run again.
     assert call_batch("--resume").exit_code == 0

@@ -139,7 +139,7 @@ def test_depth_scale_that_the_images_do_not_tell_is_asked_for(
     folder = make(tmp_path / "take", 1000)
     (folder / "camera.yaml").write_text(CAMERA)
     with pytest.raises(
-        InputError, match="take: the unit of depth is not stated, and the images do not tell it"
+        InputError, match="take: the unit of depth is not stated and cannot be estimated from the images"
     ) as error:
         open_source(str(folder), options=FPS if make is images else None)
     assert "write the line depth_scale: 1000 into camera.yaml" in str(error.value) and "\n" not in str(error.value)

@@ -61,7 +61,7 @@ def test_frame_of_a_stream_that_is_read_too_late_counts_as_captured_when_it_was_
     assert clock.time == 55 and playback.captured_at(frame) == pytest.approx(50.1) and playback.skipped == 0
 
 
-def test_frames_of_a_sequence_that_are_due_already_are_passed_over() -> None:
+def test_frames_of_a_sequence_that_are_already_due_are_skipped() -> None:
     clock = SimulatedClock()
     playback = RealtimePlayback(StoredWall(), clock)
     frames = iter(playback)

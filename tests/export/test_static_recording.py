@@ -1,4 +1,4 @@
-"""Recordings without what moves."""
+"""Recordings of the static scene."""
 
 from __future__ import annotations
 

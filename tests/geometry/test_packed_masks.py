@@ -1,4 +1,4 @@
-"""Masks with one bit for each pixel."""
+"""Masks with one bit per pixel."""
 
 from __future__ import annotations
 

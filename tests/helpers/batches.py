@@ -10,7 +10,7 @@ from v3d_torch.datasets import load_sequence
 
 
 def repeat_sequence(moment: Path, folder: Path, frames: int) -> Path:
-    """Write a sequence that plays the frames of `moment` forth and back, without ground truth.
+    """Write a sequence that plays the frames of `moment` forwards and backwards, without ground truth.
 
     Args:
         moment: Sequence to take the frames from.

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.demo_frames import copy_frames
 from torch import Tensor
 
 from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.config.loading import load_config
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 from v3d_torch.segmentation import YOLOSegmenter
@@ -52,7 +52,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         for name, twin in TWINS.items():
             patch.setitem(TWINS, name, twin._replace(compiled=record(name)))
         folder = tmp_path_factory.mktemp("demo")
-        write_sequence(folder, FRAMES)
+        copy_frames(folder, FRAMES)
         sequence = load_sequence(str(folder))
         camera = replace(sequence.camera, readout=None)  # so that the map calibrates the readout
         config = load_config(overrides=["occupancy.enabled=true"])

@@ -1,4 +1,4 @@
-"""SLAM on live frames: equality with an offline run, frames left out, latency, and ends of a run."""
+"""SLAM on live frames: equality with an offline run, dropped frames, latency, and ends of a run."""
 
 from __future__ import annotations
 

@@ -291,6 +291,52 @@ def test_object_detected_again_too_late_gets_a_new_id() -> None:
         assert tracks == []
 
 
+def test_missed_furniture_rests_without_a_mask_and_keeps_its_history() -> None:
+    track_boards = BoardTracker()
+    track_thrice(track_boards, Board(0.0, label=CHAIR))
+    for _ in range(3):
+        assert track_boards(Board(0.0, label=CHAIR, detected=False)) == []
+    (resting,) = track_boards.tracker.resting
+    assert resting.missed and not resting.visible and resting.mask.numel() == 0
+    (track,) = track_boards(Board(0.0, label=CHAIR))
+    assert track is resting and len(track.detections) == 4 and track_boards.tracker.resting == []
+
+
+def test_missed_furniture_that_has_moved_is_predicted() -> None:
+    track_boards = BoardTracker()
+    track_thrice(track_boards, Board(0.0, label=CHAIR))
+    (track,) = track_boards.tracker.tracks
+    track.mark_dynamic(0.1)
+    (predicted,) = track_boards(Board(0.0, label=CHAIR, detected=False))
+    assert predicted is track and track.missed and bool(track.mask.any())
+
+
+def test_resting_furniture_is_lost_after_the_maximum_time_and_keeps_its_id() -> None:
+    track_boards = BoardTracker()
+    for _ in range(30):
+        track_boards(Board(0.0, label=CHAIR))
+    for _ in range(16):
+        track_boards(Board(0.0, label=CHAIR, detected=False))
+    assert track_boards.tracker.resting == []
+    (lost,) = track_boards.tracker.lost
+    assert len(lost.detections) == 1
+    (track,) = track_boards(Board(0.0, label=CHAIR))
+    assert track is lost and track.first_stamp == track.newest.stamp
+
+
+def test_tracker_restores_resting_and_lost_tracks() -> None:
+    track_boards = BoardTracker(10.0)
+    track_thrice(track_boards, Board(-0.8, label=DOG))
+    for _ in range(6):  # hidden by a cupboard
+        track_boards(Board(-0.8, 1.5, width=0.8, height=2.0, detected=False))
+    track_thrice(track_boards, Board(0.8, label=CHAIR))
+    track_boards()
+    restored = BoardTracker(10.0)
+    restored.tracker.load_state_dict(track_boards.tracker.state_dict())
+    assert [track.id for track in restored.tracker.lost] == [1]
+    assert [track.id for track in restored.tracker.resting] == [2]
+
+
 def test_object_hidden_for_longer_than_the_maximum_lost_time_gets_a_new_id() -> None:
     """A cupboard hides the board."""
     track_boards = BoardTracker(10.0)

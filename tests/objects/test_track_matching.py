@@ -9,7 +9,7 @@ from helpers.boards import CAMERA, CLOUDS, HERE, Board, BoardTracker, render
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
-from v3d_torch.objects.track_matching import compare_lost_tracks, compare_tracks, detect_instances, predict_tracks
+from v3d_torch.objects.track_matching import compare_tracks, compare_without_masks, detect_instances, predict_tracks
 
 
 def evidence(before: list[Board], after: list[Board], appearance: torch.Tensor | None = None) -> torch.Tensor:
@@ -45,7 +45,7 @@ def test_lost_track_beyond_the_gate_is_impossible() -> None:
     depth, instances = render([Board(-0.4), Board(0.9)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
     detected = detect_instances(0.1, instances, clouds, None, HERE, 1)
-    near, far = compare_lost_tracks([track], detected, TrackerConfig())[0].tolist()
+    near, far = compare_without_masks([track], detected, TrackerConfig())[0].tolist()
     assert near > 0
     assert far == -torch.inf
 
@@ -57,4 +57,4 @@ def test_track_lost_for_seconds_is_found_again_by_its_colours(colour: int, likel
     depth, instances = render([Board(0.1)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
     detected = detect_instances(4.0, instances, clouds, torch.eye(HISTOGRAM_SIZE)[colour][None], HERE, 1)
-    assert bool(compare_lost_tracks([track], detected, TrackerConfig()) > 0) is likely
+    assert bool(compare_without_masks([track], detected, TrackerConfig()) > 0) is likely

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.floor import find_floor
-from v3d_torch.occupancy.gravity import UpDirection, estimate_up
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
+from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 TABLE = torch.tensor([[-1.2, 0.4, 0.6], [1.2, 0.45, 1.83]])
@@ -101,9 +101,9 @@ def test_map_without_or_with_a_small_floor_has_none(side: int) -> None:
 
 
 def test_up_direction_comes_from_the_most_accurate_source() -> None:
-    accelerometer, votes = torch.tensor([0.0, -2.0, 0.1]), torch.tensor([9.0, 0.0, 1.0])
+    gravity, votes = torch.tensor([0.0, 2.0, -0.1]), torch.tensor([9.0, 0.0, 1.0])
     assert estimate_up().direction.tolist() == [0.0, -1.0, 0.0]
     assert estimate_up(votes=votes / 9).direction.tolist() == [0.0, -1.0, 0.0]  # too few
-    for up, vector in ((estimate_up(votes=votes), votes), (estimate_up(accelerometer, votes), accelerometer)):
+    for up, vector in ((estimate_up(votes=votes), votes), (estimate_up(gravity, votes), -gravity)):
         torch.testing.assert_close(up.direction, vector.double() / vector.double().norm())
-    assert estimate_up(accelerometer).tolerance < estimate_up(votes=votes).tolerance == estimate_up().tolerance
+    assert estimate_up(gravity).tolerance < estimate_up(votes=votes).tolerance == estimate_up().tolerance

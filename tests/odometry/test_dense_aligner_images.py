@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.demo_frames import copy_frames
 from helpers.rendered_planes import Image, align, motion_error
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from v3d_torch.datasets import TUMSequence
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.se3 import invert, se3_log
 
@@ -44,7 +44,7 @@ def darkened(image: Image) -> Image:
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[TUMSequence, list[Tensor]]:
     """Frames 40, 43 and 46 of the demo, and their masks of static pixels."""
     folder = tmp_path_factory.mktemp("demo")
-    write_sequence(folder, range(40, 49, 3))
+    copy_frames(folder, range(40, 49, 3))
     masks = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted((folder / "masks").iterdir())]
     static = [torch.from_numpy(cv2.dilate(mask, np.ones((9, 9), np.uint8)) == 0) for mask in masks]
     return TUMSequence(folder), static

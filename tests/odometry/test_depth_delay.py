@@ -1,4 +1,4 @@
-"""Depth-delay compensation: features get their depth at the time of the colour image."""
+"""Depth-delay compensation: the depth of features at the time of the colour image."""
 
 from __future__ import annotations
 

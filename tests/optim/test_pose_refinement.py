@@ -294,7 +294,7 @@ def test_transforms_give_the_gradient(transform: Callable[..., Any]) -> None:
 
 
 def test_weights_of_features_are_learnt_through_the_poses_of_a_batch() -> None:
-    """A quarter of the features is inaccurate; only the first number of their descriptors tells so."""
+    """A quarter of the features is inaccurate; only the first number of their descriptors shows which."""
     torch.manual_seed(0)
     frames = camera_inputs.view(32, 50, torch.float64) | {"weights": None, "valid": None}
     true = refine_pose(**frames).T_cw

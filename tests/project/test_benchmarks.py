@@ -1,4 +1,4 @@
-"""Benchmarks: replays, vocabulary, processes, tables, and the page of all figures."""
+"""Benchmarks: replays, vocabulary, processes, tables, and the page of all measurements."""
 
 from __future__ import annotations
 

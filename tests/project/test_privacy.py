@@ -1,4 +1,4 @@
-"""Nothing unasked: no connections, and no files but those of the package, by the commands and by what they import."""
+"""Privacy: commands and their imports make no connections, and write only files of the package."""
 
 from __future__ import annotations
 

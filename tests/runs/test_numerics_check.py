@@ -1,4 +1,4 @@
-"""Debug mode: the stage that returns NaN is named, documented NaN is accepted, and results are unchanged."""
+"""Debug mode: the error names the stage that returns NaN, documented NaN is accepted, and results are unchanged."""
 
 from __future__ import annotations
 

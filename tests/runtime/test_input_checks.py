@@ -1,4 +1,4 @@
-"""Checks of the frames, instances and parameters that callers pass in."""
+"""Checks of frames, instances and parameters given by callers."""
 
 from __future__ import annotations
 

@@ -105,10 +105,10 @@ def test_interpolated_covariance_is_an_upper_bound(fraction: float, seed: int) -
 
 
 def test_times_that_are_not_kept_are_input_errors() -> None:
-    with pytest.raises(InputError, match="no frame was tracked yet; ask after the first frame"):
+    with pytest.raises(InputError, match="no frame has been tracked; track a frame first"):
         StateHistory().at(1.0)
     states = history(*(n / 10 for n in range(200)))
-    with pytest.raises(InputError, match=r"those of the last 10 s are kept, the first is at 9\.900000 s"):
+    with pytest.raises(InputError, match=r"only states of the last 10 s are stored, since 9\.900000 s"):
         states.at(9.0)
 
 

@@ -26,7 +26,7 @@ TRACKED, LOST, ODOMETRY = TrackingStatus.TRACKED, TrackingStatus.LOST, TrackingS
 
 @pytest.fixture(scope="module")
 def slide() -> Slide:
-    """Frames along a wall; the cases play them forth and back, because they need more frames."""
+    """Frames along a wall; the cases play them forwards and backwards, because they need more frames."""
     return Slide(0, 240)
 
 

@@ -1,4 +1,4 @@
-"""Refinement of the previous frame with the velocity that is known from both of its sides."""
+"""Refinement of the previous frame with the velocity from the poses before and after it."""
 
 from __future__ import annotations
 

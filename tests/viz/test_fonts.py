@@ -1,4 +1,4 @@
-"""Text of the user in figures: no warnings and no boxes for characters that the default font lacks."""
+"""User text in figures: no warnings and no boxes for characters that the default font lacks."""
 
 from __future__ import annotations
 

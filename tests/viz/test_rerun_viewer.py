@@ -18,6 +18,7 @@ import psutil
 import pytest
 import rerun_cli
 import torch
+from helpers.demo_frames import copy_frames
 from helpers.squares import squares
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
 from matplotlib.colors import to_rgba
@@ -27,7 +28,6 @@ from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
 from v3d_torch.config.loading import load_config
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.errors import ConfigError, OutputError, ViewerError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.level_frame import level_frame
@@ -442,7 +442,7 @@ def test_viewer_is_started_and_receives_the_run(
 
 
 def test_command_without_screen_suggests_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_sequence(tmp_path / "three", range(45, 48))
+    copy_frames(tmp_path / "three", range(45, 48))
     for name in list(os.environ):
         if "DISPLAY" in name or "WAYLAND" in name:
             monkeypatch.delenv(name)

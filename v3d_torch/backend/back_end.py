@@ -1,8 +1,8 @@
 """Background optimisation: local bundle adjustment and loop closing, run while tracking continues.
 
-ORB-SLAM2 has a thread for each of them, which changes the map as soon as it has finished. Here everything is computed
-beside the map, and the result is applied at one fixed point: when the next frame is tracked, before it is matched
-against the map. Therefore the results do not depend on when and in which thread the computation runs.
+In ORB-SLAM2 each of them has a thread that changes the map as soon as it has finished. Here the computation does not
+change the map; its result is applied at one fixed point: when the next frame is tracked, before it is matched against
+the map. Therefore the results do not depend on when and in which thread the computation runs.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class BackEnd:
         loop_closer: Loop closer of the same map.
 
     Attributes:
-        keyframe: Keyframe of which the result is pending; None if there is none.
+        keyframe: Keyframe whose result is pending; None if there is none.
     """
 
     def __init__(self, config: Config, camera: PinholeCamera, sparse_map: SparseMap, loop_closer: LoopCloser) -> None:
@@ -79,8 +79,8 @@ class BackEnd:
         """Change the map according to a result, then cull landmarks and redundant keyframes.
 
         Returns:
-            If a loop was closed, the correction of the world at its end, new world from old world, float64, shape
-            :math:`(4, 4)`; else None.
+            If a loop was closed, the transform ``T_new_old`` from the old to the corrected world frame at the end of
+            the loop, float64, shape :math:`(4, 4)`; else None.
         """
         self.keyframe = self._get_result = None
         if result.adjustment is not None:
@@ -99,7 +99,7 @@ class BackEnd:
         return {"keyframe": self.keyframe}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state that `state_dict` returned, by submitting the pending keyframe again.
+        """Restore a state of `state_dict`, and submit the pending keyframe again.
 
         Load the map and the loop closer first. The pending keyframe must be the object in the map.
         """

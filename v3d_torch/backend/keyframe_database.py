@@ -16,15 +16,15 @@ _DESCRIPTOR_BITS = 256
 """Length of an ORB descriptor, bits."""
 
 _KEY_BITS = 16
-"""Leading bits of a descriptor that select its hash bucket: fewer make the buckets larger and the search slower, more
-split the descriptors of one landmark between buckets, because a single different bit is enough."""
+"""Number of leading bits of a descriptor that select its hash bucket. With fewer bits, buckets are larger and the
+search is slower; with more bits, descriptors of one landmark are more often in different buckets."""
 
 _MAX_DISTANCE = 50
 """Hamming distance below which two descriptors match, bits: the same patch from a similar view (TH_LOW of ORB-SLAM)."""
 
 
 class KeyframeDatabase:
-    """Database of keyframes that is queried by descriptors; keyframes are added and removed without training.
+    """Database of keyframes that is queried by descriptors; it needs no training.
 
     A descriptor of the query votes for every keyframe that has a similar descriptor: in the same hash bucket, and with
     a Hamming distance below a threshold. Votes are weighted as in text retrieval, by inverse document frequency:
@@ -66,7 +66,7 @@ class KeyframeDatabase:
                 self.add(index, own)
 
     def query(self, descriptors: Tensor, k: int, exclude: Iterable[int] = ()) -> list[tuple[int, float]]:
-        """Find the keyframes that most likely show the same place.
+        """Find the keyframes that most likely observe the same place.
 
         Args:
             descriptors: ORB descriptors of the query image, uint8, shape :math:`(N, 32)`.
@@ -74,8 +74,9 @@ class KeyframeDatabase:
             exclude: IDs of keyframes that are not returned, such as recent or covisible ones.
 
         Returns:
-            Pairs (ID, score) with score > 0, best first; of equal scores the earlier added keyframe first. The score is
-            the mean weighted vote of a descriptor. It ranks the keyframes of one query and is not a probability.
+            Pairs (ID, score) with score > 0, best first; of equal scores, the keyframe added earlier is first. The
+            score is the mean weighted vote of a descriptor. It ranks the keyframes of one query; it is not a
+            probability.
         """
         ids = np.array(list(self._descriptors), dtype=np.int64)
         count, is_active = len(ids), ~np.isin(ids, list(self._removed))

@@ -20,8 +20,8 @@ from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 
 _MIN_SHARED_LANDMARKS = 30
-"""Number of shared landmarks from which two keyframes are joined in the pose graph. ORB-SLAM2 requires 100 for its
-essential graph, with 2000 features per image; here there are fewer."""
+"""Minimum number of shared landmarks of two keyframes with an edge in the pose graph. ORB-SLAM2 requires 100 for its
+essential graph, with 2000 features per image; here images have fewer features."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class LoopCorrection:
     Attributes:
         place: Place at which the loop begins.
         loop: Relative pose between the keyframe of that place and the keyframe at which the loop ends.
-        T_cw: World-to-camera poses of all keyframes, float64, shape :math:`(K, 4, 4)`; those of culled keyframes have
-            no meaning.
+        T_cw: World-to-camera poses of all keyframes, float64, shape :math:`(K, 4, 4)`; the poses of culled keyframes
+            are meaningless.
     """
 
     place: PlaceMatch
@@ -75,15 +75,15 @@ class LoopCloser:
         self.loop_count = 0
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
-        """Add a keyframe to the places that can be recognised."""
+        """Add a keyframe to the database of place recognition."""
         self._database.add(keyframe.index, keyframe.features.descriptors)
 
     def remove_keyframes(self, keyframes: Iterable[int]) -> None:
-        """Remove keyframes, given by their indices, from the places that can be recognised."""
+        """Remove keyframes, given by their indices, from the database of place recognition."""
         self._database.remove(keyframes)
 
     def rebuild(self, keyframes: Iterable[Keyframe]) -> None:
-        """Replace the places that can be recognised by the given keyframes.
+        """Replace the database of place recognition by the given keyframes.
 
         Args:
             keyframes: Active keyframes of the map, without a keyframe that is pending in the back end.
@@ -97,11 +97,11 @@ class LoopCloser:
         return {"loop_count": self.loop_count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state that `state_dict` returned; call `rebuild` as well."""
+        """Restore a state of `state_dict`; call `rebuild` as well."""
         self.loop_count = state["loop_count"]
 
     def relocalise(self, features: Features, sparse_map: SparseMap, exclude: Iterable[int] = ()) -> PlaceMatch | None:
-        """Find the place in the map that an image shows.
+        """Find the place in the map at which an image was taken.
 
         Args:
             features: Features of the image.
@@ -148,8 +148,8 @@ class LoopCloser:
         """Correct keyframes and landmarks of the map in place and fuse the landmarks on both sides of the loop.
 
         Returns:
-            Correction of the world at the keyframe at which the loop ends, new world from old world, float64, shape
-            :math:`(4, 4)`.
+            Transform ``T_new_old`` from the old to the corrected world frame at the keyframe at which the loop ends,
+            float64, shape :math:`(4, 4)`.
         """
         place, keyframe = correction.place, sparse_map.keyframes[correction.loop.j]
         previous_T_cw = keyframe.T_cw
@@ -157,13 +157,13 @@ class LoopCloser:
         self.loop_count += 1
         sparse_map.move_keyframes(correction.T_cw)
         sparse_map.fuse_landmarks(keyframe, place.tracking.landmarks)
-        # The loop joins the disconnected part of the map to the rest, unless the place itself is disconnected.
+        # The loop connects the disconnected part of the map to the rest, unless the place itself is disconnected.
         for other in sparse_map.keyframes:
             other.disconnected &= place.keyframe.disconnected
         return invert(keyframe.T_cw) @ previous_T_cw
 
     def _detect_revisit(self, keyframe: Keyframe, sparse_map: SparseMap) -> PlaceMatch | None:
-        """Find a place that is neither recent nor covisible; None soon after another loop."""
+        """Find a place whose keyframe is neither recent nor covisible; None soon after another loop."""
         if sparse_map.loops and keyframe.index - sparse_map.loops[-1].j < self._config.min_keyframe_gap:
             return None
         covisible = sparse_map.count_shared_landmarks(keyframe.observed_landmarks).nonzero()[:, 0].tolist()

@@ -1,4 +1,4 @@
-"""Pose-graph optimisation: poses that fit measured relative poses best (paper, Sec. III-E).
+"""Pose-graph optimisation: least squares of poses over measured relative poses (paper, Sec. III-E).
 
 Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE Intelligent Transportation Systems Magazine 2010. The
 normal equations are sparse, with 6x6 blocks for poses joined by an edge.
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import pypose as pp
 
 _REGULARISATION = 1e-9
-"""Added to the diagonal of the normal equations, so that they have a solution for poses without any edge; negligible
-beside the information of an edge."""
+"""Number added to the diagonal of the normal equations, so that they have a solution for poses without any edge;
+negligible compared with the information of an edge."""
 
 
 class PoseGraphResult(NamedTuple):
@@ -38,7 +38,7 @@ class PoseGraphResult(NamedTuple):
         cost_before: Sum of the weighted (robust) squared errors at the initial poses, shape :math:`(*)`.
         cost_after: Sum of the weighted (robust) squared errors at the optimised poses, shape :math:`(*)`.
         iterations: Number of Levenberg-Marquardt steps tried, int64, shape :math:`(*)`.
-        converged: True if the optimisation stopped because the cost no longer changed, bool, shape :math:`(*)`.
+        converged: True if the optimisation converged within the number of iterations, bool, shape :math:`(*)`.
     """
 
     T_wc: Tensor
@@ -69,30 +69,30 @@ def optimise_pose_graph(
 
     The result is differentiable in the measured poses, information, weights and fixed poses, by the implicit function
     theorem: memory does not grow with the iterations, but with the square of N. The Hessian is that of the robust cost,
-    with the dependence of the robust weights on the errors. The derivatives are as accurate as the optimum: train with
-    a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
+    including the dependence of the robust weights on the errors. The derivatives are as accurate as the optimum: train
+    with a small ``tolerance`` and enough ``iterations``. Second derivatives are not correct.
 
     Grisetti et al., A Tutorial on Graph-Based SLAM, 2010; Gould et al., On Differentiating Parameterized Argmin and
     Argmax Problems, 2016.
 
     Args:
         T_wc: Initial camera-to-world poses, shape :math:`(*, N, 4, 4)`, or PyPose's SE3 of shape :math:`(*, N)`. All
-            inputs are floating point except edges and masks, and computed with in float64.
+            inputs are floating point except edges and masks, and converted to float64.
         edges: Indices (i, j) of the poses joined by each measurement, i and j different, int64, shape
             :math:`(*, E, 2)`.
         T_ij: Measured pose of camera j in camera i, ``T_wi^-1 T_wj``, shape :math:`(*, E, 4, 4)`, or PyPose's SE3 of
             shape :math:`(*, E)`.
-        information: Inverse covariances of the errors, shape :math:`(*, E, 6, 6)`; the identity by default.
-        fixed: Poses that stay unchanged, bool, shape :math:`(*, N)`; only the first by default. Poses that are padding
-            have no edges; they must be finite, and are returned unchanged.
-        weights: Weight of each edge, not negative, shape :math:`(*, E)`; 1 by default.
-        valid: Edges that are not padding, bool, shape :math:`(*, E)`; all by default.
+        information: Inverse covariances of the errors, shape :math:`(*, E, 6, 6)`; None for the identity.
+        fixed: Mask of the poses that stay unchanged, bool, shape :math:`(*, N)`; None for only the first. Poses that
+            are padding have no edges; they must be finite, and are returned unchanged.
+        weights: Weight of each edge, not negative, shape :math:`(*, E)`; None for 1.
+        valid: Mask of the edges that are not padding, bool, shape :math:`(*, E)`; None for all.
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
         robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
 
     Returns:
-        The poses of minimal cost, with the dtype of ``T_wc``. Poses that no path of edges joins to a fixed pose are
+        The poses of minimal cost, with the dtype of ``T_wc``. Poses without a path of edges to a fixed pose are
         determined only relative to each other.
     """
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
@@ -136,7 +136,7 @@ def edge_errors(T_wi: Tensor, T_wj: Tensor, T_ji: Tensor) -> tuple[Tensor, Tenso
 
 
 class _Graph(NamedTuple):
-    """Measured relative poses, with the indices of the poses that each of them joins."""
+    """Edges of a pose graph: measured relative poses, with the indices of both poses."""
 
     edges: Tensor  # (..., E, 2)
     T_ji: Tensor  # (..., E, 4, 4)
@@ -164,7 +164,7 @@ class _Graph(NamedTuple):
         return torch.where(self.is_fixed, T_wc, T_wc @ se3_exp(xi))
 
     def differentiate(self, T_wc: Tensor, initial: Tensor) -> Tensor:
-        """Steps at the optimum, zero with the derivatives by the measurements and the fixed poses of ``initial``."""
+        """Return zero steps at the optimum, with derivatives by measurements and by the fixed poses of ``initial``."""
         constant = self.detach()
         ends = constant._ends(T_wc)
         blocks = jacobian(lambda xi: constant._gradient(ends, xi), T_wc.new_zeros(*self.edges.shape[:-1], 12))
@@ -186,7 +186,7 @@ class _Graph(NamedTuple):
         return error, torch.cat([J_i, J_j], dim=-1), weights * self.weights, costs
 
     def _gradient(self, ends: tuple[Tensor, Tensor], xi: Tensor | None) -> Tensor:
-        """Half the gradient of the cost of each edge by its unknowns, (..., E, 12), after a change by these."""
+        """Half the gradient of the cost of each edge by its unknowns, (..., E, 12), after the update ``xi``."""
         if xi is not None:
             ends = ends[0] @ se3_exp(xi[..., :6]), ends[1] @ se3_exp(xi[..., 6:])
         error, J, weights, _ = self._evaluate(ends)
@@ -235,9 +235,9 @@ def _is_lie_tensor(T: Tensor) -> TypeGuard[pp.LieTensor]:
 
 
 def _move(initial: Tensor, optimum: Tensor, steps: Tensor | None, is_fixed: Tensor) -> Tensor:
-    """Optimum with its derivatives, in the type of the initial poses, whose fixed ones are kept."""
+    """Return the optimum with its derivatives, in the type of the initial poses; fixed poses are kept."""
     if _is_lie_tensor(initial):
-        import pypose as pp  # the package takes long to import, and few callers need it
+        import pypose as pp  # the import takes long, and few callers need it
 
         T = pp.mat2SE3(optimum, check=False)
         T = T if steps is None else T @ pp.se3(steps).Exp()

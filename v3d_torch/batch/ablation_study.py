@@ -42,7 +42,7 @@ _NOTE = (
 class CachedSegmenter:
     """Segmenter that computes the instances of each frame once and then returns identical copies.
 
-    The variants of a study differ only in what follows the network, which takes most of the time of a run.
+    The variants of a study differ only after the network, and the network takes most of the time of a run.
 
     Args:
         segment: Segmenter to cache.
@@ -53,7 +53,7 @@ class CachedSegmenter:
         self._cache: dict[tuple[int, int], Instances] = {}
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Return the instances of a frame. The key is index and image, because the image may have been rotated."""
+        """Return the instances of a frame. The cache key is index and image, because the image may be rotated."""
         key = (frame.index, hash(frame.image.numpy().tobytes()))
         if key not in self._cache:
             instances = self._segment(frame)
@@ -144,7 +144,7 @@ def _run(
         )
     except OutputError:
         raise
-    except Exception as error:  # an error in one variant must not end the study; its log has the traceback
+    except Exception as error:  # continue the study after an error in one variant; its log has the traceback
         return {}, f"{type(error).__name__}: {error}"
     if pipeline.record.interrupted:
         raise KeyboardInterrupt

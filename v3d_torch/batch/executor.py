@@ -19,7 +19,7 @@ ONE_THREAD_ENVIRONMENT = dict.fromkeys(
     (*("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "OPENCV_FOR_THREADS_NUM", "RAYON_NUM_THREADS"),
     "1",
 )
-"""Environment of a job that shares its machine with other jobs: no library starts threads of its own."""
+"""Environment variables of a job that shares its machine with other jobs: libraries start no threads."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class JobFinished:
 
 
 def report_lost_process(job: Job, reason: str) -> JobFinished:
-    """Write to the log of a job that its process died, which the process itself cannot write.
+    """Write to the log of a job that its process died; the process itself cannot do it.
 
     Args:
         job: Job that the process ran.
-        reason: Reason in words.
+        reason: Reason, for the log and the message.
 
     Returns:
         The end of the job.

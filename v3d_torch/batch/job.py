@@ -20,13 +20,13 @@ class Job:
 
     Attributes:
         sequence: Name of the sequence in tables.
-        source: Path or name of the sequence, as `load_sequence` takes it.
+        source: Path or name of the sequence, see `load_sequence`.
         frames: Number of frames of the sequence.
         data_root: Folder of named sequences.
         config_name: Name of the configuration in tables.
         config: Configuration of the run, including its seed.
         folder: Folder of the results.
-        skip_broken: True to pass over broken frames.
+        skip_broken: True to skip broken frames.
     """
 
     sequence: str

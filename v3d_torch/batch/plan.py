@@ -18,7 +18,7 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
     """Load configurations.
 
     Args:
-        names: Names or files, as `find_config` takes them. Duplicates are loaded once.
+        names: Names or files, see `find_config`. Duplicates are loaded once.
         one_thread: True to limit each run to one thread, for runs that share a machine.
 
     Returns:
@@ -68,7 +68,7 @@ def plan_jobs(
         seeds: Number of runs for each sequence and configuration; their seeds count from 0.
         data_root: Folder of named sequences.
         folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
-        skip_broken: True if runs pass over broken frames.
+        skip_broken: True if runs skip broken frames.
     """
     return [
         Job(

@@ -20,10 +20,10 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 
 _STOP_LATENCY = 0.2
-"""Longest delay until a stop request is noticed, seconds: hardly noticeable, and the checks cost nothing."""
+"""Interval of the checks for a stop request, seconds: the delay is hardly noticeable, and the checks take no time."""
 
 _SPAWN = get_context("spawn")
-"""New interpreters instead of forks: a fork would copy threads and locks of the libraries in use."""
+"""Start method of processes: new interpreters instead of forks, which would copy threads and locks of libraries."""
 
 
 class ProcessExecutor:
@@ -145,7 +145,7 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 def _block_interrupts() -> Iterator[None]:
     """Block Ctrl-C for the processes that are started in the block; the parent asks them to stop instead.
 
-    A terminal sends Ctrl-C to all its processes. If it comes within the block, it takes effect after the block.
+    A terminal sends Ctrl-C to all its processes. Ctrl-C within the block takes effect after the block.
     """
     if sys.platform == "win32":
         yield

@@ -13,7 +13,7 @@ from v3d_torch.batch.job import Job
 
 
 class BatchProgress:
-    """One bar for the frames of all jobs, and below it one bar for each running job.
+    """Progress bars of a batch: one for the frames of all jobs, and below it one for each running job.
 
     Args:
         progress: Display to add the bars to.

@@ -20,7 +20,7 @@ _POLL_INTERVAL = 0.2
 """Time between two polls of the progress, seconds: often enough for a progress bar, and cheap for the cluster."""
 
 _CONNECT_TIMEOUT = 5.0
-"""Longest wait for the head of a cluster to accept a connection, seconds; on a network that works it takes less."""
+"""Maximum wait for the head of a cluster to accept a connection, seconds; a working network takes less."""
 
 
 class RayExecutor:
@@ -30,8 +30,8 @@ class RayExecutor:
     sequences. A job whose process or machine dies is not run again.
 
     Args:
-        address: Address of the cluster, as ``ray.init`` takes it: ``auto`` for the cluster that this machine belongs
-            to, ``local`` for a new cluster on this machine, or host and port of the head of another cluster.
+        address: Address of the cluster for ``ray.init``: ``auto`` for the cluster of this machine, ``local`` for a new
+            cluster on this machine, or host and port of the head of another cluster.
         workers: Number of jobs at a time; None for one job per core of the cluster.
 
     Raises:
@@ -139,7 +139,7 @@ def _task(job: Job, index: int, board: Any) -> str | None:
     with interrupts_between_frames() as cancelled:  # Ray cancels a task with the signal of Ctrl-C
 
         def report_progress(frames: int) -> None:
-            board.report.remote(index, frames)  # not awaited: a task that waits would yield its core to another task
+            board.report.remote(index, frames)  # not awaited, because a waiting task yields its core to another task
             if cancelled.is_set():
                 raise KeyboardInterrupt
 

@@ -82,7 +82,7 @@ class ReproductionRecord(BatchRecord):
         jobs: All jobs.
         folder: Folder of the results.
         table_configs: Names of the configurations in the paper's tables; the others appear in the study only.
-        absent: Sequences of the paper that are not available; they keep their row in the tables.
+        absent: Sequences of the paper that are not available; they have a row without values in the tables.
         study: True to include the ablation study.
 
     Raises:

@@ -49,7 +49,7 @@ def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
             segment = make_segmenter(job.config.segmentation)
             run = Run(_make_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
             run(on_frame)
-    except Exception as error:  # an error in one run must not end the batch; its log has the traceback
+    except Exception as error:  # continue the batch after an error in one run; its log has the traceback
         return describe_error(error)
     return run.pipeline.record.failure
 
@@ -60,7 +60,7 @@ def _make_request(job: Job) -> RunRequest:
 
 
 def _matching_checkpoint(job: Job) -> Checkpoint | None:
-    """Return the checkpoint of the same run; None if there is no readable one, so that the run starts again."""
+    """Return the checkpoint of the same run; None if there is no readable checkpoint, so that the run restarts."""
     try:
         checkpoint = read_checkpoint(job.folder)
     except InputError:

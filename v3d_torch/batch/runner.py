@@ -1,4 +1,4 @@
-"""A batch from sequence patterns to summary tables: planning, execution, display and files."""
+"""Runner of a batch: planning, execution, display and summary tables."""
 
 from __future__ import annotations
 

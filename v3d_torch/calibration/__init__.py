@@ -1,1 +1,1 @@
-"""Calibration of the camera from a map that was built with it, and plausibility of the camera without ground truth."""
+"""Self-calibration of the camera from a map, and plausibility checks of the camera without ground truth."""

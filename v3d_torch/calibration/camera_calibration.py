@@ -19,17 +19,17 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.types import Trajectory
 
 _DELAY_TOLERANCE = 0.003
-"""Largest accepted standard deviation of the depth delay, seconds: 3 pixels of an image that moves by 1000 pixels per
+"""Maximum accepted standard deviation of the depth delay, seconds: 3 pixels in an image that moves by 1000 pixels per
 second."""
 
 _SCALE_TOLERANCE = 0.01
-"""Largest accepted relative standard deviation of the depth scale."""
+"""Maximum accepted relative standard deviation of the depth scale."""
 
 _MAX_SHIFT = 0.01
-"""Largest shift between depth and colour at which their delay is estimated, relative to the width of the image."""
+"""Maximum shift between depth and colour with which their delay is estimated, relative to the width of the image."""
 
 _MIN_VIEWS = 5
-"""Smallest number of views from which the depth delay is estimated."""
+"""Minimum number of views for an estimate of the depth delay."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Calibration:
     """Calibrated camera.
 
     Attributes:
-        camera: The given camera with the values that were taken.
+        camera: The given camera with the accepted estimates as new values.
         estimates: Estimates of all parameters.
     """
 
@@ -54,15 +54,15 @@ def calibrate_camera(
     given: PinholeCamera,
     config: Config,
 ) -> Calibration:
-    """Estimate the parameters of a camera from a run, and take those that the recording tells.
+    """Estimate the parameters of a camera from a run, and accept the estimates that the recording determines.
 
     Args:
         tables: Data of the map of the run.
         views: Static views of its keyframes.
         trajectory: Poses of all frames.
-        groundtruth: Measured poses in metres, which tell the depth scale; None if there are none.
+        groundtruth: Measured poses in metres, which determine the depth scale; None if there are none.
         camera: Camera with which the run was made.
-        given: Camera as it was given; its values are kept where the recording tells no others.
+        given: Camera before calibration; its values are kept for parameters that the recording does not determine.
         config: Configuration of the run.
     """
     estimates = [

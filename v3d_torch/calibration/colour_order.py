@@ -1,6 +1,6 @@
-"""Order of the colour channels, from what the segmentation network recognises.
+"""Check of the order of the colour channels, by the scores of the segmentation network.
 
-A network that was trained on photographs is less certain of things in blue instead of red. On a few images, the sum of
+A network that was trained on photographs has lower scores if red and blue are exchanged. On a few images, the sum of
 its scores is compared with that of the same images with red and blue exchanged.
 """
 
@@ -17,27 +17,27 @@ from v3d_torch.segmentation.yolo import YOLOSegmenter
 from v3d_torch.types import Segmenter
 
 _FIRST_IMAGES = 2
-"""Number of images that are compared first. The others are compared only if these seem exchanged, to save time."""
+"""Number of images that are compared first. To save time, further images are compared only if these seem exchanged."""
 
 _IMAGES = 12
 """Maximum number of images that are compared."""
 
 _MIN_RATIO = 1.1
-"""Smallest ratio of the scores with exchanged channels to those without."""
+"""Minimum ratio of the scores with exchanged channels to those without, for a warning."""
 
 _MIN_T = 2.5
-"""Smallest t-statistic of the difference of the scores."""
+"""Minimum t-statistic of the difference of the scores, for a warning."""
 
 
 def check_colour_order(views: StaticViews, segment: Segmenter) -> list[str]:
-    """Check whether the network recognises more if red and blue are exchanged.
+    """Check whether the scores of the network are higher if red and blue are exchanged.
 
     Args:
         views: Static views of the keyframes.
-        segment: Segmenter of the run; only a YOLO network is asked.
+        segment: Segmenter of the run; only a YOLO network is used.
 
     Returns:
-        One sentence with the likely cause, or nothing.
+        A list with one sentence that states the likely cause, or an empty list.
     """
     network = segment.segment if isinstance(segment, UprightSegmenter) else segment
     if not isinstance(network, YOLOSegmenter) or len(views) < _FIRST_IMAGES:
@@ -45,7 +45,7 @@ def check_colour_order(views: StaticViews, segment: Segmenter) -> list[str]:
     images = [view.colour for view in views]
     count = min(_IMAGES, len(images))
     spread = [images[round(index)] for index in torch.linspace(0, len(images) - 1, count).tolist()]
-    spread = spread[::2] + spread[1::2]  # the first ones are spread over the run, too
+    spread = spread[::2] + spread[1::2]  # so that the first images are spread over the run, too
     first = _compare_scores(spread[:_FIRST_IMAGES], network)
     if float(first[:, 0].sum()) >= float(first[:, 1].sum()):
         return []
@@ -55,7 +55,7 @@ def check_colour_order(views: StaticViews, segment: Segmenter) -> list[str]:
     if difference.mean() < _MIN_T * error or scores[:, 1].sum() < _MIN_RATIO * scores[:, 0].sum():
         return []
     return [
-        "the network recognises more in the images if red and blue are exchanged; the colour images seem to be BGR"
+        "the network detects more objects in the images if red and blue are exchanged; the colour images seem to be BGR"
         " instead of RGB"
     ]
 

@@ -1,8 +1,8 @@
-"""Steps of the depth images of cameras that measure disparity in whole steps.
+"""Quantisation step of the depth images of cameras that measure quantised disparity.
 
-A camera with structured light measures disparity in steps of a fraction of a pixel. Inverse depth then has equal steps:
-the step of disparity divided by focal length and baseline of the sensor (Khoshelham and Elberink, Accuracy and
-Resolution of Kinect Depth Data, Sensors 2012). So these images contain a length, the baseline.
+A structured-light camera measures disparity in steps of a fraction of a pixel. Inverse depth then has equal steps: the
+step of disparity divided by focal length and baseline of the sensor (Khoshelham and Elberink, Accuracy and Resolution
+of Kinect Depth Data, Sensors 2012). The steps therefore determine a length, the baseline.
 """
 
 from __future__ import annotations
@@ -11,29 +11,29 @@ import torch
 from torch import Tensor
 
 _BIN = 5e-5
-"""Width of the bins of inverse depth, 1/m: a tenth of the finest step, and of a millimetre at 1.5 m."""
+"""Width of the bins of inverse depth, 1/m: a tenth of the finest step, and a tenth of a millimetre at 1.5 m."""
 
 _MAX_INVERSE_DEPTH = 8.0
-"""Largest inverse depth, 1/m: a depth of 0.125 m."""
+"""Maximum inverse depth, 1/m: a depth of 0.125 m."""
 
 _MIN_STEP, _MAX_STEP = 4e-4, 2e-2
 """Range of the steps that are searched, 1/m."""
 
 _MIN_STRENGTH = 0.25
-"""Smallest strength of steps, 1 = all measurements lie on them. Depth without steps has less than 0.05."""
+"""Minimum strength of steps; 1 if all measurements are multiples of a step, less than 0.05 for depth without steps."""
 
 _HARMONIC = 0.5
-"""Steps of a fraction of the true step fit as well. The true one is the largest with this fraction of the best
-strength."""
+"""Minimum strength of the true step relative to the best strength. Fractions of the true step fit as well, so the true
+step is the largest with this strength."""
 
 _PEAK_WIDTH = 1.06
 """Ratio between the steps at the two sides of a peak."""
 
 _NEIGHBOURHOOD = 1.6
-"""Ratio between steps that are compared: up to it, steps do not resemble the true one."""
+"""Maximum ratio between steps that are compared: steps within it are not multiples or fractions of the true step."""
 
 _MIN_PROMINENCE = 6.0
-"""Smallest strength relative to the median of those in the neighbourhood. A few parallel walls, each at one depth, have
+"""Minimum strength relative to the median strength of neighbouring steps. A few parallel walls, each at one depth, give
 the same strength for many steps."""
 
 

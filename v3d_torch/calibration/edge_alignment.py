@@ -1,10 +1,10 @@
 r"""Registration and delay of the depth image, from its occlusion boundaries and the edges of the colour image.
 
-An occlusion boundary mostly is an edge of the colour image, too. If the depth image is shifted against the colour
-image, so are its boundaries: by a constant shift if it is not registered, and by the image motion meanwhile if it was
-taken at another time. Both are found where most boundaries lie on edges (cf. Levinson and Thrun, Automatic Online
-Calibration of Cameras and Lasers, RSS 2013). A single view has many edges that are no boundaries, but these lie
-elsewhere in each view.
+Most occlusion boundaries are edges of the colour image, too. If the depth image is not registered to the colour image,
+its boundaries have a constant shift; if it was taken at another time, they are shifted by the image motion in between.
+Shift and delay are estimated by maximising the number of boundaries on edges (cf. Levinson and Thrun, Automatic Online
+Calibration of Cameras and Lasers, RSS 2013). A single view has many other edges, but their positions differ between
+views.
 """
 
 from __future__ import annotations
@@ -25,48 +25,50 @@ from v3d_torch.optim.jackknife import jackknife_covariance
 from v3d_torch.types import Trajectory
 
 _MIN_BOUNDARIES = 100
-"""Minimum number of boundaries of a view; with fewer, chance decides where they fit."""
+"""Minimum number of boundaries of a view; fewer can fit somewhere by chance."""
 
 _SHIFTS = 48
-"""Largest shift of the coarse search, frame pixels, along both axes."""
+"""Maximum shift of the coarse search along both axes, frame pixels."""
 
 _DELAYS = torch.arange(-12, 13, dtype=torch.float64) / 100
 """Delays of the coarse search, seconds."""
 
 _REACH = 64
-"""Largest displacement by shift and delay together, frame pixels; farther ones do not count in the coarse search."""
+"""Maximum displacement by shift and delay together, frame pixels; boundaries with a larger displacement do not count in
+the coarse search."""
 
 _STEP = 2.0
-"""Step of the finite differences, frame pixels: the blur of the edges."""
+"""Step of the finite differences by the shift, frame pixels: the width of the blurred edges."""
 
 _DELAY_STEPS = (0.001, 0.02)
-"""Range of the step of the finite differences by the delay, in which the image mostly moves by the step above,
-seconds."""
+"""Range of the step of the finite differences by the delay, seconds; in this time most images move by about the step of
+the shift."""
 
 _MAX_NEWTON_STEPS = 20
 _CONVERGED = 0.02
-"""Newton steps end below this fraction of the steps above."""
+"""Size of the last Newton step, as a fraction of the steps of the finite differences."""
 
 _MIN_RATIO = 1.5
-"""Smallest ratio of two scores for one to be better: edges other than those of the boundaries give no more."""
+"""Minimum ratio of a significantly better score to the other score: edges that are not boundaries give smaller
+ratios."""
 
 _MIN_T = 3.0
-"""Smallest t-statistic of the difference between two scores, over views and over parts of the image."""
+"""Minimum t-statistic of the difference between two scores, over views and over parts of the image."""
 
 _PARTS = 4
 """Number of parts of the image in each direction."""
 
 _MIN_CLUSTERS = 4
-"""Smallest number of views or parts of the image for a test."""
+"""Minimum number of views or of parts of the image for a test."""
 
 
 @dataclass(frozen=True)
 class Misalignment:
-    """Shift and delay with which most boundaries lie on edges.
+    """Shift and delay that maximise the number of boundaries on edges.
 
     Attributes:
-        values: Shift of the colour image against the depth image along u and v (frame pixels), and delay of the depth
-            image in addition to the assumed one (seconds), float64, shape :math:`(3,)`.
+        values: Shift of the colour image relative to the depth image along u and v (frame pixels), and delay of the
+            depth image in addition to the assumed delay (seconds), float64, shape :math:`(3,)`.
         covariance: Covariance of the values, by the jackknife over views, shape :math:`(3, 3)`.
     """
 
@@ -83,7 +85,7 @@ class EdgeAlignment:
     """Search for the shift and the delay of the depth images of a run.
 
     Args:
-        views: Static views of the keyframes. Views of an earlier run are left out.
+        views: Static views of the keyframes. Views of an earlier run are ignored.
         trajectory: Poses of all frames.
         depth_delay: Delay of all depth images in addition to that of their timestamps, seconds.
         max_views: Maximum number of views, evenly spread over the run; None for all.
@@ -124,7 +126,7 @@ class EdgeAlignment:
         """Find the best shift and delay on a coarse grid, as in `Misalignment`."""
         reach, shifts = _REACH // self._stride, torch.arange(-(_SHIFTS // self._stride), _SHIFTS // self._stride + 1)
         maps = torch.stack([_correlation(edges, reach) for edges in self._edges])
-        maps = pad(maps, (1, 1, 1, 1))  # beyond the reach, the mean: 0
+        maps = pad(maps, (1, 1, 1, 1))  # beyond the maximum displacement, use the mean, 0
         motion = torch.stack([self._mean_motion(float(delay)) for delay in _DELAYS])  # (T, K, 2)
         index = (motion[..., None] + shifts).round().long().clamp(-reach - 1, reach + 1) + reach + 1
         column, row = index[:, :, 0, None, :], index[:, :, 1, :, None]
@@ -163,10 +165,10 @@ class EdgeAlignment:
         return float(self._scores(values).sum())
 
     def is_better(self, values: Tensor, other: Tensor) -> bool:
-        """Check whether more boundaries lie on edges with some values than with others, beyond chance.
+        """Check whether significantly more boundaries lie on edges with some values than with others.
 
-        Edges of one object can fit by chance in all views that show it, and those of one view in all its parts.
-        Therefore views and parts of the image have to agree, each in a t-test with clusters.
+        Edges of one object can fit by chance in all views that show it, and edges of one view in all parts of the
+        image. Therefore two t-tests must be significant, one with views and one with parts of the image as clusters.
 
         Args:
             values: Values that should be better, as in `Misalignment`.
@@ -181,11 +183,11 @@ class EdgeAlignment:
         return all(_t_statistic(score - compared, cluster) > _MIN_T for cluster in clusters)
 
     def _scores(self, values: Tensor) -> Tensor:
-        """Normalised gradient at each boundary after it is moved, (E,)."""
+        """Normalised gradient at each boundary moved by the values, (E,)."""
         return self._gradients_at(self._at_time_of_colour(float(values[2])) + values[:2] / self._stride)
 
     def _gradients_at(self, moved: Tensor) -> Tensor:
-        """Normalised gradient at each boundary, whose pixel is given, (E,)."""
+        """Normalised gradient at the given pixel of each boundary, (E,)."""
         height, width = self._gradients.shape[2:]
         limit = torch.tensor([width - 1, height - 1], dtype=torch.float64)
         moved = moved.clamp(torch.zeros_like(limit), limit)
@@ -211,7 +213,7 @@ class EdgeAlignment:
 
     def _derivatives(self, values: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
         """First (K, C) and second derivatives (K, C, C) of the score of each view, in units of the steps."""
-        pixels_at = cache(self._at_time_of_colour)  # most of the moves below keep the delay
+        pixels_at = cache(self._at_time_of_colour)  # most of the moves below have the same delay
 
         def of_views(*moves: tuple[int, int]) -> Tensor:
             moved = values.clone()
@@ -240,8 +242,8 @@ def _group_means(values: Tensor, group: Tensor) -> Tensor:
 def _t_statistic(values: Tensor, cluster: Tensor) -> float:
     """Mean of values divided by its standard error, for values that are correlated within clusters.
 
-    Liang and Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986. It is 0 for so few
-    clusters that chance decides.
+    Liang and Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986. It is 0 if there are
+    too few clusters for a test.
     """
     count = len(cluster.unique())
     if count < _MIN_CLUSTERS:
@@ -253,7 +255,7 @@ def _t_statistic(values: Tensor, cluster: Tensor) -> float:
 
 
 def _ascent_step(gradient: Tensor, hessian: Tensor) -> Tensor:
-    """Newton step towards a maximum, with directions of positive curvature turned uphill; at most one unit long."""
+    """Newton step towards a maximum: uphill also in directions of positive curvature, and at most one unit long."""
     curvature, directions = torch.linalg.eigh(hessian)
     step = directions @ (directions.T @ gradient / curvature.abs().clamp(min=1e-9))
     return step / max(float(step.abs().max()), 1.0)

@@ -1,4 +1,4 @@
-"""Depth scale from measured poses. Images alone do not tell it: a room of half the size gives the same images."""
+"""Depth scale from measured poses. Images alone do not determine it: a room of half the size gives the same images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MIN_PAIRS = 10
 
 
 def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, float] | None:
-    """Size of a measured trajectory relative to an estimated one (Umeyama, PAMI 1991).
+    """Scale of a measured trajectory relative to an estimated trajectory (Umeyama, PAMI 1991).
 
     Args:
         groundtruth: Measured poses, in metres.

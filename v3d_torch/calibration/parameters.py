@@ -1,4 +1,4 @@
-"""Parameters of a camera that a map can calibrate, in groups that are taken or left as a whole."""
+"""Parameters of a camera that can be calibrated from a map, in groups that are accepted or rejected as a whole."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ DERIVATIVE_STEPS = {
     "inverse_depth_offset": 1e-4,
     "readout": 1e-3,
 }
-"""Steps of central differences of the residuals by each parameter: pixels; no unit; 1/m; seconds. Large enough that the
-tolerance of undistortion, 1e-6 pixels, does not matter, small enough that the residuals are linear."""
+"""Steps of the central differences of residuals by each parameter, in pixels, no unit, 1/m and seconds: large enough
+that the tolerance of undistortion, 1e-6 pixels, is negligible, and small enough that the residuals are linear."""
 
 
 _MIN_FOCAL_LENGTH = 10.0
-"""Smallest focal length of a step, pixels."""
+"""Minimum focal length, at which a step ends, pixels."""
 
 _MAX_OFFSET = MAX_INVERSE_DEPTH_OFFSET - 2 * DERIVATIVE_STEPS["inverse_depth_offset"]
-"""Largest inverse-depth offset of a step: the differences around it are still accepted by a camera, 1/m."""
+"""Maximum inverse-depth offset, at which a step ends, 1/m; a camera also accepts the values of the central differences
+around it."""
 
 LIMITS = {
     "readout": (-MAX_READOUT, MAX_READOUT),
@@ -40,12 +41,12 @@ LIMITS = {
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters that have one meaning together.
+    """Parameters that are meaningful only together.
 
     Attributes:
         name: Name for tables.
         parameters: Names of the parameters.
-        tolerance: Largest accepted standard deviation, in the unit of the parameters; None for parameters whose
+        tolerance: Maximum accepted standard deviation, in the unit of the parameters; None for parameters whose
             tolerance is `PIXEL_TOLERANCE`.
     """
 
@@ -55,8 +56,8 @@ class ParameterGroup:
 
 
 PIXEL_TOLERANCE = 0.005
-"""Largest accepted standard deviation of where a group of parameters moves the pixels of an image, root mean square,
-relative to the width of the image: 3 pixels of 640, the accuracy of a calibration by hand."""
+"""Maximum accepted uncertainty of the pixels of an image that a group of parameters causes: root mean square of the
+standard deviations, relative to the width of the image. It is 3 pixels of 640, the accuracy of a manual calibration."""
 
 GROUPS = (
     ParameterGroup("focal length", ("fx", "fy")),
@@ -66,13 +67,14 @@ GROUPS = (
     ParameterGroup("inverse-depth offset", ("inverse_depth_offset",), tolerance=0.005),
     ParameterGroup("tangential distortion", ("p1", "p2")),
 )
-"""Groups in the order in which they are freed: by their effect on the images, and a group before those that resemble
-it. A tangential distortion can hardly be told from a shift of the principal point. The tolerances mean 2 pixels at
-the upper and lower border of an image that moves by 2000 pixels per second, and 2 cm at a depth of 2 m."""
+"""Groups in the order in which they are freed: by their effect on the images, and a group before groups with a similar
+effect. Tangential distortion, for example, has nearly the same effect as a shift of the principal point. The tolerances
+correspond to 2 pixels at the upper and lower border of an image that moves by 2000 pixels per second, and to 2 cm at a
+depth of 2 m."""
 
 
 def groups_of(camera: PinholeCamera) -> list[ParameterGroup]:
-    """Return the groups with the parameters that a camera has: its model has only some of the coefficients."""
+    """Return the groups, reduced to the parameters of a camera: its model has only some of the coefficients."""
     absent = DISTORTION - set(COEFFICIENTS[camera.distortion_model])
     kept = [
         replace(group, parameters=tuple(each for each in group.parameters if each not in absent)) for group in GROUPS
@@ -85,7 +87,7 @@ def get_values(camera: PinholeCamera, readout: float, names: Iterable[str]) -> l
 
     Args:
         camera: Camera.
-        readout: Readout, seconds; that of the camera can be unknown.
+        readout: Readout to return, seconds, because that of the camera can be unknown.
         names: Names of parameters.
     """
     values = vars(camera) | _coefficients(camera) | {"readout": readout}

@@ -1,6 +1,6 @@
 """Plausibility of the camera and of the depth images, without ground truth.
 
-Each check compares the images with themselves or with a property of all scenes or sensors, and warns only if they
+Each check compares the images with each other or with a property of all scenes or sensors, and warns only if they
 contradict the camera significantly.
 """
 
@@ -20,56 +20,55 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.types import Trajectory
 
 _FIRST_VIEWS, _MAX_VIEWS = 8, 32
-"""Number of views whose edges are compared first, which takes a tenth of a second, and of a closer look, if the first
-ones do not seem to fit."""
+"""Number of views whose edges are compared first, which takes a tenth of a second, and number of views for a more
+accurate estimate if these do not seem to fit."""
 
 _MAX_KEYFRAMES = 12
-"""Maximum number of keyframes whose bundle adjustment tells the focal length."""
+"""Maximum number of keyframes in the bundle adjustment that estimates the focal length."""
 
 _SUSPICION = 0.5
-"""Fraction of the following limits above which a first, inaccurate estimate is followed by a closer look."""
+"""Fraction of the following limits above which a first, inaccurate estimate is followed by a more accurate one."""
 
 _MIN_SHIFT = 0.01
-"""Smallest shift of depth that is reported, relative to the width of the image: 6 pixels of 640. Registration by
-a driver is accurate to a third of that."""
+"""Minimum shift of depth that is reported, relative to the width of the image: 6 pixels of 640, three times the error
+of the registration by a driver."""
 
 _MIN_DELAY = 0.05
-"""Smallest delay of depth that is reported, seconds: more than half a frame period, within which cameras without
-synchronisation stay."""
+"""Minimum delay of depth that is reported, seconds: more than half a frame period, the maximum delay of cameras without
+synchronisation."""
 
 _MIN_FOCAL_CHANGE = 0.1
-"""Smallest relative error of the focal length that is reported: cameras of one model differ by a fifth of that, and a
-lens distortion that is not modelled changes the estimate by half of it."""
+"""Minimum relative error of the focal length that is reported: the focal lengths of cameras of one model differ by a
+fifth of it, and lens distortion that is not modelled changes the estimate by half of it."""
 
 _SIGNIFICANCE = 3.0
-"""Standard deviations by which an estimate has to differ from the camera beyond the limits above."""
+"""Number of standard deviations by which an estimate must exceed the limits above."""
 
 _KINECT_STEP = 0.0029
 """Step of inverse depth of the Kinect and of other cameras with its sensor (Xtion, Structure), 1/m: an eighth of a
 pixel, divided by a focal length of 575 pixels and a baseline of 0.075 m."""
 
 _STEP_TOLERANCE = 1.14
-"""Accepted ratio of the steps to those of a Kinect, and its inverse."""
+"""Maximum accepted ratio of the steps to those of a Kinect; its inverse is the minimum."""
 
 _MAX_STEP_RATIO = 1.5
-"""Finer steps than those of a Kinect divided by this are those of other cameras."""
+"""Steps of a Kinect divided by this: cameras with finer steps are not a Kinect."""
 
 _KINECT_FOCAL_LENGTHS = (0.75, 1.0)
 """Focal length of cameras with the sensor of the Kinect, relative to the width of the image."""
 
 _MIN_VIEWS = 5
-"""Smallest number of keyframes for a check."""
+"""Minimum number of keyframes for a check."""
 
 _DEPTH_VIEWS = 4
 """Number of views whose depth is examined."""
 
 _FAR = (2.5, 10.0)
-"""Depth that 99% and 1% of the measurements exceed if the depth is too large, metres: RGB-D cameras measure up to about
-10 m."""
+"""Depths for a warning that depth is too large, metres: 99 % of the measurements exceed the first, and 1 % the second.
+RGB-D cameras measure up to about 10 m."""
 
 _NEAR = 0.3
-"""Depth that half of the measurements do not reach if the depth is too small, metres: most RGB-D cameras do not measure
-below it."""
+"""Median depth below which depth is too small, metres: most RGB-D cameras do not measure below it."""
 
 
 def check_plausibility(
@@ -88,7 +87,7 @@ def check_plausibility(
         One sentence with the likely cause for each contradiction.
     """
     registration = _check_registration(views, trajectory, camera)
-    # Depth that belongs to other pixels makes any focal length fit badly.
+    # If depth is not registered, no focal length fits.
     focal_length = [] if registration else _check_focal_length(tables, camera, config)
     return [*_check_depth_scale(views, camera), *registration, *focal_length]
 
@@ -96,7 +95,7 @@ def check_plausibility(
 def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
     """Compare depth with the range of RGB-D cameras, and its steps with those of the Kinect.
 
-    Depth in floating point has no scale.
+    Depth in floating point has no depth scale and is not checked.
     """
     if camera.depth_scale is None:
         return []

@@ -1,9 +1,9 @@
-"""Bundle adjustment with free parameters of the camera, by variable projection.
+"""Self-calibration: bundle adjustment with free parameters of the camera, by variable projection.
 
-For given parameters, poses and points are adjusted by the bundle adjustment of the map. The remaining cost depends on
-the parameters alone, and is minimised by damped Gauss-Newton steps with its exact derivatives (variable projection:
+For given parameters, poses and points are adjusted by the bundle adjustment of the map. The minimum cost is a function
+of the parameters alone, and is minimised by damped Gauss-Newton steps with its exact derivatives (variable projection:
 Golub and Pereyra, SIAM Journal on Numerical Analysis 1973; self-calibration: Triggs et al., Bundle Adjustment - A
-Modern Synthesis, 2000). So every camera model that can undistort pixels can be calibrated.
+Modern Synthesis, 2000). Therefore every camera model that can undistort pixels can be calibrated.
 """
 
 from __future__ import annotations
@@ -70,11 +70,11 @@ class SelfCalibration:
         tables: Data of the map.
         camera: Camera with which the map was built.
         config: Configuration of the run: measurement noise.
-        given: Camera whose values parameters have that are not free; None for the same camera.
-        max_keyframes: Maximum number of keyframes, the newest ones; None for all.
+        given: Camera with the values of the parameters that are not free; None for ``camera``.
+        max_keyframes: Maximum number of keyframes, of which the newest are used; None for all.
 
     Attributes:
-        given: Camera whose values parameters have that are not free.
+        given: Camera with the values of the parameters that are not free.
         observations: Observations of the map, with noise estimated from its residuals.
         T_cw: World-to-camera poses of the keyframes, adjusted with the given camera, float64, shape
             :math:`(K, 4, 4)`.
@@ -96,7 +96,7 @@ class SelfCalibration:
         self.given = camera if given is None else given
         self._camera, self._readout = camera, tables.readout.seconds
         self._given_readout = self._readout if self.given.readout is None else self.given.readout
-        self._fixed = torch.arange(len(keyframes)) == 0  # the gauge
+        self._fixed = torch.arange(len(keyframes)) == 0  # fixes the gauge
         self._pixel = camera.distort(self.observations.measured.uv)  # in the recorded image
         self._readout_jacobian = tables.observations["readout_jacobian"].index_select(0, self.observations.rows)
         self.T_cw, self.points = tables.T_cw[keyframes], tables.landmarks["point"][landmarks]
@@ -117,7 +117,7 @@ class SelfCalibration:
         return 6 * int((~self._fixed).sum()) + 3 * len(self.points)
 
     def given_values(self, names: Sequence[str]) -> Tensor:
-        """Values of parameters that are not free, float64, shape :math:`(C,)`; an unknown readout is the map's."""
+        """Given values of parameters, float64, shape :math:`(C,)`; for an unknown readout, that of the map."""
         return torch.tensor(get_values(self.given, self._given_readout, names), dtype=torch.float64)
 
     def minimise(self, names: Sequence[str], start: Tensor | None = None) -> tuple[Tensor, AdjustedMap]:
@@ -125,7 +125,7 @@ class SelfCalibration:
 
         Args:
             names: Free parameters.
-            start: Initial values; None for the given ones.
+            start: Initial values; None for the given values.
 
         Returns:
             Values, float64, shape :math:`(C,)`, and the map adjusted for them.
@@ -177,7 +177,7 @@ class SelfCalibration:
         return torch.stack(rows)
 
     def _measured_with(self, names: Sequence[str], values: Tensor) -> tuple[MapObservations, PinholeCamera]:
-        """Observations as they would have been with other parameters, and a camera with these parameters."""
+        """Observations that a camera with other parameters would have made, and this camera."""
         of_name = dict(zip(names, values.tolist(), strict=True))
         readout = of_name.pop("readout", self._given_readout)
         camera = with_values(self.given, of_name)
@@ -193,7 +193,7 @@ class SelfCalibration:
         return replace(self.observations, measured=changed), camera
 
     def _with_estimated_noise(self) -> MapObservations:
-        """The observations with standard deviations that agree with their residuals in the given map."""
+        """Return the observations with standard deviations estimated from their residuals in the given map."""
         measured = self.observations.measured
         residuals = _whitened_residuals(self.observations, self._camera, self.T_cw, self.points).abs()
         depth = residuals[2, measured.inverse_depth > 0]
@@ -220,8 +220,8 @@ def _whitened_residuals(observations: MapObservations, camera: PinholeCamera, T_
 def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor, Tensor]:
     """Undistort pixels, and return the scale of undistortion around them.
 
-    The noise of the recorded pixels is known, and undistortion scales it. If the scaling were left out, a distortion
-    that shrinks the image would shrink the residuals, too, and always seem to fit better.
+    The noise of the recorded pixels is known, and undistortion scales it. Without this scaling, a distortion that
+    shrinks the image would also shrink the residuals, and always seem to fit better.
 
     Returns:
         Undistorted pixels, shape :math:`(N, 2)`, and the square root of the determinant of the Jacobian, shape

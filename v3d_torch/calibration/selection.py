@@ -1,7 +1,7 @@
-"""Selection of the camera parameters that a recording tells.
+"""Selection of the camera parameters that a recording determines.
 
-A group of parameters is free only if the recording determines it, and all groups before it, within their tolerances;
-and it replaces the given values only if it differs from them significantly. What is not taken is left as given.
+A group of parameters is free only if the recording determines it, and all groups before it, within their tolerances.
+Its estimates are accepted only if they differ significantly from the given values; otherwise the given values are kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.jackknife import jackknife_covariance
 
 MAX_P_VALUE = 1e-3
-"""Largest probability of an equal difference by chance at which new values are taken."""
+"""Significance level: maximum probability of a difference by chance with which an estimate is accepted."""
 
 _GRID = 9
 """Rows and columns of the pixels at which the effect of parameters is measured."""
@@ -41,9 +41,9 @@ class Estimate:
         name: Name of the parameter.
         given: Value of the given camera; None if it states none.
         value: Estimated value; NaN if there is none.
-        sigma: Standard deviation of the estimate; infinite if the recording does not tell the parameter.
+        sigma: Standard deviation of the estimate; infinite if the recording does not determine the parameter.
         taken: True if the estimate replaces the given value.
-        reason: Reason why it was taken or left.
+        reason: Reason why the given value was kept; empty if it was replaced.
     """
 
     name: str
@@ -54,8 +54,8 @@ class Estimate:
     reason: str
 
 
-NOT_TOLD, AGREES = "not told by the recording", "agrees with the given value"
-"""Reasons why parameters are left as given."""
+NOT_TOLD, AGREES = "not determined by the recording", "agrees with the given value"
+"""Reasons why given values are kept."""
 
 
 def decide(name: str, given: float, value: float, sigma: float, tolerance: float) -> Estimate:
@@ -66,7 +66,7 @@ def decide(name: str, given: float, value: float, sigma: float, tolerance: float
         given: Given value.
         value: Estimated value.
         sigma: Standard deviation of the estimate.
-        tolerance: Largest accepted standard deviation.
+        tolerance: Maximum accepted standard deviation.
     """
     if not sigma <= tolerance:
         return Estimate(name, given, value, sigma, taken=False, reason=NOT_TOLD)
@@ -105,9 +105,9 @@ class ParameterSelection:
         problem: Calibration problem.
 
     Attributes:
-        free: Groups that are taken.
+        free: Groups whose estimates are accepted.
         fit: Fit with these groups free.
-        left: Estimates of the parameters that are left as given.
+        left: Estimates of the parameters whose given values are kept.
     """
 
     def __init__(self, problem: SelfCalibration) -> None:
@@ -124,7 +124,7 @@ class ParameterSelection:
 
     @property
     def estimates(self) -> list[Estimate]:
-        """Estimates of all parameters, those that are taken first."""
+        """Estimates of all parameters, accepted estimates first."""
         taken = [
             Estimate(name, self._given(name), value, self.fit.sigma(name), taken=True, reason="")
             for name, value in self.fit.values.items()
@@ -165,7 +165,7 @@ class ParameterSelection:
         return effect <= PIXEL_TOLERANCE * camera.width
 
     def _most_confirmed(self) -> ParameterGroup | None:
-        """The free group with the least significant difference from its given values; None if all are significant."""
+        """Free group with the least significant difference from its given values; None if all are significant."""
         known = [group for group in self.free if self._given(group.parameters[0]) is not None]
         if not known:
             return None
@@ -190,8 +190,8 @@ class ParameterSelection:
 def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
     """Covariance of the free parameters at the minimum.
 
-    It is the jackknife over keyframes, corrected for the residuals' degrees of freedom that poses and points take, and
-    at least the inverse of the normal matrix, from which poses and points are marginalised by the Schur complement.
+    It is the jackknife covariance over keyframes, corrected for the degrees of freedom of poses and points. Its lower
+    bound is the inverse of the normal matrix after marginalisation of poses and points by the Schur complement.
 
     Args:
         problem: Calibration problem.
@@ -210,7 +210,7 @@ def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
 
 
 def pixel_effect(camera: PinholeCamera, names: Sequence[str], covariance: Tensor) -> float:
-    """Standard deviation of where parameters move the pixels of an image, root mean square, pixels.
+    """Uncertainty of the pixels of an image that is caused by parameters: root mean square, pixels.
 
     Args:
         camera: Camera.

@@ -1,4 +1,4 @@
-"""Depth edges and colour gradients of a view, from which the registration of depth and colour is measured."""
+"""Depth edges and colour gradients of a view, to measure the registration of depth and colour."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _EDGE_RATIO = 0.1
 """Minimum relative step of depth at an occlusion boundary: larger than the steps of a slanted surface."""
 
 _MAX_GAP = 24
-"""Widest gap without depth that a boundary can have on its far side, frame pixels: the shadow of a projector. Wider
-gaps are masked objects."""
+"""Maximum gap without depth between the two sides of a boundary, frame pixels: the shadow of a projector. Wider gaps
+are masked objects."""
 
 _BLUR = 2.0
 """Standard deviation of the blur of the colour image, frame pixels: the error of depth edges."""
 
 _CONTRAST_WINDOW = 80
-"""Side of the window in which gradients are divided by their mean, frame pixels: so that a few strong edges do not
-outweigh all others."""
+"""Side of the window in which gradients are divided by their mean, frame pixels; with the normalisation, a few strong
+edges do not outweigh all others."""
 
 _MIN_CONTRAST = 2.0
 """Mean gradient below which a window has no contrast, grey values per pixel: sensor noise."""
 
 _MAX_GRADIENT = 4.0
-"""Largest normalised gradient: a strong edge counts as much as a few weak ones."""
+"""Maximum normalised gradient: a strong edge counts as much as a few weak edges."""
 
 _Image = NDArray[np.float32]
 

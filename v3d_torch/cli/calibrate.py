@@ -39,7 +39,7 @@ def main(
     """Calibrate the camera of a recording from its images.
 
     Tracks the camera, calibrates it by a bundle adjustment of the map, and repeats both until the camera does not
-    change. Writes a camera file; what the recording does not tell is left as given.
+    change. Writes a camera file; values that the recording does not determine are kept as given.
     """
     from v3d_torch.datasets.locate import check_name
 

@@ -23,7 +23,7 @@ def main(
         Literal["nerfstudio", "colmap", "tum"],
         typer.Option(
             "--format",
-            help="nerfstudio: transforms.json; colmap: text model; tum: TUM layout with depth 0 where something moves.",
+            help="nerfstudio: transforms.json; colmap: text model; tum: TUM layout, depth of moving objects is 0.",
         ),
     ],
     every: Annotated[
@@ -33,7 +33,7 @@ def main(
     undistort: Annotated[
         bool, typer.Option("--undistort", help="Remove the lens distortion, for tools that read pinhole images only.")
     ] = False,
-    no_masks: Annotated[bool, typer.Option("--no-masks", help="Keep what moves: the masks exclude nothing.")] = False,
+    no_masks: Annotated[bool, typer.Option("--no-masks", help="Do not mask moving objects.")] = False,
     seq: Annotated[str | None, typer.Option(help="Sequence of the run, if it was moved.")] = None,
 ) -> None:
     """Export the images of a run with poses and masks.

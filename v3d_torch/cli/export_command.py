@@ -58,7 +58,7 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
         folder: Results of the run.
         out: Folder to write, new or empty.
         options: Format and options.
-        seq: Sequence of the run; None for the one that the run names.
+        seq: Sequence of the run; None for the sequence that the run stored.
         console: Console for progress and summary.
 
     Raises:
@@ -67,7 +67,7 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
         OutputError: If the folder is not empty or cannot be written.
     """
     if options.format == "tum" and (options.undistort or not options.masks):
-        raise ConfigError("--format tum: has masks and the images as recorded; remove --no-masks and --undistort")
+        raise ConfigError("--format tum: needs masks and the recorded images; remove --no-masks and --undistort")
     run = read_run(folder)
     check_empty_folder(out)
     request = read_request(folder)

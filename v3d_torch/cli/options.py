@@ -30,7 +30,7 @@ SkipBroken = Annotated[
     bool,
     typer.Option(
         "--skip-broken",
-        help="Pass over broken frames of a stored sequence with a warning, at most 5 % of the frames or 10.",
+        help="Skip broken frames of a stored sequence with a warning, at most 5 % of the frames or 10.",
     ),
 ]
 Seeds = Annotated[
@@ -72,7 +72,7 @@ def make_app() -> typer.Typer:
 
 
 class MultiValueCommand(TyperCommand):
-    """Command whose repeatable options also accept several values at once: ``--configs paper full``."""
+    """Command whose repeatable options also accept several values, as in ``--configs paper full``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line after inserting the name of the option before each further value."""

@@ -31,7 +31,7 @@ def main(
     static: Annotated[
         bool,
         typer.Option(
-            "--static", help="Track the camera and remove what moves: depth 0, masks, and the estimated poses beside."
+            "--static", help="Track the camera, set the depth of moving objects to 0, and write masks and poses."
         ),
     ] = False,
     config: Annotated[

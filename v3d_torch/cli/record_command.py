@@ -1,4 +1,4 @@
-"""Steps of the record command: save all frames as they are, or track the camera and save them without what moves."""
+"""Steps of the record command: save all frames as they are, or track the camera and save the static scene."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Conso
 def record_static(
     source: RGBDStream, out: Path, config: Config, interrupted: Event, console: Console
 ) -> tuple[int, str | None]:
-    """Track the camera, and write all frames without what moves, with masks and estimated poses.
+    """Track the camera, and write all frames without the depth of moving objects, with masks and estimated poses.
 
     Args:
         source: Frames.
@@ -60,7 +60,7 @@ def record_static(
         console: Console for the progress bar.
 
     Returns:
-        Number of frames, and the reason if the recording ended early but not by the user, else None.
+        Number of frames, and the reason why the recording ended early; None if it did not, or if the user ended it.
 
     Raises:
         WeightsError: If the weights of the network are not available.

@@ -55,7 +55,7 @@ def main(
     profile: Annotated[bool, typer.Option("--profile", help="Print the time of each stage.")] = False,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write a triangle mesh of the static scene.")] = False,
     occupancy: Annotated[
-        bool, typer.Option("--occupancy", help="Grow and write an occupancy map, for planning.")
+        bool, typer.Option("--occupancy", help="Build and write an occupancy map, for planning.")
     ] = False,
     save_map: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Save the map at the end, for later runs.")
@@ -65,12 +65,12 @@ def main(
     ] = None,
     realtime: Annotated[
         bool,
-        typer.Option("--realtime", help="Play the sequence at its own rate, and leave out frames as on a live camera."),
+        typer.Option("--realtime", help="Play the sequence at its own rate, and drop frames as on a live camera."),
     ] = False,
     serial: Annotated[bool, typer.Option("--serial", help="Use one thread; the results are the same.")] = False,
     localise: Annotated[bool, typer.Option("--localise", help="With --load-map: do not change the map.")] = False,
     resume: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run that wrote its results there.")
+        Path | None, typer.Option(metavar="DIR", help="Resume the interrupted run with its results in this folder.")
     ] = None,
     version: Version = False,
 ) -> None:
@@ -85,7 +85,7 @@ def main(
     from v3d_torch.runs.request import RunRequest
 
     if seq is None and resume is None:
-        raise typer.BadParameter("name a sequence, or a run to resume (--resume)", param_hint="--seq")
+        raise typer.BadParameter("give a sequence, or a run to resume (--resume)", param_hint="--seq")
     segmenter = segmenter or ("masks" if masks is not None else None)
     overrides = list(set_ or [])
     overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
@@ -97,7 +97,7 @@ def main(
     overrides += ["prefetch=false"] if serial else []
     data_root_source = context.get_parameter_source("data_root")
     if resume is not None and data_root_source is not None and data_root_source.name == "ENVIRONMENT":
-        data_root = None  # the run to resume has its own
+        data_root = None  # that of the run to resume is used
     choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, bag, profile)
     with exit_on_error():
         request = RunRequest(

@@ -66,9 +66,9 @@ class Display:
     """Output of a run in addition to its files and its summary.
 
     Attributes:
-        viz: Viewer that shows the run live: ``rerun``; None for none.
-        rerun_file: File in which the run is recorded for rerun; None for none.
-        bag: File in which the run is recorded as ROS 2 messages; None for none.
+        viz: Viewer that shows the run live, ``rerun``; None for no viewer.
+        rerun_file: File in which the run is recorded for rerun; None for no recording.
+        bag: File in which the run is recorded as ROS 2 messages; None for no recording.
         profile: True to print the time of each stage.
     """
 
@@ -87,7 +87,7 @@ class Display:
         """
         viewers = [make_viewer(self.viz, self.rerun_file, sequence)]
         if self.bag is not None:
-            from v3d_torch.export.ros.bag_viewer import BagViewer  # loads the definitions of all messages
+            from v3d_torch.export.ros.bag_viewer import BagViewer  # slow: loads the definitions of all messages
 
             viewers.append(BagViewer(self.bag, sequence.camera))
         return ViewerGroup(viewers)
@@ -114,9 +114,9 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
 
     Args:
         folder: Folder of its results.
-        given: Options given with ``--resume``. Only those in `CHANGEABLE` can differ from those of the run.
+        given: Options given with ``--resume``. Only options in `CHANGEABLE` can differ from those of the run.
         choice: Configuration given with ``--resume``.
-        out: The same folder, or None.
+        out: Folder given with ``--out``: the same as ``folder``, or None.
         display: Output on the screen.
 
     Raises:
@@ -248,7 +248,7 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
     motion_states = record.dynamics.count_motion_states()
     label = label_sequence(pipeline.sequence.name, difference)
     table = Table(title=f"V3D-SLAM on {escape(label)}", show_header=False)
-    broken = f", {len(record.broken)} broken ones passed over" if record.broken else ""
+    broken = f", {len(record.broken)} broken ones skipped" if record.broken else ""
     table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}{broken}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     active = slam.map.active_keyframes
@@ -261,7 +261,7 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
         text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
         table.add_row("latency", text)
         rejected = f", {record.rejected} late or out of order" if record.rejected else ""
-        table.add_row("left out", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
+        table.add_row("dropped", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")

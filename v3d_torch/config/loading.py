@@ -40,7 +40,7 @@ def find_config(name: StrPath) -> Path:
         name: Key of `CONFIGS`, such as ``paper``, or path of a YAML file.
 
     Raises:
-        ConfigError: If there is neither.
+        ConfigError: If the name is neither a key of `CONFIGS` nor a file.
     """
     if str(name) in CONFIGS:
         return CONFIGS[str(name)]
@@ -58,7 +58,7 @@ def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> C
     Args:
         name: Key of `CONFIGS`, such as ``paper``, or path of a YAML file with any part of the values; None for the
             defaults.
-        overrides: One text or several such as ``objects.voting.distance_threshold=0.05``; values are parsed as YAML.
+        overrides: One string or several, such as ``objects.voting.distance_threshold=0.05``; values are parsed as YAML.
 
     Raises:
         ConfigError: If the file cannot be read, a key is unknown (the message names the nearest one) or a value is not
@@ -125,7 +125,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
 
 
 def _reject_extreme_numbers(section: Section, source: str, prefix: str = "") -> None:
-    """Reject numbers that no other rule rejects but that overflow arithmetic or memory."""
+    """Reject numbers that are valid by all other rules but would overflow arithmetic or memory."""
     for name, value in section:
         if isinstance(value, Section):
             _reject_extreme_numbers(value, source, f"{prefix}{name}.")

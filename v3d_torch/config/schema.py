@@ -25,27 +25,29 @@ class SegmentationConfig(Section):
     model: Literal["yolov8n-seg", "yolo11n-seg", "yolo26n-seg"] = "yolov8n-seg"
     """Network. The paper names YOLOv8; its nano model is small enough for a CPU that also tracks the camera."""
     height: int = Field(320, gt=0, multiple_of=32)
-    """Rows of the network input, pixels. Two thirds of a 640x480 image halve the time; a person at 6 m is still about
-    100 pixels high, and the depth completes the outlines."""
+    """Rows of the network input, pixels. Scaling a 640x480 image by two thirds halves the time; a person at 6 m is
+    still about 100 pixels high, and the outlines are refined from the depth."""
     width: int = Field(416, gt=0, multiple_of=32)
     """Columns of the network input, pixels."""
     precision: Literal["int8", "float32"] = "int8"
-    """Numbers of the convolutions. 8-bit integers halve the time on processors with instructions for them; on other
-    processors float32 is used."""
+    """Number format of the convolutions. 8-bit integers halve the time on processors with instructions for them; on
+    other processors float32 is used."""
     score_threshold: float = Field(0.25, ge=0, le=1)
     """Minimum class score; 0.25 is the default of YOLOv8's authors. A missed person costs more than a false one."""
     iou_threshold: float = Field(0.7, ge=0, le=1)
     """Boxes of one class with a larger intersection over union are the same instance (non-maximum suppression;
     YOLOv8)."""
     duplicate_overlap: float = Field(0.7, gt=0, le=1)
-    """An instance is a duplicate if a larger fraction of it lies within a better one of its class."""
+    """An instance is a duplicate if a larger fraction of it lies within an instance of the same class with a higher
+    score."""
     upright: bool = True
     """True to rotate the images of a rolled camera upright before segmentation (false in the paper)."""
     max_instances: int = Field(32, gt=0)
-    """Maximum number of instances in an image, by score. It bounds memory and is far above the number in a room."""
+    """Maximum number of instances in an image; those with the highest scores are kept. It bounds memory and is far
+    above the number of objects in a room."""
     interval: int = Field(1, gt=0)
-    """The network sees every n-th frame of a sequence. In the frames between, masks follow the objects' motion and are
-    redrawn from the depth."""
+    """Every n-th frame of a sequence is segmented. In the frames between, masks are moved with the objects and refined
+    from the depth."""
     threads: int = Field(1, gt=0, le=256)
     """Threads of the inference engine. On two cores a second thread would take time from tracking."""
 
@@ -65,8 +67,8 @@ class CloudConfig(Section):
     """Instance clouds and their outlier rejection (paper, Sec. III-B.2)."""
 
     stride: int = Field(4, gt=0, le=100)
-    """Every n-th pixel of a mask becomes a point: the network predicts masks in cells of 4 pixels. Up to 4 m the points
-    of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN."""
+    """Every n-th row and column of a mask becomes points: the network predicts masks in cells of 4 pixels. Up to 4 m
+    the points of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN."""
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points, metres: the depth error of a Kinect reaches 0.1 m there, as large as the motion to
     detect."""
@@ -87,18 +89,19 @@ class TrackerConfig(Section):
     max_speed: float = Field(3.0, gt=0)
     """Maximum speed of an object, m/s: a person who runs. Matches beyond it are rejected."""
     max_jump: float = Field(0.5, gt=0)
-    """Maximum jump of a centroid, metres, in addition to its motion: the centroid also moves when an object is cut off
-    or occluded."""
+    """Maximum jump of a centroid, metres, in addition to its motion: the centroid also jumps when an object is cut off
+    by the image border or occluded."""
     acceleration_noise: float = Field(2.0, gt=0)
     """Standard deviation of the change of velocity in one second, m/s^2: a person can stop or turn within a second."""
     min_overlap: float = Field(0.4, ge=0, le=1)
     """Minimum mask overlap to continue an object with an instance of another class: the class of an object can flicker
     between frames, but a cup does not turn into the table below it."""
     max_missed_time: float = Field(0.5, ge=0)
-    """Time for which a missed object is predicted, seconds: about one step of a person. 0 in the ablation."""
+    """Time for which an object that the network misses is predicted, seconds: about one step of a person. 0 in the
+    ablation."""
     max_lost_time: float = Field(5.0, ge=0)
-    """Time after that for which an object that comes back keeps its id, seconds: people walk behind others, or leave
-    the view of a camera that turns. Appearance and position have to fit. 0 in the ablation."""
+    """Time after `max_missed_time` in which an object that reappears keeps its id, seconds: people walk behind others,
+    or leave the view of a camera that turns. Appearance and position have to match. 0 in the ablation."""
 
 
 class VotingConfig(Section):
@@ -107,9 +110,9 @@ class VotingConfig(Section):
     enabled: bool = True
     """False in the ablation."""
     distance_threshold: float = Field(0.05, gt=0)
-    """T_d, metres: a larger change of the distance between two centroids is a vote."""
+    """T_d, metres: a larger change of the distance between two centroids is a vote for both objects."""
     vote_threshold: int = Field(2, gt=0)
-    """T_v, votes that make an object dynamic (authors' code: more than one)."""
+    """T_v, number of votes from which an object is dynamic (authors' code: more than one)."""
     baselines: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
     """Times over which changes of distances are measured, seconds; 0 is the previous frame (the paper's rule). At 1 m/s
     a person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections
@@ -119,8 +122,8 @@ class VotingConfig(Section):
 class FreeSpaceConfig(Section):
     """Free-space check: objects have moved if their former places are free, or if their present places were free.
 
-    It confirms the votes. Centroids and clouds also change when an object is cut off by the image border, occluded or
-    segmented differently, and two walking persons would outvote every chair.
+    It confirms the votes, which can be wrong: centroids and clouds also change when an object is cut off by the image
+    border, occluded or segmented differently, and two walking persons alone give every chair two votes.
     """
 
     enabled: bool = True
@@ -133,7 +136,8 @@ class FreeSpaceConfig(Section):
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points that are checked, metres: beyond, the depth error is as large as the motion to detect."""
     tolerance: float = Field(0.01, gt=0)
-    """Depth tolerance divided by the squared depth, 1/m: four standard deviations of a structured-light camera."""
+    """Depth tolerance divided by the squared depth, 1/m: four standard deviations of the depth of a structured-light
+    camera."""
     min_tolerance: float = Field(0.04, gt=0)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
     depth_sync_error: float = Field(0.02, ge=0, le=1)
@@ -170,7 +174,7 @@ class StaticMaskConfig(Section):
     persons until they are classified)."""
     hold_dynamic_time: float = Field(1.0, ge=0)
     """Time for which an object stays dynamic or deforming after the last evidence, seconds: a walking person pauses
-    between steps. A thing that is observed at rest becomes static at once."""
+    between steps. An object other than a person becomes static as soon as it is observed at rest."""
     confirm_dynamic_frames: int = Field(2, gt=0)
     """Number of frames with evidence before a dynamic state is held: evidence in a single frame can be depth noise."""
     dilation: int = Field(2, ge=0, le=100)
@@ -184,8 +188,8 @@ class StaticMaskConfig(Section):
     edge_ratio: float = Field(0.04, gt=0)
     """Relative depth difference over four pixels that is an edge: a surface viewed at 80 degrees differs by 0.03."""
     min_surface_fraction: float = Field(0.4, ge=0, le=1)
-    """A mask does not grow along a surface of which the object would be a smaller fraction, such as a floor or
-    table."""
+    """Minimum fraction of a continuous surface that the object covers for its mask to grow along that surface; a foot
+    covers little of a floor."""
     depth_tolerance: float = Field(0.05, gt=0)
     """Maximum depth difference between a pixel and the points of the object around it, metres, in addition to the depth
     noise."""
@@ -222,8 +226,8 @@ class OdometryConfig(Section):
     """Camera motion between two frames from features (paper, Sec. III-E)."""
 
     max_features: int = Field(500, gt=0)
-    """Features of a frame that are matched with all features of the next one, spread over the image. More take longer
-    and do not improve the pose, which the map refines. Relocalisation matches all features."""
+    """Maximum number of features of a frame, spread over the image, that are matched with all features of the next one.
+    More take longer and do not improve the pose, which is refined in the map. Relocalisation matches all features."""
     max_ratio: float = Field(0.8, gt=0, le=1)
     """Lowe's ratio between the best and the second Hamming distance."""
     max_hamming: int = Field(64, gt=0, le=256)
@@ -240,8 +244,8 @@ class DenseOdometryConfig(Section):
     """Camera motion between two frames from all pixels, used when features fail."""
 
     halvings: tuple[int, ...] = (4, 2, 1)
-    """Number of halvings of the image at each pyramid level, coarse to fine. A shift of 60 pixels between frames is 4
-    at the coarsest level."""
+    """Number of times that the image is halved for each pyramid level, coarse to fine. A shift of 60 pixels between
+    frames is about 4 pixels at the coarsest level."""
     max_points: int = Field(5000, gt=0)
     """Approximate number of pixels used at a level, one per grid cell; it bounds the time."""
     iterations: int = Field(10, gt=0)
@@ -283,19 +287,19 @@ class TrackingConfig(Section):
 
 
 class RollingShutterConfig(Section):
-    """Times at which rows of colour and depth are read while the camera moves."""
+    """Compensation of the times at which rows of colour and depth are read while the camera moves."""
 
     enabled: bool = True
     """False to treat all rows of both images as simultaneous."""
     readout: float = Field(0.02, ge=-0.05, le=0.05)
-    """Expected time from the first row to the last, seconds, until the map has calibrated it; not used if the camera
-    states its readout. The colour cameras of Kinect, Xtion, D415 and D435 have a rolling shutter of 0.02 to 0.03 s;
-    that of the D455 is global."""
+    """Initial value of the time from reading the first row to reading the last, seconds; it is then calibrated with the
+    map. Not used if the camera file states the readout. The colour cameras of Kinect, Xtion, D415 and D435 have a
+    rolling shutter of 0.02 to 0.03 s; that of the D455 is global."""
     readout_sigma: float = Field(0.015, gt=0)
-    """Standard deviation of the expected readout, seconds: a global shutter and the slowest one are both within 2 of
-    it."""
+    """Standard deviation of the initial readout, seconds: a global shutter and the slowest rolling shutter are both
+    within two standard deviations."""
     calibration_keyframes: int = Field(20, ge=0)
-    """Number of first keyframes that update the readout; after them every tenth does."""
+    """Number of keyframes at the start of which each updates the readout; later every tenth does."""
 
 
 class MappingConfig(Section):
@@ -306,26 +310,28 @@ class MappingConfig(Section):
     max_keyframe_interval: int = Field(20, gt=0)
     """Maximum number of frames between keyframes."""
     min_tracked_ratio: float = Field(0.75, gt=0, le=1)
-    """A frame becomes a keyframe if it finds a smaller fraction of the landmarks that the best frame since the last
-    keyframe found (ORB-SLAM2 for RGB-D)."""
+    """A frame becomes a keyframe if its number of tracked landmarks, divided by the highest number of a frame since the
+    last keyframe, is lower (ORB-SLAM2 for RGB-D)."""
     min_tracked: int = Field(100, gt=0)
-    """A frame becomes a keyframe if it finds fewer landmarks."""
+    """A frame becomes a keyframe if it tracks fewer landmarks."""
     map_by_odometry_after: float = Field(0.5, ge=0)
-    """Time without the map after which a camera with known motion extends the map by odometry, seconds. Odometry
-    drifts; mostly the map is found again earlier."""
+    """Time since the camera was last tracked in the map after which keyframes are created with the pose of the
+    odometry, seconds. Odometry drifts, and usually the camera is tracked in the map again earlier."""
     restart_after: float = Field(1.0, gt=0)
     """Time after which a lost camera that observes enough features starts a disconnected part of the map, seconds."""
     landmarks_per_keyframe: int = Field(1000, gt=0)
     """Maximum number of landmarks of a keyframe, old and new (ORB-SLAM2's number of features)."""
     fusion_keyframes: int = Field(10, ge=0)
-    """Number of neighbours in which the landmarks of a new keyframe are searched and fused (ORB-SLAM2 for RGB-D)."""
+    """Number of covisible keyframes in which the landmarks of a new keyframe are searched and fused (ORB-SLAM2 for
+    RGB-D)."""
     redundant_ratio: float = Field(0.9, gt=0, le=1)
-    """A keyframe is culled if a larger fraction of its landmarks is observed well by others (ORB-SLAM2). 1 culls
-    none."""
+    """A keyframe is culled if a larger fraction of its landmarks is redundant, which means well observed by other
+    keyframes (ORB-SLAM2). 1 culls none."""
     redundant_views: int = Field(3, gt=0)
-    """Number of other keyframes that must observe such a landmark (ORB-SLAM2)."""
+    """Number of other keyframes that must observe a landmark for it to be redundant (ORB-SLAM2)."""
     bundle_keyframes: int = Field(15, ge=0)
-    """Number of keyframes that move in a local bundle adjustment, as many as make up the local map; 0 turns it off."""
+    """Number of keyframes whose poses are adjusted in a local bundle adjustment, the same as in the local map; 0 turns
+    it off."""
 
 
 class LoopConfig(Section):
@@ -340,8 +346,8 @@ class LoopConfig(Section):
     min_inliers: int = Field(40, gt=0)
     """Minimum number of inliers of the geometric verification."""
     min_inlier_ratio: float = Field(0.15, ge=0, le=1)
-    """Minimum fraction of the visible landmarks that are inliers: with fewer the pose is less accurate than the drift
-    that it would correct. Relocalisation of a lost camera does not need it."""
+    """Minimum fraction of the visible landmarks that are inliers: with fewer, the error of the pose exceeds the drift
+    that it would correct. It does not apply to the relocalisation of a lost camera."""
 
 
 class MeshConfig(Section):
@@ -352,8 +358,8 @@ class MeshConfig(Section):
     voxel_size: float = Field(0.02, gt=0)
     """Side of a voxel, metres: the pixels used lie 1.5 cm apart at 4 m, where the depth error is 2 cm."""
     truncation: float = Field(0.08, gt=0)
-    """Truncation distance of the signed distance function, metres: three times the error of depth at 4 m and of
-    poses."""
+    """Truncation distance of the signed distance function, metres: three times the combined error of poses and of
+    depth at 4 m."""
 
 
 class DenseMapConfig(Section):
@@ -362,7 +368,7 @@ class DenseMapConfig(Section):
     stride: int = Field(2, gt=0, le=100)
     """Every n-th row and column of a keyframe is used: points are 8 mm apart at 2 m, less than a voxel."""
     max_depth: float = Field(4.0, gt=0)
-    """Maximum depth of points, metres; the noise of farther ones would blur the map."""
+    """Maximum depth of points, metres; the noise of farther points would blur the map."""
     voxel_size: float = Field(0.01, gt=0)
     """Side of a voxel, metres: about the depth noise at 2 m."""
     mesh: MeshConfig = MeshConfig()
@@ -372,42 +378,43 @@ class OccupancyConfig(Section):
     """Occupancy map: free and occupied space for planning, grown with every frame (OctoMap, Hornung et al. 2013)."""
 
     enabled: bool = False
-    """True to grow an occupancy map and write it."""
+    """True to build an occupancy map and write it."""
     voxel_size: float = Field(0.05, ge=0.01)
     """Side of a voxel, metres: OctoMap's and ROS's usual resolution in rooms, twice the depth error of a Kinect at
     4 m."""
     interval: int = Field(3, gt=0)
     """Every n-th frame is added: at 30 Hz the map is updated ten times per second, and a person walks 0.1 m between."""
     stride: int = Field(8, gt=0, le=100)
-    """Every n-th row and column is added, with another offset each time: rays are 0.06 m apart at 4 m, about a
+    """Every n-th row and column is added, with a different offset each time: rays are 0.06 m apart at 4 m, about a
     voxel."""
     max_depth: float = Field(4.0, gt=0, le=10)
     """Maximum depth of obstacles, metres, as for the dense map; farther rays show free space up to it."""
     depth_tolerance: float = Field(0.006, ge=0)
-    """Depth error divided by the squared depth, 1/m: four standard deviations of a structured-light camera (Khoshelham
-    and Elberink, Sensors 2012). Space that close to a surface is not observed as free."""
+    """Depth tolerance divided by the squared depth, 1/m: four standard deviations of the depth of a structured-light
+    camera (Khoshelham and Elberink, Sensors 2012). Space within the tolerance of a surface is not observed as free."""
     hit_probability: float = Field(0.7, gt=0.5, lt=1)
-    """Probability that a voxel is occupied in which a depth measurement lies (OctoMap)."""
+    """Probability that a voxel that contains a depth measurement is occupied (OctoMap)."""
     miss_probability: float = Field(0.4, gt=0, lt=0.5)
-    """Probability that a voxel is occupied through which a ray passes (OctoMap)."""
+    """Probability that a voxel that a ray passes through is occupied (OctoMap)."""
     min_probability: float = Field(0.12, gt=0, lt=0.5)
-    """Smallest probability of a voxel: free space can become occupied after a few hits (OctoMap)."""
+    """Lower limit of the probability of a voxel: free space can become occupied after a few hits (OctoMap)."""
     max_probability: float = Field(0.97, gt=0.5, lt=1)
-    """Largest probability of a voxel: an object that was taken away is forgotten after about ten misses (OctoMap)."""
+    """Upper limit of the probability of a voxel: a removed object becomes free space after about ten misses
+    (OctoMap)."""
     window_radius: float = Field(6.0, gt=0)
-    """Space within this distance of the camera is never forgotten to limit the memory, metres: more than the depth
-    that is added."""
+    """Distance from the camera within which blocks are never removed to limit the memory, metres: more than
+    `max_depth`."""
     max_blocks: int = Field(8192, gt=0)
-    """Maximum number of blocks of 16 x 16 x 16 voxels, 4 kB each. They hold dozens of rooms; beyond, the blocks
+    """Maximum number of blocks of 16 x 16 x 16 voxels, 4 kB each: enough for dozens of rooms. Above it, the blocks
     farthest from the camera are removed."""
     max_views: int = Field(1000, gt=0)
-    """Maximum number of stored views, 15 kB each, from which the map is rebuilt after corrections of the poses. Beyond,
-    only the newest of similar views is kept."""
+    """Maximum number of stored views, 15 kB each, from which the map is rebuilt after corrections of the poses. Above
+    it, only the newest of similar views is kept."""
     max_distance: float = Field(1.0, gt=0)
-    """Distances to obstacles are truncated to this, metres: more than robots keep from obstacles."""
+    """Truncation of distances to obstacles, metres: more than the clearance that robots keep."""
     obstacle_heights: tuple[float, float] = (0.15, 1.8)
-    """Lowest and highest obstacle in the 2D grid, metres above the floor: a voxel and the error of the floor at 4 m,
-    which 1.5 degrees of tilt make, and the height of a person."""
+    """Lowest and highest obstacle in the 2D grid, metres above the floor. Below the lowest lie a voxel and the error of
+    the floor at 4 m (1.5 degrees of tilt); the highest is the height of a person."""
 
     @field_validator("obstacle_heights")
     @classmethod
@@ -423,7 +430,7 @@ class CheckpointConfig(Section):
     interval: float = Field(30.0, ge=0)
     """Minimum time between checkpoints, seconds. 0 saves after every frame, infinity never."""
     max_time_fraction: float = Field(0.02, gt=0, le=1)
-    """Maximum fraction of the run time spent on checkpoints: they grow with the run, and are then saved less often."""
+    """Maximum fraction of the run time spent on checkpoints: they grow with the run, and are saved less often."""
 
 
 class Config(Section):
@@ -437,7 +444,7 @@ class Config(Section):
     """True to preprocess the next frames in threads while one is tracked, and to run the back end in a thread. The
     results are the same."""
     check_numerics: bool = False
-    """True to check everything that a stage returns for NaN and infinity; the first stage that returns one is named.
+    """True to check the results of every stage for NaN and infinity; the error names the first stage that returns one.
     The results are the same. In Python: `v3d_torch.runs.numerics_check.CheckedSLAM`."""
     segmentation: SegmentationConfig = SegmentationConfig()
     depth: DepthConfig = DepthConfig()

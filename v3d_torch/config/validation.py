@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 
 def first_error(error: ValidationError) -> str:
-    """Describe the first error of a validation: key, rule and value, shortened if it is long."""
+    """Describe the first error of a validation: key, rule and value; a long value is shortened."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "the document"
     rule = "input should be a valid dictionary of keys" if first["type"] == "model_type" else first["msg"].lower()

@@ -1,7 +1,7 @@
 """Sources of RGB-D frames. `open_source` opens any source by name, `load_sequence` opens stored sequences only.
 
-The public names are listed in the stub beside this file, and imported when they are first used: a command can find a
-sequence, and reject a wrong path, before torch is imported.
+The public names are listed in the stub beside this file, and are imported when they are first used: a command can find
+a sequence, and reject a wrong path, before torch is imported.
 """
 
 import lazy_loader

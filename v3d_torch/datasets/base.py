@@ -33,13 +33,13 @@ class RGBDStream(Protocol):
 
 @runtime_checkable
 class LiveStream(RGBDStream, Protocol):
-    """A stream whose frames come at their own rate, whether they are processed or not, such as a camera."""
+    """A stream whose frames arrive at their own rate, whether they are processed or not, such as a camera."""
 
     def captured_at(self, frame: RGBDFrame) -> float:
         """Return the time of capture of the newest frame in the clock of the computer (`time.monotonic`), seconds."""
 
     def stop(self) -> None:
-        """End the iteration soon; another thread calls this."""
+        """End the iteration soon; can be called from another thread."""
 
 
 @runtime_checkable
@@ -63,7 +63,7 @@ class RGBDSequence(RGBDStream, Protocol):
 
 @runtime_checkable
 class HasMotionMasks(Protocol):
-    """A sequence with ground-truth motion masks. They are for evaluation only, the system never reads them."""
+    """A sequence with ground-truth motion masks, which only the evaluation reads."""
 
     def motion_mask(self, index: int) -> Tensor | None:
         """Return the ground-truth motion mask of frame ``index``; None if unknown.

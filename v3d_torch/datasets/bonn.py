@@ -46,8 +46,8 @@ class BonnSequence(TUMSequence):
     """Sequence of Bonn RGB-D Dynamic, such as ``rgbd_bonn_crowd``, with ground truth of its camera.
 
     ``groundtruth.txt`` contains the poses of the markers, 2 cm from the camera. The published transforms convert them
-    to camera poses. Most published results are computed from the unconverted file, and so are those of
-    ``v3d-torch evaluate``.
+    to camera poses. Most published results, and those of ``v3d-torch evaluate``, are computed from the unconverted
+    file.
 
     Args:
         folder: Folder of the sequence.

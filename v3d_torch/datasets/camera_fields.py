@@ -25,8 +25,8 @@ _Pixels = Annotated[int, Field(gt=0, le=1 << 13)]
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 _MAX_FISHEYE_TANGENT = math.tan(math.radians(85))
-"""Largest tangent of the angle between the ray of a pixel and the optical axis of a fisheye lens: beyond, undistorted
-pixels are far away from the image."""
+"""Maximum tangent of the angle between the ray of a pixel and the optical axis of a fisheye lens; with larger angles,
+undistorted pixels are far away from the image."""
 
 DISTORTION_MODELS: Mapping[str, DistortionModel] = {
     **{name: name for name in COEFFICIENTS},
@@ -64,8 +64,8 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
     """Create a camera from unchecked fields.
 
     Args:
-        fields: Fields of `PinholeCamera` by name. Four distortion coefficients need a ``distortion_model``, because
-            they can be those of two models.
+        fields: Fields of `PinholeCamera` by name. Four distortion coefficients need a ``distortion_model``, because two
+            models have four.
         source: Origin of the fields, for messages.
 
     Raises:
@@ -101,14 +101,14 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
 
 
 def check_distortion(camera: PinholeCamera, source: object) -> None:
-    """Check that undistortion inverts distortion at the image corners: invalid coefficients fold rays back there.
+    """Check that undistortion inverts distortion at the image corners, where invalid coefficients fold rays back.
 
     Args:
         camera: Camera.
         source: Origin of the camera, for messages.
 
     Raises:
-        InputError: If it does not.
+        InputError: If undistortion does not invert distortion.
     """
     right, bottom = camera.width - 1.0, camera.height - 1.0
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])

@@ -18,11 +18,11 @@ DEPTH_SUFFIXES = frozenset({".npy", ".exr"})
 """Suffixes of files, in lower case, that can only be depth images."""
 
 _EXR_CHANNELS = ("Z", "Y", "V", "R")
-"""Channels of an OpenEXR file that can contain depth, the first one that exists is read: depth, brightness, value, and
-red, as renderers write a depth image."""
+"""Channels of an OpenEXR file that can contain depth, as renderers write it: depth, brightness, value, red. The first
+channel that exists is read."""
 
 _EXR_HEADER_LENGTH = 1 << 16
-"""Number of bytes that are searched for the size of an OpenEXR image: far more than the header of a depth image has."""
+"""Number of bytes that are searched for the size of an OpenEXR image; the header of a depth image is much shorter."""
 
 
 def read_depth_file(path: Path) -> NDArray[np.generic]:

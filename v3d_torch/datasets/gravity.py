@@ -15,21 +15,21 @@ STANDARD_GRAVITY = 9.80665
 """Acceleration of gravity, m/s^2."""
 
 _MAX_NORM_ERROR = 1.0
-"""Largest difference between the mean acceleration and gravity, m/s^2: a bias of 0.05 g and a hand that moves the
-camera tilt the direction by some degrees. With more, the camera falls or swings, or the unit is wrong."""
+"""Maximum difference between the mean acceleration and gravity, m/s^2. Up to it, the bias of the sensor (0.05 g) and
+the motion of a hand tilt the direction by some degrees; beyond it, the camera falls or swings, or the unit is wrong."""
 
 
 def gravity_direction(accelerations: NDArray[np.float64], source: object) -> Tensor | None:
     """Estimate the direction of gravity from the accelerations measured around the first frame.
 
     Args:
-        accelerations: Accelerations that an accelerometer measures, which at rest point up, in the camera frame, m/s^2,
+        accelerations: Accelerations as an accelerometer measures them (at rest they point up), camera frame, m/s^2,
             shape :math:`(N, 3)`.
         source: Name of the source, for the log.
 
     Returns:
-        Unit vector that points down, camera frame, float64, shape :math:`(3,)`; None without measurements, or if their
-        mean is not that of a camera at rest, which is logged.
+        Unit vector that points down, camera frame, float64, shape :math:`(3,)`. None without measurements, or if their
+        mean is not that of a camera at rest; this is logged.
     """
     measured = accelerations[np.isfinite(accelerations).all(axis=1)]
     if not len(measured):

@@ -19,8 +19,8 @@ from v3d_torch.io.text import read_text
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5, depth_scale=5000.0, readout=0.0)
-"""Published camera of the dataset, except for the sign of fy: the ray tracer's y axis points up (fy = -480), the y axis
-of the images points down. All rows of a rendered image have the same time, so the readout is 0."""
+"""Published camera of the dataset, except for the sign of fy: the y axis of the ray tracer points up (fy = -480), that
+of the images points down. All rows of a rendered image are simultaneous, so the readout is 0."""
 
 _RATE = 30.0
 """Frame rate, Hz. The lists contain frame numbers instead of timestamps."""
@@ -91,7 +91,7 @@ def _is_original(folder: Path) -> bool:
 
 
 def _original_pairs(folder: Path) -> list[ImagePair]:
-    """Pairs of the original files. The ground truth of frame n has the number n, as its files."""
+    """Pairs of the original files; frame n has the number n in its file names and in the ground truth."""
     return pair_by_number(folder, folder.glob("scene_*.png"), folder.glob("scene_*.depth"), _RATE)
 
 

@@ -16,8 +16,8 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
 
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
-"""Plausible range for the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
-wrong depth scale falls outside of it."""
+"""Plausible range of the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
+wrong depth scale gives values outside of it."""
 
 _SAMPLES = 8
 """Number of frames from which an unknown depth scale is estimated."""
@@ -33,17 +33,17 @@ class ImageSequence(StoredSequence):
     """
 
     depth_scale_note: str | None = None
-    """One sentence that says how the depth scale was estimated; None if it is stated."""
+    """Sentence that reports how the depth scale was estimated; None if it is stated."""
 
     registration_fix = "export depth that is registered to the colour image"
-    """What to do if colour and depth have different sizes, for messages."""
+    """Fix for colour and depth of different sizes, for messages."""
 
     def check(self, source: object, *, skip_broken: bool = False) -> None:
         """Check that all files exist, and decode the first frame, so that errors are reported before a long run.
 
         Args:
             source: Path of the sequence, for messages.
-            skip_broken: True if files can be missing, and if frames at the start can be broken.
+            skip_broken: True to allow missing files, and broken frames at the start.
 
         Raises:
             InputError: If a file is missing, the frame cannot be decoded, or its median depth is implausible.
@@ -67,10 +67,10 @@ class ImageSequence(StoredSequence):
         )
 
     def _read_first(self, broken: int) -> tuple[int, Tensor]:
-        """Return index and depth of the first frame that can be read; at most this number of frames before is broken.
+        """Return index and depth of the first frame that can be read, after at most this number of broken frames.
 
         Raises:
-            InputError: If more frames are broken; the error is that of the last one that was tried.
+            InputError: If more frames are broken; the error is that of the last frame that was tried.
         """
         last = min(broken, len(self) - 1)
         for index in range(last):
@@ -121,7 +121,7 @@ class ImageSequence(StoredSequence):
             limit: Number of frames at the beginning from which images are sampled; None for all frames.
 
         Raises:
-            InputError: If no depth image can be read, or the images do not tell the depth scale.
+            InputError: If no depth image can be read, or the depth scale cannot be estimated from the images.
         """
         if self.camera.depth_scale is not None:
             return
@@ -141,7 +141,7 @@ class ImageSequence(StoredSequence):
 
 
 def _explain_missing(file: Path) -> str:
-    """Return what to do about a file in a list that does not exist."""
+    """Return the fix for a listed file that does not exist, for messages."""
     if "\\" in str(file):
         return "the list has Windows paths; write them relative to its folder, such as rgb/1.png"
     return "copy the whole sequence again"

@@ -19,8 +19,8 @@ _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
 """Formats that Pillow is allowed to open: some of its other decoders start external programs."""
 
 MAX_PIXELS = 1 << 26
-"""Maximum number of pixels of an image, far more than any RGB-D camera has. The header of a small file can claim an
-image that fills the memory."""
+"""Maximum number of pixels of an image, far more than those of any RGB-D camera. The header of a small file can state
+an image that would fill the memory."""
 
 
 def read_colour(path: Path) -> Tensor:

@@ -162,7 +162,7 @@ def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
 
 
 def _is_depth_first(folder: Path, rows: Iterable[tuple[float, str, float, str]]) -> bool:
-    """Check whether the first file of each row is the depth image; rows with a missing or damaged file do not tell."""
+    """Check whether the first file of each row is the depth image; rows with missing or damaged files are ignored."""
     pairs = ((is_depth_file(folder / first), is_depth_file(folder / second)) for _, first, _, second in rows)
     return next((first for first, second in pairs if first != second), False)
 
@@ -174,7 +174,7 @@ def _is_second_stamp(previous: str, word: str) -> bool:
 
 
 def _find_file(folder: Path, name: str) -> str:
-    """Return the name of a listed file, as it exists: with slashes for the backslashes of Windows, with plain spaces.
+    """Return the name under which a listed file exists: with slashes for backslashes, or with plain spaces.
 
     Args:
         folder: Folder of the list.

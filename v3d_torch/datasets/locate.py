@@ -19,7 +19,7 @@ def find_or_download(name: str, *, data_root: Path | None, download: bool, progr
     """Find the folder or file of a sequence, or download the sequence.
 
     The search order is: ``name`` as a path; ``data_root``, or else ``$V3D_DATA``; the cache
-    (`v3d_torch.io.download.cache_dir`). In the last two, a folder can have any name of the sequence. A missing TUM
+    (`v3d_torch.io.download.cache_dir`). In the last two, a folder can have any spelling of the name. A missing TUM
     sequence is downloaded to ``data_root`` if given, or else to the cache. ``$V3D_DATA`` can be shared and is never
     written to.
 
@@ -61,7 +61,7 @@ def is_tum(path: Path) -> bool:
 
 
 def check_name(name: str, data_root: Path | None) -> None:
-    """Reject a name that is no source at all, before libraries are imported to open it.
+    """Reject a name that is not a source, before libraries are imported to open it.
 
     Args:
         name: Name as in `open_source`.
@@ -70,7 +70,7 @@ def check_name(name: str, data_root: Path | None) -> None:
     Raises:
         InputError: If there is no such path and no such sequence.
     """
-    with suppress(OSError):  # such as a name that is too long; `open_source` says what is wrong
+    with suppress(OSError):  # such as a name that is too long; `open_source` reports the error
         is_special = name in ("", "demo") or name.partition(":")[0] == "realsense"
         if not is_special and canonical_name(name) is None and find_stored(name, data_root) is None:
             raise unknown_name_error(name)

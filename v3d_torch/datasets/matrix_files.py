@@ -79,7 +79,7 @@ def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
 
 
 def read_opencv_yaml(path: Path) -> Any:
-    """Read a YAML file written by OpenCV, see `plain_yaml`.
+    """Read a YAML file written by OpenCV, see `v3d_torch.io.safe_yaml`.
 
     Args:
         path: Path of the file.

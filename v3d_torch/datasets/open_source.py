@@ -19,7 +19,7 @@ from v3d_torch.io.download import Progress, cache_dir
 from v3d_torch.io.paths import StrPath, expand_user
 
 _MIN_FPS, _MAX_FPS = 0.01, 1e4
-"""Accepted range of frame rates, Hz: far wider than that of any camera, it excludes 0, negative values and NaN."""
+"""Accepted range of frame rates, Hz: far wider than that of cameras; it excludes 0, negative values and NaN."""
 
 
 def open_source(
@@ -47,8 +47,8 @@ def open_source(
         options: Options for sources that do not describe themselves completely; None for the defaults.
         download: True if a TUM sequence that is not on disk is downloaded.
         progress: Callback for the number of downloaded bytes, or of rendered frames of the demo; None for no reports.
-        skip_broken: True if missing image files and broken frames at the start are no error; they are one when such a
-            frame is read, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
+        skip_broken: True to report missing image files and broken frames only when such a frame is read, and not when
+            the sequence is opened; see `v3d_torch.datasets.readable_frames.ReadableFrames`.
 
     Returns:
         An `RGBDSequence` if the frames are stored, or else a stream.
@@ -97,7 +97,7 @@ def load_sequence(
 
 
 def is_live(name: str) -> bool:
-    """Check whether the name of a source is that of a live camera."""
+    """Check whether a name is that of a live camera."""
     return name.partition(":")[0] == "realsense"
 
 
@@ -148,7 +148,7 @@ def _open_by_name(
 
 
 def _warn(source: RGBDStream) -> None:
-    """Warn, at the line that called this module, about what a source does not state or cannot be read from it."""
+    """Warn about missing ground truth and an estimated depth scale, at the line that called this module."""
     if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
         warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)
     if isinstance(source, ImageSequence) and source.depth_scale_note is not None:

@@ -25,12 +25,12 @@ class PairedImages(ImageSequence):
         pairs: Image files of the frames, in temporal order.
         camera: Camera chosen by the user; None for the camera of the folder or the layout (`choose_camera`).
         groundtruth: Function that reads the measured poses of the camera.
-        published: Camera of all sequences of the layout; None if they have different ones.
-        depth_scale: Depth units per metre that the layout prescribes; None if it prescribes none.
+        published: Camera of all sequences of the layout; None if they have different cameras.
+        depth_scale: Depth units per metre that the layout prescribes; None if it does not prescribe them.
         name: Name used in tables; None for the folder's name.
 
     Raises:
-        InputError: If there is no camera, or the unit of depth is neither stated nor told by the images.
+        InputError: If there is no camera, or the unit of depth is not stated and cannot be estimated from the images.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Iteration over a sequence that passes over broken frames."""
+"""Iteration over a sequence that skips broken frames."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class BrokenFrame:
-    """A frame that was passed over.
+    """A frame that was skipped because it is broken.
 
     Attributes:
         index: Position in the sequence, from 0.
@@ -28,16 +28,16 @@ class BrokenFrame:
 
 
 class ReadableFrames:
-    """Iterator over the frames of a sequence that passes over those that cannot be read or have another kind or size.
+    """Iterator over a sequence that skips frames that cannot be read or whose images have another kind or size.
 
     Args:
         frames: Frames from ``start`` on; an iterator that continues after an InputError.
         start: Index of the first frame.
         total: Number of frames of the sequence.
-        broken_before: Number of broken frames before ``start``, which count for the limit.
+        broken_before: Number of broken frames before ``start``, which count towards the limit.
 
     Attributes:
-        broken: Frames that were passed over, in order. The consumer removes them, also from another thread.
+        broken: Skipped frames, in order. The consumer removes them, possibly in another thread.
     """
 
     def __init__(self, frames: Iterator[RGBDFrame], start: int, total: int, broken_before: int = 0) -> None:
@@ -63,18 +63,18 @@ class ReadableFrames:
             except InputError as error:
                 if self._next == self._total:  # after the last frame: an error of the whole sequence
                     raise
-                self._pass_over(error)
+                self._skip(error)
             else:
                 self._next += 1
                 return frame
 
-    def _pass_over(self, error: InputError) -> None:
+    def _skip(self, error: InputError) -> None:
         if self._count == self._limit:
             raise InputError(
-                f"{error}; {self._limit + 1} of {self._total} frames are broken, and --skip-broken passes over"
-                f" {self._limit} at most"
+                f"{error}; {self._limit + 1} of {self._total} frames are broken, and --skip-broken skips at most"
+                f" {self._limit}"
             ) from error
-        _LOG.warning("frame %d is broken and passed over: %s", self._next, error)
+        _LOG.warning("frame %d is broken and skipped: %s", self._next, error)
         self.broken.append(BrokenFrame(self._next, str(error)))
         self._count += 1
         self._next += 1

@@ -15,21 +15,21 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 
 class RealtimePlayback:
-    """Live stream of the frames of a source: each frame comes when its stamp is due, counted from the first one.
+    """Live stream of the frames of a source: each frame arrives at the time of its stamp, relative to the first frame.
 
-    Each frame is read before it is due. A camera does not wait: frames of a sequence that are due already when the next
-    one is read are passed over, so that a slow computer does not fall behind. A frame counts as captured when it is
-    due, also if reading it took longer.
+    Each frame is read before it is due. Frames of a sequence that are already due when the next one is read are
+    skipped, as a camera does not wait, so that a slow computer does not fall behind. A frame counts as captured when it
+    is due, even if reading it took longer.
 
     Args:
         source: Source of frames.
         clock: Clock of the computer.
 
     Attributes:
-        skipped: Number of frames that were passed over so far.
+        skipped: Number of frames that were skipped so far.
 
     Raises:
-        InputError: If the source is live already.
+        InputError: If the source is already live.
     """
 
     def __init__(self, source: RGBDStream, clock: Clock = MONOTONIC_CLOCK) -> None:

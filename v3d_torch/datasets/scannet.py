@@ -73,8 +73,8 @@ class ScanNetSequence(PairedImages):
             return colour
         K_depth = self.camera.K.numpy()
         K_colour = self._K_colour if self._K_colour is not None else _scale(K_depth, width / size[0], height / size[1])
-        # First average down to about the depth resolution: this avoids aliasing of fine texture. Then warp by fractions
-        # of a pixel, so that the pixels of both images have the same rays.
+        # First average down to about the depth resolution, to avoid aliasing of fine texture. Then warp by fractions of
+        # a pixel, so that the pixels of both images have the same rays.
         shrink = K_depth.diagonal()[:2] / K_colour.diagonal()[:2]
         small_size = np.maximum(np.rint(np.array([width, height]) * shrink), 1).astype(int).tolist()
         small = cv2.resize(colour.permute(1, 2, 0).numpy(), small_size, interpolation=cv2.INTER_AREA)

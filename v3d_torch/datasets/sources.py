@@ -25,7 +25,7 @@ from v3d_torch.io.download import Progress
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options for sources that do not describe themselves completely.
+    """Options for sources whose files do not state everything.
 
     Attributes:
         rgb_topic: Topic of a bag's colour images; None for automatic selection.
@@ -96,13 +96,13 @@ _CONVERTIBLE = {
     (".tgz", ".tar", ".tar.gz", ".zip", ".7z", ".rar"): "is an archive; unpack it and pass the folder",
     (".sens",): "is a ScanNet recording; export it with ScanNet's SensReader and pass the exported folder",
 }
-"""Message for each file type that is not supported itself, by suffixes: the user can convert such a file."""
+"""Message for each unsupported file type that the user can convert, by suffixes."""
 
 _UNKNOWN = (
-    "is not a sequence of a supported format; the README lists the formats, the simplest is a folder with colour images"
-    " in a subfolder rgb and depth images in a subfolder depth"
+    "is not a sequence of a supported format; the README lists the formats, of which the simplest is a folder with"
+    " colour images in a subfolder rgb and depth images in a subfolder depth"
 )
-"""Message for every other path."""
+"""Message for all other paths."""
 
 
 def is_source(path: Path) -> bool:

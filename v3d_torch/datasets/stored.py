@@ -22,12 +22,12 @@ ReadGroundTruth = Callable[[], Trajectory | None]
 """Function that reads the ground truth; it returns None if the sequence has none."""
 
 _MAX_BROKEN_FRACTION, _MIN_BROKEN_LIMIT = 0.05, 10
-"""Broken frames that are passed over on request: at most this fraction of the frames, or this number if it is more. A
-sequence with more of them was probably copied incompletely, or opened with the wrong camera."""
+"""Maximum number of broken frames that are skipped on request: this fraction of the frames, or this number if it is
+larger. A sequence with more broken frames was probably copied incompletely, or opened with the wrong camera."""
 
 
 def max_broken_frames(frames: int) -> int:
-    """Return how many broken frames can be passed over in a sequence of this length."""
+    """Return the maximum number of broken frames that can be skipped in a sequence of this length."""
     return max(int(_MAX_BROKEN_FRACTION * frames), _MIN_BROKEN_LIMIT)
 
 
@@ -108,7 +108,7 @@ class StoredSequence(ABC):
         )
 
     def files(self, index: int) -> tuple[Path, ...]:
-        """Return the files that only frame ``index`` is read from; empty if all frames share their files."""
+        """Return the files that contain only frame ``index``; empty if all frames share their files."""
         return ()
 
     @abstractmethod
@@ -119,7 +119,7 @@ class StoredSequence(ABC):
 class Cursor(Generic[_T]):
     """Random access to the items of a stream that can only be read forward.
 
-    Reading forward continues the stream, reading backward starts it again.
+    Reading forward continues the stream; reading backward restarts it.
 
     Args:
         start: Function that returns an iterator over all items.

@@ -9,14 +9,14 @@ from v3d_torch.datasets.sequence_names import short_name
 from v3d_torch.types import Trajectory
 
 _MAX_MISSING_FRACTION = 0.01
-"""Fraction of frames that a whole sequence can lack: rules of association differ in some frames."""
+"""Maximum fraction of missing frames of a whole sequence: rules of association differ in some frames."""
 
 _MAX_STAMP_DIFFERENCE = 0.5
 """Maximum difference of the first and of the last timestamp of a whole sequence, seconds."""
 
 _MAX_LENGTH_DIFFERENCE = 0.01
-"""Maximum relative difference of the length of the true path: digits that are cut off, or another frame of reference,
-change it by less."""
+"""Maximum relative difference of the length of the true path: rounding, or another frame of reference, changes it by
+less."""
 
 
 class Span(NamedTuple):
@@ -80,10 +80,10 @@ def describe_difference(sequence: RGBDStream) -> str | None:
     """Describe how a sequence differs from the sequence of the TUM benchmark that has its name.
 
     Args:
-        sequence: Sequence. Its name decides which sequence of the benchmark it is compared with.
+        sequence: Sequence, compared with the sequence of the benchmark of the same name.
 
     Returns:
-        Some words, such as "part: 60 of 827 frames"; None if the sequences agree, or if the extent is not known.
+        Text such as "part: 60 of 827 frames"; None if the sequences agree, or if the extent is not known.
     """
     extent = EXTENTS.get(short_name(sequence.name))
     if extent is None or not isinstance(sequence, RGBDSequence) or len(sequence) == 0:

@@ -39,7 +39,7 @@ class TUMWriter:
         self.folder = folder
         self._depth_scale = _DEPTH_SCALE if camera.depth_scale is None else camera.depth_scale
         self._written: list[tuple[str, str]] = []
-        # The depth of the frames is corrected already.
+        # The depth of the frames is already corrected.
         written = replace(camera, depth_scale=self._depth_scale, inverse_depth_offset=0.0)
         write_text(folder / "camera.yaml", camera_text(written))
         if groundtruth is not None:

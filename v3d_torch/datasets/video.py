@@ -23,7 +23,7 @@ from v3d_torch.io.download import Progress
 from v3d_torch.io.timestamps import associate
 from v3d_torch.types import RGBDFrame
 
-# FFmpeg inside OpenCV prints warnings about damaged files to stderr; the errors that matter are raised in this module.
+# FFmpeg inside OpenCV prints warnings about damaged files to stderr; this module raises the errors that matter.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 _MIN_DECODED_FRACTION = 0.9

@@ -125,7 +125,7 @@ def make_overview_table(outcomes: Sequence[Outcome], absent: Sequence[str] = ())
 
     Args:
         outcomes: Outcomes of the runs.
-        absent: Sequences of the paper that are not available, and have a row all the same.
+        absent: Sequences of the paper that are not available; they have a row without values.
 
     Returns:
         Table with one column per variant. The last two rows are the geometric mean of the ratio, over the sequences on
@@ -167,7 +167,7 @@ def format_csv(outcomes: Sequence[Outcome]) -> str:
 
 
 def conclusion(outcomes: Sequence[Outcome]) -> str:
-    """Return a sentence on whether the full system has the lowest ATE on one sequence, or is within noise of it.
+    """Return a sentence that compares the ATE of the full system on one sequence with that of the best variant.
 
     Two variants are within noise of each other if their ranges over the seeds overlap. Values are rounded as in the
     table, to 0.1 mm, so smaller differences do not count. The sentence is empty if there is nothing to compare.

@@ -17,12 +17,12 @@ _MIN_PLANE_SPREAD = 1e-3
 not determine the rotation of an alignment: the spread is no larger than the noise of motion capture."""
 
 _MIN_SCALE_FACTOR = 1.5
-"""Minimum ratio between the sizes of two trajectories to report a scale error. Drift changes the size by less; a wrong
-unit of depth changes it by more."""
+"""Minimum ratio between the sizes of two trajectories for a scale error: drift changes the size by less, a wrong unit
+of depth by more."""
 
 _MAX_UNEXPLAINED_VARIANCE = 0.25
-"""Maximum fraction of the ground truth's variance that a rescaled estimate leaves unexplained, for a scale error. With
-more, the estimate has another shape, and its size does not indicate the unit of depth."""
+"""Maximum fraction of the ground truth's variance that a rescaled estimate does not explain, for a scale error. With a
+larger fraction, the estimate has another shape, and its size does not indicate the unit of depth."""
 
 
 class RotationSource(StrEnum):
@@ -63,9 +63,9 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
     Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
 
     Args:
-        T_gc: Ground truth, camera-to-world poses, floating point, shape :math:`(*, N, 4, 4)`; computed with in float64.
+        T_gc: Ground truth, camera-to-world poses, floating point, shape :math:`(*, N, 4, 4)`; converted to float64.
         T_ec: Estimate at the same times, camera-to-world poses in any world, shape :math:`(*, N, 4, 4)`.
-        valid: Poses that are not padding, bool, shape :math:`(*, N)`; all by default.
+        valid: Mask of the poses that are not padding, bool, shape :math:`(*, N)`; None for all.
 
     Returns:
         ATE, metres, dtype of ``T_ec``, shape :math:`(*)`; NaN without poses.
@@ -87,13 +87,13 @@ def root_mean_square(errors: Tensor, valid: Tensor | None) -> Tensor:
 
 
 def spans_plane(positions: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Check whether positions span a plane, and so determine the rotation of an alignment.
+    """Check whether positions span a plane, so that they determine the rotation of an alignment.
 
-    Positions of a camera that stands still, only turns, or moves along a line do not.
+    Positions of a camera that stands still, only turns, or moves along a line do not span a plane.
 
     Args:
         positions: Camera positions, metres, shape :math:`(..., N, 3)`.
-        valid: Positions that are not padding, bool, shape :math:`(..., N)`; all by default.
+        valid: Mask of the positions that are not padding, bool, shape :math:`(..., N)`; None for all.
 
     Returns:
         Bool, shape :math:`(...)`.
@@ -118,7 +118,7 @@ def align(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None, *, oriented: 
     Args:
         T_gc: Ground truth, camera-to-world poses, float64, shape :math:`(..., N, 4, 4)`.
         T_ec: Estimate at the same times, camera-to-world poses, float64, shape :math:`(..., N, 4, 4)`.
-        valid: Poses that are not padding, bool, shape :math:`(..., N)`; all by default.
+        valid: Mask of the poses that are not padding, bool, shape :math:`(..., N)`; None for all.
         oriented: True if the orientations of the ground truth were measured.
     """
     p_g, p_e = T_gc[..., :3, 3], T_ec[..., :3, 3]

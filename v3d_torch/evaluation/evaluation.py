@@ -15,7 +15,7 @@ from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.types import Trajectory
 
 MIN_PAIRS = 3
-"""Minimum number of associated poses. Three positions are the fewest that determine a rigid alignment."""
+"""Minimum number of associated poses: three positions determine a rigid alignment."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Evaluation:
 
     Attributes:
         ate: Absolute trajectory error, metres.
-        rpe: Relative pose error; None if it cannot be measured, and ``notes`` gives the reason.
+        rpe: Relative pose error; None if it cannot be measured, with the reason in ``notes``.
         pairs: Number of estimated poses with ground truth.
         poses: Number of estimated poses.
         coverage: Number of estimated poses divided by the number of frames of the sequence; None if the latter is not
@@ -119,8 +119,8 @@ def evaluate(
 def has_orientations(trajectory: Trajectory) -> bool:
     """Check whether the orientations of a trajectory were measured.
 
-    A ground truth of positions only fills the quaternion columns with a constant. So if the position changes and the
-    orientation never does, the orientations are placeholders.
+    A ground truth that has only positions has constant quaternions. Orientations that are constant while the position
+    changes are therefore placeholders.
     """
     T_wc = trajectory.T_wc
     turns = not torch.allclose(T_wc[:, :3, :3], T_wc[:1, :3, :3], rtol=0, atol=1e-9)

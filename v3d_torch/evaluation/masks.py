@@ -14,7 +14,7 @@ STATIC = 0
 """Value of static pixels in a ground-truth mask."""
 
 UNSURE = 255
-"""Value of the pixels in a ground-truth mask that are neither surely moving nor surely static."""
+"""Value of pixels in a ground-truth mask that are neither certainly moving nor certainly static."""
 
 _MIN_OVERLAP = 0.5
 """Intersection over union above which an object covers a person, as for the id switches of MOTS."""
@@ -28,7 +28,8 @@ class PersonScore:
         id: Id of the person in the ground-truth masks.
         in_view: Number of frames in which the person is in view.
         found: Number of these frames in which an object covers the person.
-        id_switches: Number of id switches: the object that covers the person has another id than the last one.
+        id_switches: Number of times that the object that covers the person has a different id than the last such
+            object.
     """
 
     id: int
@@ -43,13 +44,12 @@ class MaskScores:
 
     Attributes:
         frames: Number of frames with a ground-truth mask.
-        moving_masked: Fraction of the moving pixels with depth that are left out of tracking.
-        static_masked: Fraction of the static pixels with depth that are left out of tracking. Tracking uses pixels
-            with depth only.
-        static_masked_anywhere: Fraction of all static pixels, with or without depth, that are left out of tracking.
+        moving_masked: Fraction of the moving pixels with depth that are masked.
+        static_masked: Fraction of the static pixels with depth that are masked. Tracking uses only pixels with depth.
+        static_masked_anywhere: Fraction of all static pixels, with or without depth, that are masked.
         id_switches_per_60_frames: Id switches of all people per 60 frames in view.
-        people_found: Fraction of the frames in view in which an object covers the person. Needed to interpret the id
-            switches: a person who is never found has none.
+        people_found: Fraction of the frames in view in which an object covers the person. It is needed to interpret the
+            id switches: a person who is never found has no id switches.
         people: Counts of each person.
     """
 
@@ -76,11 +76,11 @@ class MaskEvaluation:
     """
 
     MIN_FRACTION_IN_VIEW = 0.003
-    """Minimum fraction of the image that a person in view covers, 900 pixels at 640x480. About a tenth of a person at
-    5 m; no detector finds smaller parts, such as a sleeve behind a door."""
+    """Minimum fraction of the image that a person in view covers: 900 pixels at 640x480, about a tenth of a person at
+    5 m. No detector finds smaller parts, such as a sleeve behind a door."""
 
     MAX_ABSENCE = 0.5
-    """Longest time out of view after which the id must be the same, seconds. Without appearance features the identity
+    """Maximum time out of view after which the id must be the same, seconds. Without appearance features, the identity
     of a person who returns later cannot be known."""
 
     def __init__(self) -> None:
@@ -133,15 +133,14 @@ class MaskEvaluation:
 
 
 def tally(masked: Tensor, region: Tensor) -> Tensor:
-    """Count the pixels of a region, and those of them that are left out.
+    """Count the pixels of a region, and those of them that are masked.
 
     Args:
         masked: Masked pixels, bool, shape :math:`(*, H, W)`.
         region: Pixels to count, bool, shape :math:`(*, H, W)`.
 
     Returns:
-        Number of pixels of the region that are left out, and number of pixels of the region, int64, shape
-        :math:`(*, 2)`.
+        Number of masked pixels of the region, and number of pixels of the region, int64, shape :math:`(*, 2)`.
     """
     return torch.stack([(masked & region).sum(dim=(-2, -1)), region.sum(dim=(-2, -1))], dim=-1)
 
@@ -175,7 +174,7 @@ def covering_ids(truth: Tensor, people: Tensor, objects: Mapping[int, Tensor]) -
         :math:`(P,)`.
     """
     true_areas = _count_values(truth, torch.ones_like(truth, dtype=torch.bool))
-    # The first row stands for no object. For equal values argmax returns the first, so an object must exceed it.
+    # The first row represents no object. Of equal values argmax returns the first, so an object must exceed it.
     overlaps = [torch.full((len(people),), _MIN_OVERLAP)]
     for mask in objects.values():
         intersection = _count_values(truth, mask)
@@ -191,7 +190,7 @@ def count_id_switches(stamps: Tensor, ids: Tensor, max_absence: float) -> int:
         stamps: Timestamps of the frames in which the person is in view, seconds, increasing, float64, shape
             :math:`(F,)`.
         ids: Id of the object that covers the person in these frames, 0 for none, int64, shape :math:`(F,)`.
-        max_absence: Longest time out of view, seconds; a new id after a longer time is not a switch.
+        max_absence: Maximum time out of view, seconds; a new id after a longer time is not a switch.
     """
     visit, found = (stamps.diff(prepend=stamps[:1]) > max_absence).cumsum(dim=0), ids > 0
     visit, ids = visit[found], ids[found]

@@ -27,7 +27,7 @@ class Outcome:
 
     @property
     def difference(self) -> str | None:
-        """Difference between the sequence and that of the benchmark with its name, in words; None if there is none."""
+        """Description of the difference to the sequence of the benchmark with this name; None if there is none."""
         difference: str | None = self.metrics.get("difference")
         return difference
 
@@ -44,19 +44,19 @@ class Outcome:
         if self.difference is not None:
             score += f" ({self.difference})"
         if skipped := self.get_metric("skipped"):
-            score += f", {skipped:.0f} broken frame{'s' if skipped > 1 else ''} passed over"
+            score += f", {skipped:.0f} broken frame{'s' if skipped > 1 else ''} skipped"
         result = score if self.failure is None else f"failed: {self.failure}"
         return f"{self.sequence}, {self.config}, seed {self.seed}: {result}"
 
 
 def find_difference(outcomes: Iterable[Outcome], sequence: str) -> str | None:
-    """Find how a sequence differs from that of the benchmark with its name; None if it does not, or no run tells."""
+    """Return the difference of a sequence to that of the benchmark with its name; None if no run recorded one."""
     differences = (outcome.difference for outcome in outcomes if outcome.sequence == sequence)
     return next((difference for difference in differences if difference is not None), None)
 
 
 def label_sequence(sequence: str, difference: str | None) -> str:
-    """Return the name of a sequence in tables, with its difference from that of the benchmark with its name."""
+    """Return the name of a sequence in tables, followed by its difference to the sequence of the benchmark, if any."""
     return sequence if difference is None else f"{sequence} ({difference})"
 
 

@@ -46,7 +46,7 @@ def load_paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
 
 
 def find_paper_sequence(name: str) -> str | None:
-    """Find the sequence of the paper named by a text or by the path of a file.
+    """Find the sequence of the paper that a text or a path names.
 
     Args:
         name: Name or path, such as ``fr3/w/xyz``, ``results/fr3_w_xyz/latest/trajectory.txt`` or
@@ -67,8 +67,8 @@ def make_paper_table(sequence: str, evaluation: Evaluation, difference: str | No
     Args:
         sequence: Name of the sequence, in any notation accepted by `find_paper_sequence`.
         evaluation: Evaluation of the result.
-        difference: Difference between the sequence and that of the paper, which is shown beside the result; no value
-            is then the best. None if there is none.
+        difference: Difference between the sequence and that of the paper, which is shown beside the result, and no
+            value is marked as the best; None if there is none.
 
     Returns:
         The table; None if the paper does not evaluate the sequence.
@@ -97,7 +97,7 @@ def make_paper_table(sequence: str, evaluation: Evaluation, difference: str | No
 
 
 def _scores(evaluation: Evaluation) -> list[Score]:
-    """Return a result in the columns of the paper. The RPE is left out unless it is over one second, as the paper's."""
+    """Return a result in the columns of the paper. The RPE is omitted unless it is over one second, as in the paper."""
     rpe = evaluation.rpe if evaluation.rpe is not None and evaluation.rpe.delta == 1 else None
     measured = [evaluation.ate, rpe.trans if rpe else None, rpe.rot if rpe else None]
     return [Score(s.rmse, s.std) if s is not None else Score(None, None) for s in measured]

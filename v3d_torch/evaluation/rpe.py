@@ -62,11 +62,11 @@ def rpe(
     Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
 
     Args:
-        T_gc: Ground truth, camera-to-world poses, floating point, shape :math:`(*, N, 4, 4)`; computed with in float64.
+        T_gc: Ground truth, camera-to-world poses, floating point, shape :math:`(*, N, 4, 4)`; converted to float64.
         T_ec: Estimate at the same times, camera-to-world poses in any world, shape :math:`(*, N, 4, 4)`.
         stamps: Timestamps, seconds, strictly increasing, shape :math:`(*, N)`; the frame numbers for a ``delta`` in
             frames.
-        valid: Poses that are not padding, bool, shape :math:`(*, N)`; all by default.
+        valid: Mask of the poses that are not padding, bool, shape :math:`(*, N)`; None for all.
         delta: Time between the poses of a pair, seconds.
 
     Returns:

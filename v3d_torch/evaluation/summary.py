@@ -45,7 +45,7 @@ def make_error_tables(
     Args:
         outcomes: Outcomes of the runs.
         papers: Methods of the paper to include, such as ``V3D-SLAM``; None for all.
-        absent: Sequences of the paper that are not available, and have a row all the same.
+        absent: Sequences of the paper that are not available; they have a row without values.
     """
     tables = []
     for metric, heading in HEADINGS.items():
@@ -78,7 +78,7 @@ def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     """Return all values as CSV, unrounded, one line per metric, sequence and method; see `make_error_tables`.
 
     The column sd is the standard deviation of the errors, as in the paper's tables: the median over the seeds. The last
-    column is the difference between the sequence and that of the benchmark with its name, if there is one.
+    column is the difference to the sequence of the benchmark with the same name, if there is one.
     """
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -113,7 +113,7 @@ class _Result:
         failed: Number of runs that failed.
         absent: True if the sequence is not available.
         deviations: Standard deviation of the errors of each run.
-        difference: Difference between the sequence and that of the benchmark with its name; None if there is none.
+        difference: Difference to the sequence of the benchmark with the same name; None if there is none.
     """
 
     sequence: str
@@ -172,7 +172,7 @@ def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:
         by_method = {result.method: result for result in results if result.sequence == sequence}
         medians = {method: median(result.values) for method, result in by_method.items() if result.values}
         difference = next((result.difference for result in by_method.values() if result.difference is not None), None)
-        # A part of a sequence, or another recording, is no easier or harder than the whole: no value is the best.
+        # A part of a sequence, or another recording, is not comparable with the whole, so no value is the best.
         is_comparable = len(medians) > 1 and difference is None
         lowest = format_lowest(medians.values(), _FORMAT) if is_comparable else None
         rows[label_sequence(sequence, difference)] = tuple(

@@ -17,7 +17,7 @@ class Cell(NamedTuple):
 
     Attributes:
         text: Text of the cell.
-        best: True if the value is the best among the compared ones.
+        best: True if the value is the best of the compared values.
     """
 
     text: str
@@ -53,7 +53,7 @@ def format_median_and_range(values: Sequence[float], form: str) -> str:
 
 
 def format_lowest(values: Iterable[float], form: str) -> str:
-    """Format the lowest of values. Values that print the same are equal, so several can be the best."""
+    """Format the lowest of values. Values that are equal as printed can all be the best."""
     return format(min(values), form)
 
 

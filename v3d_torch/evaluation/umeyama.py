@@ -29,16 +29,16 @@ def umeyama(
     Umeyama, Least-Squares Estimation of Transformation Parameters Between Two Point Patterns, PAMI 1991.
 
     Args:
-        p: Points in frame p, metres, floating point, shape :math:`(*, N, 3)`; computed with in float64.
+        p: Points in frame p, metres, floating point, shape :math:`(*, N, 3)`; converted to float64.
         q: The same points in frame q, shape :math:`(*, N, 3)`.
-        weights: Weight of each pair, not negative, shape :math:`(*, N)`; 1 by default.
-        valid: Pairs that are not padding, bool, shape :math:`(*, N)`; all by default.
-        with_scale: True to estimate the scale, too; it is 1 by default.
+        weights: Weight of each pair, not negative, shape :math:`(*, N)`; None for 1.
+        valid: Mask of the pairs that are not padding, bool, shape :math:`(*, N)`; None for all.
+        with_scale: True to estimate the scale, false for a scale of 1.
 
     Returns:
         Transform ``T_qp``, with the scaled rotation :math:`s R` in its upper left block, dtype of ``p``, shape
-        :math:`(*, 4, 4)`. Points on a line do not determine the rotation, of which one is returned; without points the
-        result is the identity.
+        :math:`(*, 4, 4)`. Points on a line do not determine the rotation; one of the solutions is returned. Without
+        points the result is the identity.
     """
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
@@ -65,7 +65,7 @@ def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:
 
     Args:
         points: Shape :math:`(..., N, d)`.
-        weights: Shape :math:`(..., N, 1)`; None = equal ones.
+        weights: Shape :math:`(..., N, 1)`; None for equal weights.
 
     Returns:
         Shape :math:`(..., d)`.
@@ -79,7 +79,7 @@ def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:
 def nearest_rotation(M: Tensor) -> Tensor:
     """Rotation R that maximises trace(R^T M), for matrices of shape (..., 3, 3).
 
-    The gradient is that of the maximum, which is finite where the singular vectors have none.
+    The gradient is computed from the maximum, so that it is finite even where singular vectors have no gradient.
     """
     with torch.no_grad():
         U, _, Vh = torch.linalg.svd(M)
@@ -87,7 +87,7 @@ def nearest_rotation(M: Tensor) -> Tensor:
         R = (U * signs[..., None, :]) @ Vh  # the last sign excludes reflections
     if not needs_gradient(M):
         return R
-    # Of trace(exp(phi)^T A) with A = M R^T: the gradient by phi, and the Hessian, negated.
+    # Gradient and negated Hessian of trace(exp(phi)^T A) by phi, with A = M R^T.
     A = M @ R.mT
     gradient = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
     fixed = ((A + A.mT) / 2).detach()

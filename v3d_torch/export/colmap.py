@@ -20,7 +20,7 @@ from v3d_torch.io.files import write_text
 _CAMERA_ID = 1
 
 _MAX_POINTS = 200_000
-"""Largest number of points of the dense map that are written; of more, every n-th is."""
+"""Maximum number of points of the dense map that are written; a larger map is subsampled."""
 
 
 def write_colmap(
@@ -32,7 +32,7 @@ def write_colmap(
 ) -> int:
     """Write ``images/``, ``masks/`` and the model ``sparse/0``: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 
-    Masks are named as COLMAP expects: the name of the image with another ``.png``.
+    Masks have the names that COLMAP expects: the name of the image with ``.png`` appended.
 
     Args:
         folder: Empty folder.

@@ -42,7 +42,7 @@ def landmark_tracks(tables: MapTables, images: Trajectory) -> LandmarkTracks:
 
     Args:
         tables: Data of the map.
-        images: Poses of the images. Keyframes of the same time with another pose, which are of another run, are
+        images: Poses of the images. Keyframes with the time of an image but another pose come from another run and are
             ignored.
     """
     image_of_keyframe = _images_of_keyframes(tables, images)

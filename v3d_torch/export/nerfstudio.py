@@ -67,7 +67,7 @@ def _lens(camera: PinholeCamera) -> dict[str, Any]:
     if camera.distortion_model == "equidistant":
         return {"camera_model": "OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), camera.distortion, strict=True))}
     raise ConfigError(
-        f"nerfstudio has no distortion model {camera.distortion_model}; remove the distortion: --undistort"
+        f"nerfstudio has no distortion model {camera.distortion_model}; remove the distortion with --undistort"
     )
 
 

@@ -34,12 +34,12 @@ class PosedImage:
 
     @property
     def name(self) -> str:
-        """File name: the order of the names is that of the frames."""
+        """File name; the names have the order of the frames."""
         return f"frame_{self.frame.index:06d}.png"
 
     @property
     def static_depth(self) -> Tensor:
-        """Depth without what moves, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement or not static."""
+        """Depth of the static scene, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement or not static."""
         return torch.where(self.static, self.frame.depth, 0.0)
 
     def write_colour(self, folder: Path) -> None:
@@ -47,7 +47,7 @@ class PosedImage:
         write_png(folder / self.name, self.frame.image.permute(1, 2, 0).numpy())
 
     def write_mask(self, path: Path) -> None:
-        """Write the mask: 255 = static, 0 = to be ignored, as reconstruction tools read masks."""
+        """Write the mask in the format of reconstruction tools: 255 = static, 0 = ignored."""
         write_png(path, self.static.to(torch.uint8).numpy() * 255)
 
 
@@ -68,7 +68,7 @@ class Undistorter:
         self._map_u, self._map_v = (each.numpy() for each in recorded.float().unbind(dim=2))
 
     def __call__(self, image: PosedImage) -> PosedImage:
-        """Undistort an image. Its mask excludes pixels that the recorded image does not show.
+        """Undistort an image. Its mask excludes pixels outside of the recorded image.
 
         Depth and mask are taken from the nearest pixel, so that depth edges stay sharp.
         """
@@ -80,5 +80,5 @@ class Undistorter:
         return PosedImage(undistorted, image.T_wc, visible)
 
     def _remap(self, image: Tensor, interpolation: int) -> Tensor:
-        """Resample an image (H, W) or (H, W, C); what it does not show is 0."""
+        """Resample an image (H, W) or (H, W, C); pixels outside of it are 0."""
         return torch.from_numpy(cv2.remap(image.numpy(), self._map_u, self._map_v, interpolation))

@@ -1,4 +1,4 @@
-"""Recording without what moves: a folder in TUM layout with masks and estimated poses."""
+"""Recording of the static scene: a folder in TUM layout without the depth of moving objects, with masks and poses."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from v3d_torch.io.files import write_png
 from v3d_torch.types import RGBDFrame, Trajectory
 
 ESTIMATE = "estimated_trajectory.txt"
-"""File of the estimated poses, in the format of a ground truth."""
+"""Name of the file of estimated poses, in the format of ``groundtruth.txt``."""
 
 _MASKS = "moving"
-"""Folder of the masks. It is not ``masks``, in which a sequence in TUM layout has its true masks."""
+"""Folder of the masks; different from ``masks``, the folder of true masks in a sequence in TUM layout."""
 
 
 class StaticRecording:
-    """Writer of a recording in which depth is 0 where something moves.
+    """Writer of a recording in which the depth of moving objects is 0.
 
-    Beside the images, a mask of each frame, named by the timestamp of its colour image, is 255 where depth was removed.
+    It also writes a mask of each frame, named by the timestamp of the colour image: 255 where depth was removed.
 
     Args:
         writer: Writer of the folder.

@@ -13,8 +13,7 @@ from v3d_torch.kernels import brief as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
 MARGIN = 21
-"""Smallest distance of a corner from the border of the image, pixels: all pixels that a descriptor depends on are
-within it."""
+"""Minimum distance of a corner from the image border, pixels: the radius of the patch that a descriptor depends on."""
 
 _HALF_WIDTHS = (15, 15, 15, 15, 14, 14, 14, 13, 13, 12, 11, 10, 9, 8, 6, 3)
 """Half width of the disk of the intensity centroid in each row from its centre, pixels: a disk of radius 15 that is
@@ -34,10 +33,10 @@ def _describe_compiled(image: Tensor, smoothed: Tensor, corners: Tensor) -> Tens
 
 @compiled_by(_describe_compiled)
 def describe(image: Tensor, smoothed: Tensor, corners: Tensor) -> Tensor:
-    """Compute descriptors: each bit compares two pixels of a pattern that turns with the image.
+    """Compute rotation-invariant descriptors: each bit compares two pixels of a pattern rotated with the corner.
 
     Args:
-        image: Grey image, uint8, shape :math:`(H, W)`; its intensity centroid around a corner gives the direction.
+        image: Grey image, uint8, shape :math:`(H, W)`; the intensity centroid around a corner gives its direction.
         smoothed: Smoothed image, whose pixels are compared, uint8, shape :math:`(H, W)`.
         corners: Corners (column, row) at least `MARGIN` from the border, int64, shape :math:`(N, 2)`.
 

@@ -18,7 +18,7 @@ _CELL_BITS = 2 * _DEPTH + 4
 """Bits of the code of a cell: two for each level, and four for the square cells of the first level."""
 
 _PIXELS_BEFORE = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0]], np.uint8)
-"""Neighbours of a pixel that come before it in row-major order."""
+"""Offsets of the neighbours of a pixel that precede it in row-major order."""
 
 Ints = NDArray[np.int64]
 Points = NDArray[np.float32]
@@ -34,16 +34,16 @@ def _select_strong_corners_compiled(
 def select_strong_corners(
     corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
 ) -> Ints:
-    """Select the local maxima that are strong, and weak ones in cells without a strong one.
+    """Select strong local maxima, and weak local maxima in cells without a strong corner.
 
-    The weak ones lie on surfaces with little contrast. Of equal neighbours, the first one is the maximum.
+    Weak corners lie on surfaces with little contrast. Of neighbours with equal response, the first is the maximum.
 
     Args:
         corners: Corners (column, row), whole numbers, float32, shape :math:`(N, 2)`.
         response: Strength of the corners, at least 1, uint8, shape :math:`(N,)`.
-        is_inside: True for the pixels whose corners are selected, none of them at the border, bool, shape
+        is_inside: Mask of the pixels in which corners are selected, false at the image border, bool, shape
             :math:`(H, W)`.
-        threshold: Corners above it are strong.
+        threshold: Corners with a larger response are strong.
         cell: Side of a cell, pixels.
 
     Returns:
@@ -66,8 +66,8 @@ def select_corners(
 ) -> Ints:
     """Select the strongest corner of each cell of a quadtree, for several images at once.
 
-    Cells with several corners are divided into four, all at once as long as at most the wanted number of cells are
-    occupied, then those with the most corners first.
+    Cells with several corners are divided into four: all cells of a level while the number of occupied cells stays
+    within the number of corners to select, then single cells, those with the most corners first.
 
     Args:
         corners: Corners (column, row) of all images, int64, shape :math:`(N, 2)`.
@@ -75,7 +75,7 @@ def select_corners(
             first one is selected.
         image: Index of the image of each corner, int64, shape :math:`(N,)`.
         sizes: Width and height of the M images, pixels.
-        counts: Number of corners to select in each image; up to three more are selected if the last cell gives them.
+        counts: Number of corners to select in each image; the division of the last cell can add up to three more.
 
     Returns:
         Indices of the selected corners, sorted by image, int64, shape :math:`(K,)`.
@@ -90,21 +90,21 @@ def _select_strongest_compiled(code: Ints, response: Ints, counts: Ints) -> Ints
 
 @compiled_by(_select_strongest_compiled)
 def _select_strongest(code: Ints, response: Ints, counts: Ints) -> Ints:
-    """Select the strongest corner of each cell; ``code`` is the image of each corner, then its smallest cell."""
+    """Select the strongest corner of each cell; ``code`` combines the image of a corner and its smallest cell."""
     if len(code) == 0:
         return np.zeros(0, np.int64)
     index = np.lexsort((-response, code))  # stable
     code, image = code[index], code[index] >> _CELL_BITS
-    # The cells of a level are the ranges of equal prefixes of the codes. A corner begins a cell on all levels from the
-    # first one on which its prefix differs from that of the corner before it.
+    # The cells of a level are the ranges of codes with equal prefixes. A corner is the first of its cell on all levels
+    # from the first level on which its prefix differs from that of the corner before it.
     begins = np.zeros(len(code), np.int64)
     begins[1:] = np.maximum(_DEPTH - (_bit_length(code[1:] ^ code[:-1]) - 1) // 2, 0)
-    # Number of occupied cells of each image on each level, and the last level on which there are few enough of them.
+    # Number of occupied cells of each image on each level, and the last level on which it is not too large.
     begun = np.bincount(image * (_DEPTH + 2) + begins, minlength=len(counts) * (_DEPTH + 2))
     cells = begun.reshape(len(counts), -1)[:, :-1].cumsum(axis=1)
     level = np.maximum((cells <= counts[:, None]).sum(axis=1) - 1, 0)
     missing = np.where(level < _DEPTH, counts - cells[np.arange(len(counts)), level], 0)
-    # Divide further cells, the fullest ones first, until no more are missing.
+    # Divide further cells, those with the most corners first, until the wanted number is reached.
     above = begins <= level[image]
     below = begins == level[image] + 1
     first = np.flatnonzero(above)

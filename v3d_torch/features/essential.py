@@ -20,7 +20,7 @@ from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.runtime.batches import common_batch, fill_padding
 
 _MIN_PAIRS = 6
-"""A sample of 5 pairs, and one more pair that can confirm its matrix."""
+"""Minimum number of pairs: a sample of 5, and one more pair that can confirm its matrix."""
 
 
 class EssentialMatrix(NamedTuple):
@@ -51,9 +51,9 @@ def essential_ransac(
     """Estimate essential matrices from pairs of pixels: RANSAC, refined by the Sampson distance of all inliers.
 
     The matrices are differentiable in pixels, camera matrix and weights, by the implicit function theorem; the inliers
-    are constant. On the CPU, kornia-rs finds the hypotheses by the five-point algorithm, one problem of the batch after
-    the other. On other devices and where `torch.func` traces the computation, torch finds them by the eight-point
-    algorithm, all at once; that algorithm does not work if all points lie in a plane.
+    are constant. On the CPU, kornia-rs computes the hypotheses by the five-point algorithm, one problem of the batch
+    after the other. On other devices, and if `torch.func` traces the computation, torch computes them for the whole
+    batch at once by the eight-point algorithm, which fails if all points lie in a plane.
 
     `kornia.geometry.motion_from_essential_choose_solution` gives the motion, up to the length of its translation.
 
@@ -64,8 +64,8 @@ def essential_ransac(
         uv_a: Undistorted pixels in image a, floating point, shape :math:`(*, N, 2)`.
         uv_b: Undistorted pixels of the same points in image b, shape :math:`(*, N, 2)`.
         K: Camera matrix of both images, shape :math:`(*, 3, 3)`.
-        weights: Weight of each pair in the refinement, not negative, shape :math:`(*, N)`; 1 by default.
-        valid: Pairs that are not padding, bool, shape :math:`(*, N)`; all by default.
+        weights: Weight of each pair in the refinement, not negative, shape :math:`(*, N)`; None for 1.
+        valid: Mask of the pairs that are not padding, bool, shape :math:`(*, N)`; None for all.
         threshold: Maximum Sampson distance of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
@@ -101,7 +101,7 @@ def essential_ransac(
 def _sample_five_points(
     problem: EpipolarProblem, valid: Tensor, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Best essential matrices of kornia-rs, (..., 3, 3), and True where there is one, (...)."""
+    """Best essential matrices of kornia-rs, (..., 3, 3), and a mask of the problems with a matrix, (...)."""
     focal = 1 / problem.K_inverse.diagonal(dim1=-2, dim2=-1)[..., :2].prod(dim=-1).sqrt()
     pairs = torch.cat([(each @ problem.K_inverse.mT)[..., :2] for each in (problem.a, problem.b)], dim=-1)
     E = torch.eye(3, dtype=torch.float64).repeat(*valid.shape[:-1], 1, 1)
@@ -126,7 +126,7 @@ def _sample_five_points(
 def _sample_eight_points(
     problem: EpipolarProblem, valid: Tensor, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Best essential matrices of RANSAC in torch, (..., 3, 3), and True where there is one, (...)."""
+    """Best essential matrices of RANSAC in torch, (..., 3, 3), and a mask of the problems with a matrix, (...)."""
     a, b = (each @ problem.K_inverse.mT for each in (problem.a, problem.b))
     by_hypothesis = {name: getattr(problem, name)[..., None, :, :] for name in ("a", "b", "K_inverse")}
 

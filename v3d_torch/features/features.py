@@ -76,7 +76,7 @@ def sample_depth(pixel: Tensor, depth: Tensor, max_depth: float) -> Tensor:
     Args:
         pixel: (column, row), int64, shape :math:`(N, 2)`; pixels outside the image have no depth.
         depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-        max_depth: Depth beyond this counts as missing, metres.
+        max_depth: Depth above this counts as missing, metres.
 
     Returns:
         Depth, metres, float64, shape :math:`(N,)`; 0 = no measurement.
@@ -89,7 +89,7 @@ def sample_depth(pixel: Tensor, depth: Tensor, max_depth: float) -> Tensor:
 
 
 def select_evenly(pixel: Tensor, count: int, cell: int) -> Tensor:
-    """Select pixels evenly over the cells of a grid: one of each cell first, then a second of each cell, and so on.
+    """Select pixels evenly over the cells of a grid: first one of each cell, then a second one of each, and so on.
 
     Args:
         pixel: (column, row), int64, shape :math:`(N, 2)`.
@@ -106,7 +106,7 @@ def select_evenly(pixel: Tensor, count: int, cell: int) -> Tensor:
     order = np.sort(key * len(key) + index) % len(key)  # an argsort by key; sorting numbers is faster
     rank = np.empty_like(key)  # position of each pixel within its cell
     rank[order] = index - np.searchsorted(key[order], key[order])
-    # All pixels of the ranks that fit as a whole, and the first ones of the next rank.
+    # All pixels of the ranks that fit as a whole, then the first pixels of the next rank.
     full_ranks = np.searchsorted(np.bincount(rank).cumsum(), count, side="right")
     selected, next_rank = rank < full_ranks, np.flatnonzero(rank == full_ranks)
     selected[next_rank[: count - np.count_nonzero(selected)]] = True
@@ -118,7 +118,7 @@ def pixel_sigma(octave: Tensor, config: TrackingConfig, pyramid: FeaturesConfig)
 
     Args:
         octave: Level of the scale pyramid of each feature, int64, shape :math:`(N,)`.
-        config: Standard deviation at level 0.
+        config: Configuration with the standard deviation at level 0.
         pyramid: Scale factor between pyramid levels.
 
     Returns:
@@ -132,7 +132,7 @@ def to_measurements(features: Features, config: TrackingConfig, pyramid: Feature
 
     Args:
         features: Features of one frame.
-        config: Standard deviations of pixels and inverse depth.
+        config: Configuration with the standard deviations of pixels and inverse depth.
         pyramid: Scale factor between pyramid levels.
     """
     return Measurements(

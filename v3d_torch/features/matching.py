@@ -1,4 +1,4 @@
-"""Matching of binary descriptors: exhaustively, or only near the projections of landmarks."""
+"""Matching of binary descriptors: exhaustive, or only near the projections of landmarks."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from v3d_torch.kernels import projection_matching as projection_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
 MAX_HAMMING, MAX_RATIO = OdometryConfig().max_hamming, OdometryConfig().max_ratio
-"""Default thresholds: those of the configuration of odometry."""
+"""Default thresholds, those of the odometry section of the configuration."""
 
 _BYTES = 32
 """Bytes of an ORB descriptor."""
 
 _CELL = 8.0
-"""Side of the cells of the search grid, pixels. Cells of about half a search radius keep the candidates few."""
+"""Side of the cells of the search grid, pixels: about half a search radius, so that few pixels are candidates."""
 
 _MAX_DISTANCE = 1 << 9
-"""Exceeds the distance of any two descriptors, bits. Combines a landmark and a distance into one sort key."""
+"""Factor that combines a landmark and a distance into one sort key; larger than any Hamming distance, bits."""
 
 
 def hamming_distance(a: Tensor, b: Tensor) -> Tensor:
@@ -89,14 +89,15 @@ def match_descriptors(
 ) -> Tensor:
     """Match binary descriptors: mutual nearest neighbours that pass Lowe's ratio test.
 
-    Of several nearest neighbours the first one counts. Memory grows with N times M. The descriptors are those of ORB
-    (Rublee et al., ICCV 2011); Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004.
+    Of several neighbours at the same distance, the first counts as nearest. Memory grows with N times M. Descriptors
+    are binary, as those of ORB (Rublee et al., ICCV 2011). The ratio test is that of Lowe, Distinctive Image Features
+    from Scale-Invariant Keypoints, IJCV 2004.
 
     Args:
         a: Descriptors, uint8, shape :math:`(*, N, D)`, 8 D bits.
         b: Descriptors, uint8, shape :math:`(*, M, D)`.
-        a_valid: Descriptors of ``a`` that are not padding, bool, shape :math:`(*, N)`; all by default.
-        b_valid: Descriptors of ``b`` that are not padding, bool, shape :math:`(*, M)`; all by default.
+        a_valid: Mask of the descriptors of ``a`` that are not padding, bool, shape :math:`(*, N)`; None for all.
+        b_valid: Mask of the descriptors of ``b`` that are not padding, bool, shape :math:`(*, M)`; None for all.
         max_hamming: Maximum Hamming distance, bits.
         max_ratio: Maximum ratio of the best to the second-best distance.
 
@@ -125,8 +126,8 @@ def match_descriptors(
 def _pairwise_hamming_distances(a: Tensor, b: Tensor) -> Tensor:
     """Hamming distances of all pairs of descriptors (..., N, D) and (..., M, D), float32, (..., N, M).
 
-    The scalar product of two vectors of +1 and -1, one for each bit, is the number of equal bits minus that of
-    different ones. The sums are whole numbers, and exact in float32.
+    Each descriptor is a vector of +1 and -1, one for each bit. The scalar product of two of them is the number of equal
+    bits minus the number of different bits. The sums are whole numbers and exact in float32.
     """
     place = torch.arange(8, dtype=torch.uint8, device=a.device)
     signs = [((each[..., None] >> place & 1).to(torch.float32) * 2 - 1).flatten(-2) for each in (a, b)]

@@ -18,31 +18,31 @@ from v3d_torch.geometry.camera import PinholeCamera
 Ints = NDArray[np.int64]
 
 _THRESHOLD, _MIN_THRESHOLD = 20, 7
-"""Difference of brightness between a corner and its surroundings, grey levels; the low one is used in cells without
-other corners (ORB-SLAM2)."""
+"""Minimum difference of brightness between a corner and its surroundings, grey levels; the lower threshold is used in
+cells without other corners (ORB-SLAM2)."""
 
 _CELL = 32
-"""Side of these cells, pixels of a level (ORB-SLAM2 has 30 or 35). Between two levels lies a margin that is wider."""
+"""Side of these cells, pixels of the level (ORB-SLAM2 uses 30 or 35). The margin between two levels is wider."""
 
 _WHITE = 255
-"""Grey level of white. The response of kornia-rs is a fraction of it."""
+"""Grey level of white, by which kornia-rs divides its corner response."""
 
 _ARC = 9
-"""Number of adjacent pixels on the circle around a corner that are brighter, or darker (FAST-9)."""
+"""Minimum number of adjacent pixels on the circle around a corner that are all brighter or all darker (FAST-9)."""
 
 _SMOOTHING_SIZE, _SMOOTHING_SIGMA = (7, 7), (2.0, 2.0)
-"""Gaussian filter before the comparisons of BRIEF, pixels (OpenCV)."""
+"""Kernel size and standard deviation of the Gaussian filter before the comparisons of BRIEF, pixels (OpenCV)."""
 
 
 class ORB:
     """Detector and descriptor of ORB features.
 
-    FAST and the smoothing are those of kornia-rs. Its own ORB takes longer, selects several pixels of one corner, and
-    leaves surfaces with little contrast without features.
+    FAST and the Gaussian filter are those of kornia-rs. The ORB of kornia-rs is not used: it takes longer, selects
+    several pixels of one corner, and finds no features on surfaces with little contrast.
 
     Args:
         config: Number of features, scale pyramid, maximum depth.
-        camera: Camera of the images; undistorts the features.
+        camera: Camera of the images, whose model undistorts the features.
     """
 
     def __init__(self, config: FeaturesConfig, camera: PinholeCamera) -> None:
@@ -68,7 +68,7 @@ class ORB:
         corners, level = self._detect(canvas)
         smoothed = kornia_rs.imgproc.gaussian_blur(canvas[..., None], _SMOOTHING_SIZE, _SMOOTHING_SIGMA)[..., 0]
         descriptors = brief.describe(*map(torch.from_numpy, (canvas, smoothed, corners)))
-        # Pixel centres lie at integers, so the borders of the images are half a pixel outside of them.
+        # Pixel centres lie at integers, so the image borders lie at half-integers.
         sizes = np.array(self._pyramid.sizes)
         corners[:, 1] -= self._pyramid.tops[level]
         position = torch.from_numpy((corners + 0.5) * (sizes[0] / sizes)[level] - 0.5)

@@ -13,19 +13,20 @@ from torch import Tensor
 from v3d_torch.geometry.se3 import invert
 
 _ROOT_ITERATIONS = 40
-"""Iterations for the roots. They converge quadratically, from a start that is some dozen steps away."""
+"""Iterations for the roots: some dozens from the start to the neighbourhood of the roots, then convergence is
+quadratic."""
 
 
 def solve_p3p(points: Tensor, directions: Tensor) -> Tensor:
-    """Poses of a camera that observes three points in given directions.
+    """Solve the perspective-three-point problem: poses of a camera that observes three points in given directions.
 
     Args:
         points: Three points in a frame "w", metres, float64, shape :math:`(..., 3, 3)`, one in each row.
         directions: Viewing directions of the points, of any length, shape :math:`(..., 3, 3)`.
 
     Returns:
-        World-to-camera poses ``T_cw`` of the four solutions, shape :math:`(..., 4, 4, 4)`. Solutions that are not real
-        are poses that do not fit the points; degenerate points give NaN.
+        World-to-camera poses ``T_cw`` of the four solutions, shape :math:`(..., 4, 4, 4)`. Poses of complex solutions
+        do not fit the points; degenerate points give NaN.
     """
     f = torch.nn.functional.normalize(directions, dim=-1)
     cos_a, cos_b, cos_c = ((f[..., i, :] * f[..., j, :]).sum(dim=-1) for i, j in ((1, 2), (0, 2), (0, 1)))
@@ -53,7 +54,7 @@ def _real_parts_of_roots(coefficients: Tensor) -> Tensor:
     Simultaneous iteration of all roots (Durand, 1960; Kerner, 1966).
     """
     monic = (coefficients[..., :4] / coefficients[..., 4:])[..., None, :]
-    # Any start that is neither real nor on a circle; scaled by a bound of the roots.
+    # The start must be neither real nor on a circle; it is scaled by an upper bound of the roots.
     start = torch.tensor([0.4 + 0.9j], dtype=torch.complex128, device=coefficients.device) ** torch.arange(
         4, device=coefficients.device
     )

@@ -74,10 +74,10 @@ class ProjectionMatcher:
     """
 
     _MIN_COSINE = 0.5
-    """Cosine of the largest change of viewing direction, 60 degrees: beyond, descriptors differ (ORB-SLAM2)."""
+    """Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
 
     _LEVEL_MARGIN = 1.2
-    """Landmarks up to this many levels beyond either end of the pyramid are matched, too: the expected level is
+    """Number of levels beyond either end of the pyramid at which landmarks are still matched: the expected level is
     rounded, and descriptors tolerate a difference of one level."""
 
     def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
@@ -85,7 +85,7 @@ class ProjectionMatcher:
         self._scale = pyramid.scale
         self._levels = pyramid.levels
         self._camera = camera
-        # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower ones are inclusive.
+        # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower bounds are inclusive.
         margin = self._LEVEL_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
         lower = [MIN_DEPTH, u_min, v_min, self._MIN_COSINE, -margin]

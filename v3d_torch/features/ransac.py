@@ -21,15 +21,15 @@ from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
 from v3d_torch.runtime.batches import common_batch
 
 _MIN_EPIPOLAR_PAIRS = 8
-"""Pairs that determine a fundamental matrix (eight-point algorithm)."""
+"""Minimum number of pairs for a fundamental matrix (eight-point algorithm)."""
 
 _MIN_PNP_POINTS = 6
-"""A sample of 5 points, and one more point that can confirm its pose."""
+"""Minimum number of points: a sample of 5, and one more point that can confirm its pose."""
 
 _SUBSET_SIZE = 100
-"""Points in the first run of RANSAC, spaced evenly over all points, to save time: each hypothesis is tested on every
-point. If no pose explains half of the points, a second run uses all of them, because a small subset has too few
-inliers."""
+"""Number of points in the first run of RANSAC, spaced evenly over all points. The subset saves time, because each
+hypothesis is tested on every point. If no pose explains half of all points, a second run uses all of them, because the
+subset then has too few inliers."""
 
 _LOCAL_OPTIMISATION_INTERVAL = 5
 """Interval of the local optimisation, ``lo_every`` of kornia-rs (LO-RANSAC; Chum et al., DAGM 2003)."""
@@ -87,8 +87,8 @@ def pnp_ransac(
     """Estimate camera poses from 3D points and their pixels: PnP in RANSAC, refined on all inliers.
 
     The poses are differentiable in points, pixels and camera matrix, as those of :func:`refine_pose`; the inliers are
-    constant. On the CPU, kornia-rs finds the hypotheses by EPnP, one problem of the batch after the other. On other
-    devices and where `torch.func` traces the computation, torch finds them by P3P, all at once.
+    constant. On the CPU, kornia-rs computes the hypotheses by EPnP, one problem of the batch after the other. On other
+    devices, and if `torch.func` traces the computation, torch computes them by P3P for the whole batch at once.
 
     Fischler and Bolles, Random Sample Consensus, CACM 1981; Lepetit et al., EPnP, IJCV 2009; Chum et al., Locally
     Optimized RANSAC, DAGM 2003.
@@ -97,9 +97,9 @@ def pnp_ransac(
         points: Points in a frame "w", metres, floating point, shape :math:`(*, N, 3)`.
         uv: Undistorted pixels of the points, shape :math:`(*, N, 2)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`. If the prediction, once refined, explains more than
-            half of the points, RANSAC is skipped.
-        valid: Points that are not padding, bool, shape :math:`(*, N)`; all by default.
+        initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`; None if there is no prediction. If the refined
+            prediction explains more than half of the points, RANSAC is skipped.
+        valid: Mask of the points that are not padding, bool, shape :math:`(*, N)`; None for all.
         threshold: Maximum reprojection error of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
@@ -129,7 +129,7 @@ def pnp_ransac(
         yield _sample_epnp(*data, mask, ~done & (count > _SUBSET_SIZE), None, *settings)
 
     for hypothesis, exists in hypotheses():
-        # Residuals of pixels only: depth enters through the points.
+        # Only pixels have residuals; the measured depth is already part of the points.
         refined = refine_pose(hypothesis, points, uv, K, pixel_sigma=sigma, valid=valid, rounds=2)
         is_new = exists & ~done
         T_cw, inliers = select(is_new, (refined.T_cw.to(points.dtype), refined.inliers), (T_cw, inliers))
@@ -155,9 +155,9 @@ def _sample_epnp(
     iterations: int,
     seed: int,
 ) -> tuple[Tensor, Tensor]:
-    """Best poses ``T_cw``, (..., 4, 4), of one RANSAC run of kornia-rs, and True where there is one, (...).
+    """Best poses ``T_cw``, (..., 4, 4), of one RANSAC run of kornia-rs, and a mask of the problems with a pose, (...).
 
-    Only the problems that are ``wanted`` are sampled, each from ``size`` of its points; None = all.
+    Only the problems in the mask ``wanted`` are solved, each with ``size`` of its points; None for all points.
     """
     poses = torch.eye(4, dtype=torch.float64).repeat(*valid.shape[:-1], 1, 1)
     found = torch.zeros(valid.shape[:-1], dtype=torch.bool)
@@ -189,7 +189,7 @@ def _sample_epnp(
 def _sample_p3p(
     points: Tensor, uv: Tensor, K: Tensor, valid: Tensor, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Best poses ``T_cw``, (..., 4, 4), of RANSAC in torch, and True where there is one, (...)."""
+    """Best poses ``T_cw``, (..., 4, 4), of RANSAC in torch, and a mask of the problems with a pose, (...)."""
     focal, centre = K.diagonal(dim1=-2, dim2=-1)[..., None, :2], K[..., None, :2, 2]
     xy = (uv - centre) / focal
     rays = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)

@@ -15,10 +15,10 @@ from torch import Tensor
 from v3d_torch.config import OdometryConfig
 
 ITERATIONS = OdometryConfig().iterations
-"""Default number of hypotheses: that of the configuration of odometry."""
+"""Default number of hypotheses, that of the odometry section of the configuration."""
 
 _CHUNK = 64
-"""Samples that are tested at once: bounds the memory."""
+"""Number of samples tested at once; it bounds the memory."""
 
 
 def find_best_hypothesis(
@@ -31,21 +31,21 @@ def find_best_hypothesis(
     iterations: int,
     seed: int,
 ) -> tuple[Tensor, Tensor]:
-    """Find the hypothesis with the lowest truncated error.
+    """Find the hypothesis with the lowest sum of truncated squared errors.
 
     Args:
         solve: Function from samples, indices of shape :math:`(..., S, n)`, to hypotheses, matrices of shape
-            :math:`(..., S, H, r, c)`, H for each sample; NaN for those that do not exist.
+            :math:`(..., S, H, r, c)`, with H hypotheses per sample; NaN for hypotheses that do not exist.
         squared_errors: Function from hypotheses of shape :math:`(..., T, r, c)` to the squared error of each element,
             :math:`(..., T, N)`; infinite or NaN for elements that exclude the hypothesis.
-        valid: Elements that are not padding, bool, shape :math:`(..., N)`.
+        valid: Mask of the elements that are not padding, bool, shape :math:`(..., N)`.
         size: Number n of elements in a sample.
-        threshold: Errors are truncated here.
+        threshold: Error at which errors are truncated, in the unit of the square root of the squared errors.
         iterations: Number of samples.
         seed: Seed of the sampling.
 
     Returns:
-        The best hypothesis, shape :math:`(..., r, c)`, and True where there is one, bool, shape :math:`(...)`.
+        The best hypothesis, shape :math:`(..., r, c)`, and a mask of the problems with one, bool, shape :math:`(...)`.
     """
     best, lowest = None, None
     for samples in draw_samples(valid, size, iterations, seed).split(_CHUNK, dim=-2):
@@ -66,11 +66,11 @@ def find_best_hypothesis(
 
 
 def draw_samples(valid: Tensor, size: int, count: int, seed: int) -> Tensor:
-    """Draw samples of different elements, the same on every device.
+    """Draw random samples without replacement, the same on every device.
 
     Args:
-        valid: Elements that can be drawn, bool, shape :math:`(..., N)`, at least ``size``; with fewer, samples contain
-            others, too.
+        valid: Mask of the elements that can be drawn, bool, shape :math:`(..., N)`. If fewer than ``size`` elements are
+            valid, samples also contain others.
         size: Number n of elements in a sample, at most N.
         count: Number S of samples.
         seed: Seed of the sampling.
@@ -78,13 +78,13 @@ def draw_samples(valid: Tensor, size: int, count: int, seed: int) -> Tensor:
     Returns:
         Indices, int64, shape :math:`(..., S, n)`.
     """
-    # Random numbers of NumPy, because those of torch depend on the device and are refused by torch.func.vmap.
+    # Random numbers come from NumPy, because those of torch depend on the device and fail in torch.func.vmap.
     keys = torch.from_numpy(np.random.default_rng(seed).random((count, valid.shape[-1]))).to(valid.device)
     return torch.where(valid[..., None, :], keys, 1.0).topk(size, dim=-1, largest=False).indices
 
 
 def gather_samples(elements: Tensor, samples: Tensor) -> Tensor:
-    """Gather the elements of samples.
+    """Gather the elements at the indices of samples.
 
     Args:
         elements: Shape :math:`(..., N, d)`.

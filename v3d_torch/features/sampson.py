@@ -1,4 +1,4 @@
-r"""Essential matrices with the smallest Sampson distances: least squares over rotations U and V.
+r"""Refinement of essential matrices: least squares of Sampson distances over two rotations U and V.
 
 .. math::
     E = \frac{1}{\sqrt 2}\, U \,\mathrm{diag}(1, 1, 0)\, V^\top
@@ -21,13 +21,13 @@ from v3d_torch.optim.implicit import jacobian, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt, select
 
 _ROUNDS = 3
-"""Rounds of refinement on the inliers, after each of which all pairs are classified anew."""
+"""Number of rounds of refinement on the inliers; all pairs are classified again after each round."""
 
 _ITERATIONS, _TOLERANCE = 10, 1e-6
-"""Maximum number of steps in a round, and relative change of the cost that ends it."""
+"""Maximum number of steps in a round, and relative change of the cost that ends the round."""
 
 _REGULARISATION = 1e-9
-"""Added to the diagonal of the normal equations, which are singular without inliers."""
+"""Number added to the diagonal of the normal equations, which are singular without inliers."""
 
 
 State = tuple[Tensor, Tensor]
@@ -50,7 +50,7 @@ def decompose(E: Tensor) -> State:
 
 
 def _move(state: State, x: Tensor) -> State:
-    """State moved by (..., 5): rotation of U about three axes, and of V about its first two columns.
+    """State after an update (..., 5): rotation of U about three axes, and of V about its first two columns.
 
     Rotating both about their third columns does not change E.
     """
@@ -82,7 +82,7 @@ class EpipolarProblem(NamedTuple):
         return (line_b * self.b).sum(dim=-1) / _length(line_a, line_b)
 
     def jacobian(self, state: State) -> Tensor:
-        """Derivatives of the Sampson distances by the arguments of `_move`, (..., 5, N)."""
+        """Derivatives of the Sampson distances by the update of `_move`, (..., 5, N)."""
         (U, V), E = state, compose(*state)
         axes = torch.cat([torch.eye(3, dtype=U.dtype, device=U.device).expand_as(U), V[..., :2].mT], dim=-2)
         turns = hat(torch.cat([torch.zeros_like(axes), axes], dim=-1))[..., :3, :3]  # 5 x 3 x 3
@@ -97,13 +97,13 @@ class EpipolarProblem(NamedTuple):
         return (change_b * b).sum(dim=-2) / length - distance * stretch / length.square()
 
     def linearise(self, state: State, influence: Tensor) -> tuple[Tensor, State]:
-        """Cost, and halves of its Hessian by Gauss-Newton and of its gradient."""
+        """Return the cost, half of its Gauss-Newton Hessian, and half of its gradient."""
         r, J = self.sampson(compose(*state)), self.jacobian(state)
         weighted = J * influence[..., None, :]
         return (influence * r.square()).sum(dim=-1), (weighted @ J.mT, (weighted @ r[..., None])[..., 0])
 
     def differentiate(self, state: State, active: Tensor) -> State:
-        """The optimum ``state`` of the active pairs, with its derivatives."""
+        """Return the optimum ``state`` of the active pairs with its derivatives attached."""
 
         def gradient(x: Tensor, problem: EpipolarProblem) -> Tensor:
             return problem.linearise(_move(state, x), problem.weights * active)[1][1]
@@ -115,7 +115,7 @@ class EpipolarProblem(NamedTuple):
 
 
 def _length(line_a: Tensor, line_b: Tensor) -> Tensor:
-    """Denominator of the Sampson distance, of the epipolar lines (..., N, 3) in both images, (..., N)."""
+    """Denominator of the Sampson distance, (..., N), from the epipolar lines in both images, (..., N, 3)."""
     square = line_a[..., :2].square().sum(dim=-1) + line_b[..., :2].square().sum(dim=-1)
     return square.clamp(min=1e-30).sqrt()
 
@@ -133,7 +133,7 @@ def _step(state: State, system: State, damping: Tensor) -> State:
 def refine_essential(
     E: Tensor, problem: EpipolarProblem, valid: Tensor, threshold: float
 ) -> tuple[State, Tensor, Tensor]:
-    """Optimum on the inliers, the inliers (..., N), and the pairs (..., N) that took part in the last round."""
+    """Refine essential matrices; return the optimum, its inliers (..., N), and the pairs (..., N) of the last round."""
     state, active = decompose(E), valid
     inliers = valid & (problem.sampson(compose(*state)).abs() <= threshold)
     finished = torch.zeros(E.shape[:-2], dtype=torch.bool, device=E.device)

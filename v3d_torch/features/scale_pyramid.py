@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 
 
 class ScalePyramid:
-    """Pyramid whose levels lie one below the other in one image, so that a filter runs once for all of them.
+    """Scale pyramid with all levels in one image, one below the other, so that a filter runs once for all levels.
 
     Args:
         width: Columns of the image.
         height: Rows of the image.
-        levels: Number of levels; those that are smaller than twice the margin are left out.
+        levels: Number of levels; levels smaller than twice the margin are left out.
         scale: Scale factor between levels.
-        margin: Distance from the border of a level up to which its pixels are not used, pixels.
+        margin: Width of the unused border of each level, pixels.
 
     Attributes:
         sizes: Width and height of each level, pixels.
         tops: First row of each level in the image of all levels.
-        is_inside: True for pixels of the image of all levels that lie in a level outside of its margin, bool.
+        is_inside: Mask of the pixels of the image of all levels that lie in a level, without its margin, bool.
         level_of_row: Level of each row of the image of all levels, int64.
     """
 
@@ -44,5 +44,5 @@ class ScalePyramid:
             level = np.asarray(cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
             rows = canvas[top : top + height]
             rows[:, :width] = level
-            rows[:, width:] = level[:, -1:]  # no edge beside the level
+            rows[:, width:] = level[:, -1:]  # repeat the last column, so that there is no edge beside the level
         return canvas

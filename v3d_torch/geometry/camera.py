@@ -26,7 +26,7 @@ MAX_READOUT = 0.05
 """Longest accepted readout, seconds: no RGB-D camera takes longer to read the rows of an image."""
 
 MAX_DEPTH_DELAY = 0.5
-"""Longest accepted depth delay, seconds: images that are farther apart do not belong together."""
+"""Longest accepted depth delay, seconds: images that are farther apart are not of the same frame."""
 
 MAX_INVERSE_DEPTH_OFFSET = 0.05
 """Largest accepted offset of inverse depth, 1/m: it changes a depth of 2 m by 0.2 m."""
@@ -114,7 +114,7 @@ class PinholeCamera:
             object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, object]:
-        """Fields without the cached tensors, which follow from them and take megabytes."""
+        """Return the fields without the cached tensors, which take megabytes and can be computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -151,7 +151,7 @@ class PinholeCamera:
 
     @property
     def is_distorted(self) -> bool:
-        """True if undistorted and distorted pixels differ: a distortion coefficient is not 0, or the lens a fisheye."""
+        """True if undistorted and distorted pixels differ: a coefficient is not 0, or the model is ``equidistant``."""
         return self.distortion_model == "equidistant" or any(self.distortion)
 
     def undistort(self, uv: Tensor) -> Tensor:
@@ -171,9 +171,9 @@ class PinholeCamera:
     def correct_depth(self, depth: Tensor) -> Tensor:
         r"""Correct measured depth by the camera's offset of inverse depth: :math:`1 / z = 1 / z_{measured} + \beta`.
 
-        Cameras with structured light and stereo cameras measure disparity, which is linear in inverse depth; an error
-        of its zero point is a constant offset of inverse depth, and an error of depth that grows with its square
-        (Khoshelham and Elberink, Accuracy and Resolution of Kinect Depth Data, Sensors 2012).
+        Structured-light and stereo cameras measure disparity, which is linear in inverse depth. An error of the zero
+        point of disparity is a constant offset of inverse depth, and causes an error of depth that grows with the
+        square of depth (Khoshelham and Elberink, Accuracy and Resolution of Kinect Depth Data, Sensors 2012).
 
         Args:
             depth: Measured depth, metres, any shape; 0 = no measurement.
@@ -238,7 +238,8 @@ class PinholeCamera:
     def undistorted_bounds(self) -> tuple[float, float, float, float]:
         """Undistorted pixels that the image covers: minimum u and v, inclusive, and maximum u and v, exclusive.
 
-        The undistorted image of a fisheye lens is much larger than the recorded one, that of other lenses about equal.
+        The undistorted image of a fisheye lens is much larger than the recorded image; for other lenses, the two have
+        about the same size.
         """
         if self.distortion_model != "equidistant":
             return 0.0, 0.0, float(self.width), float(self.height)
@@ -253,7 +254,7 @@ class PinholeCamera:
 
         Args:
             points: Points in the camera frame, metres, shape :math:`(P, 3)`.
-            min_depth: Points with a depth up to this are not in the image, metres.
+            min_depth: Points with at most this depth are not in the image, metres.
 
         Returns:
             Distorted pixels (u, v), float64, shape :math:`(P, 2)`, and a mask of the points in the image, bool, shape

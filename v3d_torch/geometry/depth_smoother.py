@@ -15,7 +15,7 @@ from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _MAX_VALID_DEPTH = 1e5
-"""Depth beyond this counts as missing, metres. Missing pixels get a placeholder that differs from any depth by more."""
+"""Depth above this counts as missing, metres. The placeholder of missing pixels differs from any depth by more."""
 
 _STRIP_HEIGHT = 120
 """Rows filtered at a time. The intermediate results of a strip stay in the processor's cache."""
@@ -44,8 +44,8 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
 
     The gates keep the average on one surface: :math:`g_j` is 1 if the pixel j rows away is measured and its depth
     differs from the centre's by at most ``edge_ratio`` times the centre's depth, else 0; :math:`g_{ij}` compares the
-    pixel i columns beside that pixel with that pixel in the same way. The filter is separable: each row is summed
-    first, then the columns. The paper's equation is the case ``edge_ratio=inf`` on an image without holes.
+    pixel (i, j) with the pixel (0, j) in the same way. The filter is separable: sums along rows come first, then sums
+    along columns. The paper's equation is the case ``edge_ratio=inf`` on an image without holes.
 
     Args:
         depth: Depth, metres, float32 or float64, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
@@ -85,8 +85,8 @@ def _gaussian(kernel_size: int, sigma: float) -> tuple[float, ...]:
 def _smooth(depth: Tensor, taps: tuple[float, ...], edge_ratio: float) -> Tensor:
     """Smooth an image with a Gaussian, given by its weights from the centre outwards.
 
-    The filter averages differences to the centre, not depths. So no quotient is 0 / 0, because the centre always has
-    its weight, and a plane parallel to the image keeps its depth to the bit.
+    The filter averages differences to the centre's depth, not depths. The centre always has a weight, so that no
+    quotient is 0 / 0, and the depth of a plane parallel to the image does not change by a bit.
     """
     measured = (depth > 0) & (depth < _MAX_VALID_DEPTH)
     z = torch.where(measured, depth, -2 * _MAX_VALID_DEPTH)
@@ -111,7 +111,7 @@ def _convolve(
         dim: Dimension along which to accumulate.
 
     Returns:
-        The sums and weights of each pixel and its neighbours, with all differences taken to the pixel's own depth.
+        Sums of weighted differences to each pixel's depth, over the pixel and its neighbours, and sums of the weights.
     """
     sums, weights = total * taps[0], weight * taps[0]
     for distance, tap in enumerate(taps[1:], start=1):

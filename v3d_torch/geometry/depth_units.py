@@ -1,8 +1,8 @@
 """Units of depth images: conversion to metres, and estimation of an unknown depth scale.
 
-Depth in floating point is in metres. Depth in whole numbers has a unit: a camera file, a data set or a device states
-the depth scale, units per metre. If none of them does, the depth scale is estimated from the images, and the estimate
-is reported. If the images fit several scales, an error asks for it.
+Depth in floating point is in metres. Depth in whole numbers has a depth scale, in units per metre, which a camera file,
+a data set or a device states. If none of them does, the depth scale is estimated from the images, and a warning reports
+the estimate. If several scales fit the images, an error asks the user for it.
 """
 
 from __future__ import annotations
@@ -34,30 +34,30 @@ UNITS: dict[float, str] = {
 """Depth scales that devices and data sets use, units per metre, with their names."""
 
 _MAX_METRES = 1e4
-"""Larger floating-point depth is no measurement, metres: renderers write such values for the sky."""
+"""Floating-point depth above this is not a measurement, metres: renderers write such values for the sky."""
 
 _NEAREST, _LEAST_FAR, _FARTHEST = 0.25, 1.0, 10.0
-"""Distances in a room, metres: no camera for rooms measures nearer than the first, something is farther away than the
-second, and nothing than the third."""
+"""Distances in a room, metres: the minimum range of depth cameras, a distance that some surface in the image exceeds,
+and a distance that no surface exceeds."""
 
 _FARTHEST_OF_OTHERS = 14.0
-"""Largest distance of an image, metres, with a depth scale that cannot be excluded: beyond the range of RGB-D
+"""Largest distance in an image with which a depth scale still counts as possible, metres: beyond the range of RGB-D
 cameras."""
 
 _NEARER_THAN_ANY_CAMERA = 0.1
 """Distance that no depth camera measures, metres."""
 
 _QUANTILES = (0.01, 0.5, 0.99)
-"""Near, median and far depth: quantiles that single wrong pixels do not change."""
+"""Quantiles used as near, median and far depth: single wrong pixels do not change them."""
 
 _MAX_STEP = 100
-"""Maximum step between depth values that is looked for, units."""
+"""Maximum step between depth values that is searched for, units."""
 
 _MIN_MULTIPLES = 0.95
 """Minimum fraction of the values that are multiples of a step. Other values come from interpolation."""
 
 _MIN_VALUES = 30
-"""Minimum number of different values that tell a step. Fewer values can be multiples of a number by chance."""
+"""Minimum number of different values for which a step is accepted. Fewer can be multiples of a number by chance."""
 
 _STRIDE = 4
 """Every n-th row and column is examined, which is enough for quantiles."""
@@ -65,11 +65,11 @@ _STRIDE = 4
 
 @dataclass(frozen=True)
 class DepthScaleEstimate:
-    """Depth scale as depth images tell it.
+    """Depth scale estimated from depth images.
 
     Attributes:
         depth_scale: Units per metre; None if the images fit several scales or none.
-        evidence: Description of the images.
+        evidence: Description of the depth values, as a part of a sentence.
     """
 
     depth_scale: float | None
@@ -77,7 +77,7 @@ class DepthScaleEstimate:
 
     @property
     def note(self) -> str:
-        """Sentence that reports the depth scale; only if there is one."""
+        """Sentence that reports the depth scale, which must not be None."""
         scale = self.depth_scale or np.nan
         return (
             f"depth scale {scale:g} ({UNITS[scale]}), estimated from {self.evidence}; state depth_scale in camera.yaml"
@@ -87,7 +87,7 @@ class DepthScaleEstimate:
     def question(self) -> str:
         """Cause and fix for an error that asks the user of a recording for the depth scale."""
         return (
-            f"the unit of depth is not stated, and the images do not tell it ({self.evidence}); write the line"
+            f"the unit of depth is not stated and cannot be estimated from the images ({self.evidence}); write the line"
             " depth_scale: 1000 into camera.yaml if depth is in millimetres, or else its units per metre (TUM: 5000)"
         )
 
@@ -105,10 +105,10 @@ class DepthScaleEstimate:
 def estimate_depth_scale(images: Iterable[NDArray[Any]]) -> DepthScaleEstimate:
     """Estimate the depth scale from depth images of a room.
 
-    A depth scale fits if the images show distances of a room with it. Most sensors measure in whole millimetres, so the
-    step between the values tells a finer unit of the file: multiples of 5 are millimetres in units of 0.2 mm, or steps
-    of 5 mm. Without such a step, values of a room in millimetres can also be a desk in a finer unit, if nothing is
-    near. The estimate is the only depth scale of `UNITS` that fits.
+    A depth scale fits if it gives distances that occur in a room. Most sensors measure in whole millimetres, so a step
+    between the values shows that the unit of the file is finer: multiples of 5 are millimetres in units of 0.2 mm, or
+    steps of 5 mm. Without such a step, and without near surfaces, the depth of a room in millimetres can have the same
+    values as the depth of a desk in a finer unit. The estimate is the only depth scale of `UNITS` that fits.
 
     Args:
         images: Depth images with whole numbers, of any shape; 0 and the largest 16-bit value are no measurement.
@@ -145,10 +145,10 @@ def _find_step(values: NDArray[np.integer[Any]]) -> int | None:
 
 
 def _is_certain(depth_scale: float, near: float, candidates: list[float]) -> bool:
-    """Check whether the only fitting depth scale can be relied on although distances in a room vary."""
+    """Check whether the only depth scale that fits is certain, although distances differ between rooms."""
     if depth_scale < MILLIMETRES:  # a close view in millimetres has the same values
         return near < MILLIMETRES * _NEARER_THAN_ANY_CAMERA
-    # Finer units differ by small factors, so that only the step between the values distinguishes them.
+    # Finer units differ by small factors; only the step between the values distinguishes them.
     return depth_scale == MILLIMETRES or len(candidates) < len(UNITS)
 
 
@@ -156,8 +156,8 @@ def depth_to_metres(depth: NDArray[Any], depth_scale: float | None) -> Tensor:
     """Convert a depth image to metres.
 
     Args:
-        depth: Depth image, shape (H, W): metres in floating point, or whole numbers in units. Values that are not
-            positive or not finite, and the largest 16-bit value, are no measurement.
+        depth: Depth image, shape (H, W): metres in floating point, or whole numbers in units of the depth scale. Values
+            that are not positive or not finite, and the largest 16-bit value, are not measurements.
         depth_scale: Units per metre of whole numbers; None only for floating point.
 
     Returns:
@@ -186,5 +186,5 @@ def _missing_value(depth: NDArray[np.integer[Any]]) -> int:
 
 
 def _is_room(near: float, far: float) -> bool:
-    """Check whether near and far depth, metres, can be distances in a room."""
+    """Check whether the near and the far depth, both in metres, can be distances in a room."""
     return near >= _NEAREST and _LEAST_FAR <= far <= _FARTHEST_OF_OTHERS

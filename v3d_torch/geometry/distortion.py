@@ -1,4 +1,4 @@
-"""Lens distortion models, with the names that ROS gives them.
+"""Lens distortion models, with their names in ROS.
 
 ``plumb_bob`` is the Brown-Conrady model (OpenCV's default), ``rational_polynomial`` its extension by a denominator, and
 ``equidistant`` the fisheye model of Kannala and Brandt (PAMI 2006), as in OpenCV's module ``fisheye``.
@@ -38,15 +38,15 @@ _MIN_RADIUS = 1e-9
 
 
 def complete_distortion(given: object, model: str) -> tuple[tuple[float, ...], DistortionModel]:
-    """Check distortion coefficients, and complete them by zeros.
+    """Check distortion coefficients, and append the zeros that are missing.
 
     Args:
         given: Coefficients: numbers, or an array of any shape as OpenCV returns it.
         model: Name of the model. As in OpenCV, the number of coefficients distinguishes the two polynomial models.
 
     Returns:
-        Coefficients, as many as the model has, and the name of the model: ``plumb_bob`` if the further coefficients of
-        ``rational_polynomial`` are 0.
+        All coefficients of the model, and the name of the model: ``plumb_bob`` if the coefficients that only
+        ``rational_polynomial`` has are 0.
 
     Raises:
         InputError: If the model is unknown, a coefficient is not a finite number, or there are too many.
@@ -105,8 +105,8 @@ def undistort_pixels(uv: Tensor, K: Tensor, model: DistortionModel, coefficients
         coefficients: Coefficients of the model.
 
     Returns:
-        Pixels of an ideal pinhole camera with the same ``K``, float64, shape :math:`(N, 2)`. For a pixel that no ray
-        reaches, the result is meaningless.
+        Pixels of an ideal pinhole camera with the same ``K``, float64, shape :math:`(N, 2)`. For a pixel to which the
+        model maps no ray, the result is meaningless.
     """
     matrix, vector = K.numpy(), np.array(coefficients)
     if model == "equidistant":
@@ -118,14 +118,14 @@ def undistort_pixels(uv: Tensor, K: Tensor, model: DistortionModel, coefficients
 
 
 def kernel_coefficients(model: DistortionModel, coefficients: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the coefficients in the layout of all models, see `v3d_torch.kernels.camera.Intrinsics`.
+    """Return the coefficients in the common layout of all models, see `v3d_torch.kernels.camera.Intrinsics`.
 
     Args:
         model: Name of the model.
         coefficients: Coefficients of the model.
 
     Returns:
-        ``k1, k2, p1, p2, k3, k4, k5, k6``, and 1 for ``equidistant`` or 0 for another model.
+        ``k1, k2, p1, p2, k3, k4, k5, k6`` and a flag, which is 1 for ``equidistant`` and 0 for other models.
     """
     named = dict(zip(COEFFICIENTS[model], coefficients, strict=True))
     layout = (named.get(name, 0.0) for name in COEFFICIENTS["rational_polynomial"])

@@ -15,8 +15,8 @@ _EPS = 1e-30  # keeps the division by a norm finite
 def surface_normals(points: Tensor, radius: int = 4, edge_ratio: float = 0.05) -> Tensor:
     """Estimate normals by averaging cross products of neighbour differences over a window.
 
-    The average is over cross products, not over depth: a window that is cut by a depth edge still gives the normal of a
-    plane exactly, while averaged depth would bend the plane there.
+    Cross products are averaged, not depths: the normal of a plane is exact even if a depth edge cuts the window, where
+    averaged depths would bend the plane.
 
     Args:
         points: Points in the camera frame, metres, one per pixel, shape :math:`(B, H, W, 3)`; z = 0 for pixels without

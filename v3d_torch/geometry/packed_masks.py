@@ -1,4 +1,4 @@
-"""Masks with one bit for each pixel, for the overlaps of many masks."""
+"""Masks with one bit per pixel, to count overlaps of many masks fast."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import torch
 from torch import Tensor
 
 _WORD = 8
-"""Bytes that are compared at a time; packed masks are padded to a multiple of it."""
+"""Number of bytes compared at a time; packed masks are padded to a multiple of it."""
 
 
 def pack_masks(masks: Tensor, stride: int = 1) -> Tensor:
-    """Pack masks.
+    """Pack masks into one bit per pixel.
 
     Args:
         masks: Masks, bool, shape :math:`(*, H, W)`.
         stride: Every n-th row and column is packed.
 
     Returns:
-        Packed masks, uint8, shape :math:`(*, B)`. Masks of the same size can be compared.
+        Packed masks, uint8, shape :math:`(*, B)`. Only packed masks of equal H, W and stride are comparable.
     """
     rows = np.ascontiguousarray(masks.numpy()[..., ::stride, :])[..., ::stride]  # faster than both strides at once
     packed = np.packbits(rows.reshape(*rows.shape[:-2], rows.shape[-2] * rows.shape[-1]), axis=-1)

@@ -1,8 +1,8 @@
 """SE(3) as 4x4 matrices: exponential, logarithm, inverse, adjoint, Jacobian of the logarithm.
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
-All functions are batched over leading dimensions, differentiable, and meant for float64. They compute the same as
-PyPose but on plain matrices, which is faster for single poses.
+All functions are batched over leading dimensions, differentiable, and meant for float64. Their results equal those of
+PyPose, but they use plain matrices, which is faster for single poses.
 
 Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018.
 """
@@ -55,7 +55,7 @@ _SERIES_ANGLE_SQUARED = 1e-4
 
 
 def _is_single(tensor: Tensor, *shape: int) -> bool:
-    """Check whether a tensor is a single element of the group or of its tangent space, which the kernels expect."""
+    """Check whether a tensor is a single float64 element without batch dimensions, as the kernels expect."""
     return tensor.shape == shape and tensor.dtype == torch.float64
 
 
@@ -119,7 +119,7 @@ def se3_exp(xi: Tensor) -> Tensor:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
     X = hat(xi)
-    # The coefficients hardly change below the small angle, and higher powers of the angle multiply them there.
+    # Below the small angle the coefficients are constant to float64, and are multiplied by high powers of the angle.
     angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL_ANGLE)
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
@@ -222,7 +222,7 @@ def _block_triangular(D: Tensor, B: Tensor) -> Tensor:
 
 
 def _so3_log(R: Tensor) -> Tensor:
-    """Rotation vectors (..., 3) of rotations (..., 3, 3), by way of quaternions: well conditioned up to pi."""
+    """Rotation vectors (..., 3) of rotations (..., 3, 3), computed via quaternions: well conditioned up to pi."""
     # Each row of 4 q q^T is a multiple of the quaternion q; the longest row has the smallest relative error.
     rows = (R.flatten(-2) @ _QUATERNION_PRODUCTS.to(R)).unflatten(-1, (4, 4))
     rows = rows + torch.eye(4, dtype=R.dtype, device=R.device)

@@ -16,7 +16,7 @@ from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _MAX_VOXELS = 2**62
-"""Largest bounding box, voxels. Larger boxes cannot be numbered with 64-bit integers."""
+"""Largest bounding box, in voxels: the voxels of larger boxes cannot be numbered with 64-bit integers."""
 
 
 class Voxels(NamedTuple):
@@ -56,8 +56,8 @@ def _voxel_pool_compiled(points: Tensor, valid: Tensor, size: float) -> Voxels:
 def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     """Replace the points of each voxel by their mean.
 
-    Voxel (i, j, k) holds the points with ``floor(point / size) == (i, j, k)``: the grid is fixed to the origin and does
-    not move with the cloud.
+    Voxel (i, j, k) contains the points with ``floor(point / size) == (i, j, k)``: the grid is fixed to the origin and
+    does not depend on the cloud.
 
     Args:
         points: Points, metres, float32 or float64, shape :math:`(B, N, 3)`.

@@ -19,7 +19,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.io.files import atomic_write
 
 _MIN_UNPACKED_LIMIT = 1 << 28
-"""Bytes to which any file may unpack, however small it is."""
+"""Number of bytes to which a file of any size may unpack."""
 
 _MAX_UNPACKED_RATIO = 20
 """Additional bytes to which a file may unpack, relative to its size. Maps unpack to about three times their size."""
@@ -77,13 +77,13 @@ def write_array_file(path: Path, about: Mapping[str, Any], arrays: Mapping[str, 
 
 @contextmanager
 def open_array_file(path: Path, format_name: str, kind: str, fix: str) -> Iterator[ArrayFile]:
-    """Open an array file to read it; damage that shows in the block is reported as that of the file.
+    """Open an array file for reading; errors in the block that damage causes become `InputError`.
 
     Args:
         path: Path of the file.
         format_name: Format that the description must have.
-        kind: Kind of file in words, for errors.
-        fix: What to do about a wrong file, for errors.
+        kind: Kind of file, for error messages.
+        fix: Fix for a wrong file, for error messages.
 
     Raises:
         InputError: If the file is missing, of another format, or damaged.

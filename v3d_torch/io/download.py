@@ -1,4 +1,4 @@
-"""Downloads over https that resume after an interruption, are verified, and appear complete or not at all."""
+"""Downloads over https: resumed after an interruption, verified, and atomic."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def fetch(
         sha256: Expected checksum, hexadecimal.
         size: Expected size, bytes; the size that the server announces is checked in any case.
         progress: Called after every chunk.
-        timeout: Longest wait for the connection and for each chunk, seconds.
+        timeout: Maximum wait for the connection and for each chunk, seconds.
 
     Returns:
         ``target``.

@@ -1,4 +1,4 @@
-"""Extraction of downloaded tar archives: confined to the target folder, bounded in size, all or nothing."""
+"""Extraction of downloaded tar archives: confined to the target folder, bounded in size, and atomic."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MAX_BYTES = 20 * 2**30
 """Largest total size of the files in an archive, bytes: three times the largest TUM sequence."""
 
 _MAX_MEMBERS = 1_000_000
-"""Largest number of members: empty files fill up a file system, too, and no sequence has a million files."""
+"""Maximum number of members: many empty files can also fill a file system, and no sequence has a million files."""
 
 _MAX_HEADER_BYTES = 1 << 20
-"""Largest extension header of a member, bytes: tarfile reads it into memory whole, and it only holds a name."""
+"""Maximum size of the extension header of a member, bytes: tarfile reads it as a whole, and it contains only a name."""
 
 _EXTENSION_HEADERS = (
     *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK),
@@ -90,7 +90,7 @@ def _read_to_end(tar: tarfile.TarFile, max_bytes: int) -> None:
 
 
 class _StrictTarInfo(tarfile.TarInfo):
-    """Member header that raises an error if it is damaged or too large; tarfile treats a damaged one as the end."""
+    """Member header that raises an error if it is damaged or too large; tarfile would treat it as the end."""
 
     @classmethod
     def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:

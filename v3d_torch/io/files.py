@@ -41,7 +41,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def check_writable(path: Path) -> None:
-    """Make the folder of a file and check that the file can be written, before long work that ends with writing it.
+    """Make the folder of a file and check that the file can be written; call this before long work.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -57,10 +57,10 @@ def check_writable(path: Path) -> None:
 
 
 def check_empty_folder(folder: Path) -> None:
-    """Check that a folder is new or empty, so that nothing is mixed with other files or overwritten.
+    """Check that a folder is new or empty, so that no file is overwritten or mixed with others.
 
     Raises:
-        OutputError: If it is not.
+        OutputError: If the folder contains files.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")

@@ -1,4 +1,4 @@
-"""Paths as users write them, with ``~`` for the home folder.
+"""Expansion of ``~`` to the home folder in paths given by users.
 
 Shells expand ``~`` in ``--out ~/x``, but not in ``--out=~/x``, in environment variables in quotes, or in Python.
 """

@@ -11,7 +11,7 @@ import yaml
 from v3d_torch.io.text import replace_odd_spaces
 
 _MAX_LENGTH = 100_000
-"""Largest YAML text, characters: more than any valid file has, and few enough for a slow parser."""
+"""Maximum length of a YAML text, characters: longer than any valid file, and short enough for a slow parser."""
 
 
 _OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
@@ -19,7 +19,7 @@ _OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
 
 
 def plain_yaml(text: str) -> str:
-    """Remove what makes the files of OpenCV and ROS invalid for a parser of single YAML documents, and odd spaces.
+    """Convert a file of OpenCV or ROS to a single valid YAML document, and replace odd spaces.
 
     OpenCV's own parser is not robust against damaged files. ``rostopic echo`` ends each message with ``---``.
 
@@ -46,7 +46,7 @@ def parse_yaml(text: str) -> Any:
         The parsed value; None for an empty text.
 
     Raises:
-        ValueError: If the text is not such YAML; the message is a short cause, with the line number if known.
+        ValueError: If the text is not valid; the message is the cause, with the line number if known.
     """
     if len(text) > _MAX_LENGTH:
         raise ValueError(f"it has {len(text)} characters, more than {_MAX_LENGTH}")

@@ -35,7 +35,7 @@ _DAMAGE_ERRORS = (
     *(UnpicklingError, RuntimeError, EOFError, ValueError),
     *(LookupError, TypeError, AttributeError, MemoryError),
 )
-"""Exceptions that a damaged archive or damaged objects in it raise while loading."""
+"""Exceptions that a damaged archive, or damaged objects in it, can raise while loading."""
 
 
 def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from v3d_torch.errors import InputError
 
 _MAX_LENGTH = 100 << 20
-"""Largest text that is read, characters: more than an hour of poses at 200 Hz, and a bound for endless devices."""
+"""Maximum length of a text that is read, characters: more than an hour of poses at 200 Hz; it ends endless devices."""
 
 
 _ODD_SPACES = str.maketrans(

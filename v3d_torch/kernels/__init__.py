@@ -1,5 +1,5 @@
-"""Compiled loops over NumPy arrays, for functions of many small tensor operations.
+"""Kernels: compiled loops over NumPy arrays that replace functions of many small tensor operations.
 
-A kernel computes what a torch function of the package computes, its twin. The torch function defines the result: it is
-the readable form, it is batched, carries gradients, and runs if numba is not installed.
+Each kernel has a twin, a torch function of the package with the same result. The torch function is the definition: it
+is readable, batched and differentiable, and runs if numba is not installed.
 """

@@ -14,10 +14,11 @@ Points = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 _GATHER_BITS = np.uint64(0x01020408_10204080)
-"""Multiplies eight bytes of 0 or 1: their bits, the first as the lowest, are then in the highest byte."""
+"""Factor that packs eight bytes of 0 or 1: the highest byte of the product contains their bits, the first as the
+lowest."""
 
 ROUNDING = np.float32(64.5)
-"""Added to coordinates before they are truncated: half a pixel, and more than any coordinate of a test point."""
+"""Number added to coordinates before truncation: half a pixel, to round, and 64 pixels, to make them positive."""
 
 
 @device
@@ -46,7 +47,7 @@ def _direction(image: Image, x: int, y: int, half_widths: Ints) -> tuple[float, 
 
 @device
 def _rotate(points: Points, cosine: np.float32, sine: np.float32, stride: np.int32, offsets: NDArray[np.int32]) -> None:
-    """Offsets in memory of the nearest pixels to rotated points."""
+    """Write the memory offsets of the pixels nearest to rotated points."""
     for i in range(offsets.size):
         x, y = points[0, i], points[1, i]
         # Truncation rounds positive numbers down.

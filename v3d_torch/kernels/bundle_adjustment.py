@@ -17,7 +17,7 @@ def _compute_residuals(
     T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, influence: Array, pose: Index,
     first: Index, min_depth: float, r: Array, weights: Array, chi2: Array,
 ) -> float:  # fmt: skip
-    """Robust cost; writes the whitened residuals, their weights, and the squared errors."""
+    """Return the robust cost; write the whitened residuals, their weights, and the squared errors."""
     cost = 0.0
     for p in range(len(points)):
         for m in range(first[p], first[p + 1]):
@@ -38,7 +38,7 @@ def _linearise(
     T_cw: Array, points: Array, scale: Array, pose: Index, first: Index, row: Index, min_depth: float,
     r: Array, weights: Array, U: Array, V: Array, W: Array,
 ) -> None:  # fmt: skip
-    """Write the blocks of the normal equations, with the gradients as last columns of U and V; W only of free poses."""
+    """Write the blocks of the normal equations; the last columns of U and V are gradients, W is for free poses only."""
     U[:], V[:] = 0.0, 0.0
     J = np.empty((3, 10))  # derivatives of a residual by pose and by point, and the residual
     for p in range(len(points)):

@@ -15,7 +15,7 @@ Bounds = tuple[float, float, float, float, float, float]
 
 
 _MIN_RADIUS = 1e-9
-"""As in `v3d_torch.geometry.distortion`."""
+"""Minimum distance from the optical axis, the same as in `v3d_torch.geometry.distortion`."""
 
 
 @device
@@ -42,7 +42,7 @@ def distort(x: float, y: float, intrinsics: Intrinsics) -> tuple[float, float]:
 def project_to_image(
     x: float, y: float, z: float, min_depth: float, intrinsics: Intrinsics, bounds: Bounds
 ) -> tuple[bool, float, float]:
-    """Check whether a point in the camera frame, metres, lies in the image, and return its distorted pixel (u, v).
+    """Check whether a point (camera frame, metres) lies in the image, and return its distorted pixel (u, v).
 
     The pixel of a point outside the image is NaN.
     """

@@ -26,7 +26,7 @@ _R = TypeVar("_R")
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 ENABLED = os.environ.get("V3D_KERNELS") != "torch" and importlib.util.find_spec("numba") is not None
-"""False if numba is not installed or ``V3D_KERNELS=torch`` is set: the torch twins run."""
+"""True if kernels run; false if numba is not installed or ``V3D_KERNELS=torch`` is set, so that torch twins run."""
 
 
 class Twin(NamedTuple):
@@ -40,7 +40,7 @@ TWINS: dict[str, Twin] = {}
 """All functions with two implementations, by qualified name."""
 
 _TO_COMPILE: deque[tuple[Any, str]] = deque()
-"""Kernels that are neither loaded nor compiled yet, each with its signature."""
+"""Kernels that are not yet loaded or compiled, each with its signature."""
 
 _LOCK = Lock()
 
@@ -48,8 +48,8 @@ _LOCK = Lock()
 def kernel(signature: str) -> Callable[[_F], _F]:
     """Compile a function of arrays and numbers.
 
-    The code is kept in the user's cache. It releases the GIL while it runs. Floating-point operations are not
-    reordered, so that the results are the same on each call; division by 0 gives infinity, as in NumPy.
+    The compiled code is stored in the user's cache, and releases the GIL while it runs. Floating-point operations are
+    not reordered, so that the results are the same on each call; division by 0 gives infinity, as in NumPy.
 
     Args:
         signature: Types of the arguments in numba's notation, for example ``(f8[:,::1], i8)``.
@@ -74,7 +74,7 @@ def kernel(signature: str) -> Callable[[_F], _F]:
 
 
 def device(function: _F) -> _F:
-    """Compile a small function that is part of kernels, such as the projection of one point."""
+    """Compile a small function that kernels call, such as the projection of one point."""
     if not ENABLED:
         return function
     import numba
@@ -88,10 +88,10 @@ def compile_kernels(*, backwards: bool = False) -> Iterator[tuple[int, int]]:
     """Load all kernels of the imported modules from the cache, or compile those that are not in it.
 
     Args:
-        backwards: Begin with the last kernel. A second process that does so halves the time.
+        backwards: True to start with the last kernel. Two processes, one of them backwards, take half the time.
 
     Yields:
-        Number of kernels that had to be compiled, and that still have to be loaded or compiled, after each kernel.
+        After each kernel, the number of kernels compiled so far, and the number of kernels still to be loaded.
     """
     compiled = 0
     while True:
@@ -100,7 +100,7 @@ def compile_kernels(*, backwards: bool = False) -> Iterator[tuple[int, int]]:
                 return
             each, signature = _TO_COMPILE[-1 if backwards else 0]
             each.compile(signature)
-            each.disable_compile()  # arguments of other types are converted, or are an error
+            each.disable_compile()  # arguments of other types are converted or raise an error
             _TO_COMPILE.remove((each, signature))
         compiled += sum(each.stats.cache_misses.values())
         yield compiled, len(_TO_COMPILE)
@@ -143,8 +143,8 @@ def to_array(tensor: Tensor) -> NDArray[Any]:
 def can_read(tensor: Tensor) -> bool:
     """Check whether the values of a tensor can be read at once.
 
-    Those of another device would have to be waited for; those of meta tensors, and of tensors that `torch.func`
-    transforms or a compiler traces, do not exist.
+    Values on another device require waiting for the device. Meta tensors, and tensors that `torch.func` transforms or a
+    compiler traces, have no values.
     """
     return type(tensor) is Tensor and tensor.device.type == "cpu" and not _is_traced()
 
@@ -160,7 +160,7 @@ def _is_traced() -> bool:
 
 
 def _is_plain(argument: object) -> bool:
-    """Check whether an argument is no tensor, or one on the CPU without gradients."""
+    """Check whether an argument is not a tensor, or a tensor on the CPU without gradients."""
     if not isinstance(argument, Tensor):
         return True
     return type(argument) is Tensor and argument.device.type == "cpu" and not argument.requires_grad
@@ -170,13 +170,13 @@ def _is_plain(argument: object) -> bool:
 def _code_folder() -> Path:
     """Folder of the compiled code of this version of the kernels; only this user can write it.
 
-    numba recompiles a kernel when its own file changes, but not when a function of another file changes that it calls.
-    The folder's name therefore depends on all files.
+    numba recompiles a kernel when its file changes, but not when a called function in another file changes. The name of
+    the folder therefore depends on all files.
     """
     files = sorted(Path(__file__).parent.glob("*.py"))
     version = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    # Without a cache folder, as in a container with a read-only home, the system's temporary folder has to do.
+    # Without a cache folder, as in a container with a read-only home, use the system's temporary folder.
     temporary = Path(tempfile.gettempdir()) / f"v3d_torch-{getpass.getuser()}"
     for parent in (Path(chosen) if chosen else cache_dir() / "kernels", temporary / "kernels"):
         if _make_private(parent / version):
@@ -185,9 +185,9 @@ def _code_folder() -> Path:
 
 
 def _make_private(folder: Path) -> bool:
-    """Make a folder that only this user can write; False if it cannot be made or belongs to somebody else.
+    """Make a folder that only this user can write; return False if it cannot be made or belongs to another user.
 
-    Whoever can write compiled code into the folder can run it as this user.
+    Compiled code in the folder runs with the rights of this user, so nobody else may write it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -13,7 +13,7 @@ Points = NDArray[np.float32]
 
 @device
 def _is_maximum(strength: NDArray[np.uint8], row: int, column: int) -> bool:
-    """True if no neighbour is stronger; of equal neighbours the first one is the maximum."""
+    """Check for a local maximum; of equal neighbours, the first is the maximum."""
     centre = strength[row, column]
     for neighbour in strength[row - 1, column - 1 : column + 2]:
         if neighbour >= centre:
@@ -28,13 +28,13 @@ def _is_maximum(strength: NDArray[np.uint8], row: int, column: int) -> bool:
 def select_strong_corners(
     corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
 ) -> Ints:
-    """Select the local maxima that are strong, and weak ones in cells without a strong one.
+    """Select strong local maxima, and weak local maxima in cells without a strong corner.
 
     Args:
         corners: Corners (column, row), (N, 2).
         response: Strength of the corners, (N,).
-        is_inside: True for the pixels whose corners are selected, none of them at the border, (H, W).
-        threshold: Corners above it are strong.
+        is_inside: Mask of the pixels in which corners are selected, false at the image border, (H, W).
+        threshold: Corners with a larger response are strong.
         cell: Side of a cell, pixels.
 
     Returns:
@@ -64,7 +64,7 @@ def select_strong_corners(
 
 @device
 def _divide_fullest(sizes: Ints, gains: Ints, missing: int) -> NDArray[np.bool_]:
-    """Choose the cells to divide, those with the most corners first, until no more corners are missing."""
+    """Choose the cells to divide, those with the most corners first, until the wanted number is reached."""
     divided, gained = np.zeros(len(sizes), np.bool_), 0
     largest = sizes.max()
     for cell in argsort(largest - sizes, largest):

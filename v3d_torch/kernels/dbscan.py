@@ -1,8 +1,8 @@
 """Kernel of DBSCAN; see `v3d_torch.objects.dbscan`.
 
 The points are grouped by cells of a grid whose diagonal is the radius (Gunawan, Eindhoven University of Technology
-2013): the points of a cell are neighbours of each other, so that its core points share a cluster. Most distances are
-not computed: a cell with enough points has core points only, and two cells are compared until one pair connects them.
+2013): all points of a cell are neighbours, so that its core points belong to one cluster. Most distances are not
+computed: a cell with enough points has only core points, and two cells are compared until one pair connects them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def _root(parents: Ints, cell: int) -> int:
 
 @device
 def _neighbouring_cells(keys: Ints, side_y: int, side_z: int) -> Ints:
-    """Pairs, shape (K, 2), of the occupied cells at most two cells apart along each axis, the lower one first."""
+    """Pairs of occupied cells at most two cells apart along each axis, shape (K, 2), the lower index first."""
     pairs, count = np.empty((16 * len(keys), 2), np.int64), 0
     for x in range(3):
         for y in range(-2 if x else 0, 3):
@@ -60,7 +60,7 @@ def _neighbouring_cells(keys: Ints, side_y: int, side_z: int) -> Ints:
 
 @device
 def _find_core_points(points: Points, begins: Ints, pairs: Ints, squared_radius: float, min_samples: int) -> Mask:
-    """Core points, shape (N,). Neighbours of a point are counted only until it is a core point."""
+    """Mask of the core points, shape (N,). Neighbours of a point are counted until it is known to be a core point."""
     sizes = begins[1:] - begins[:-1]
     neighbours = np.repeat(sizes, sizes)
     for a, b in pairs:
@@ -98,7 +98,7 @@ def dbscan(points: Points, eps: float, min_samples: int) -> Ints:
     Args:
         points: Points, metres, (N, 3); their bounding box has less than `MAX_CELLS` cells along each axis.
         eps: Radius of a neighbourhood, metres.
-        min_samples: Number of points in a neighbourhood that makes its centre a core point.
+        min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
     """
     count, side, squared = len(points), eps / math.sqrt(3) * (1 - _MARGIN), eps * eps
     labels = np.full(count, -1)
@@ -125,7 +125,7 @@ def dbscan(points: Points, eps: float, min_samples: int) -> Ints:
     pairs = _neighbouring_cells(keys[begins[:-1]], sides[1], sides[2])
     core = _find_core_points(points, begins, pairs, squared, min_samples)
     parents = _join_cells(points, begins, pairs, squared, core)
-    clusters, next_cluster = np.full(len(parents), count), 0  # as yet without a number
+    clusters, next_cluster = np.full(len(parents), count), 0  # not numbered yet
     for k in position:  # clusters are numbered by their lowest core point
         if core[k]:
             root = _root(parents, cells[k])

@@ -17,7 +17,7 @@ def _accumulate(
 ) -> None:  # fmt: skip
     """Add the weighted depth differences of one neighbour of each pixel of a row; all arrays have shape (W,).
 
-    The compiler vectorises loops over few arrays only, so there is one for each result.
+    The compiler vectorises only loops over few arrays, so there is one loop for each result.
     """
     for x in range(len(z)):
         step = z_neighbour[x] - z[x]
@@ -37,8 +37,8 @@ def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: n
         depth: Depth, metres, (H, W); 0 = no measurement.
         taps: Weights of the Gaussian from the centre outwards, (R + 1,).
         edge_ratio: Largest accepted difference from the centre's depth, as a fraction of the centre's depth.
-        max_depth: Depth beyond this counts as missing, metres.
-        smoothed: Result: smoothed depth, metres, (H, W); 0 for pixels without measurement.
+        max_depth: Depth above this counts as missing, metres.
+        smoothed: Smoothed depth, metres, (H, W), written; 0 for pixels without measurement.
     """
     height, width = depth.shape
     radius, size = len(taps) - 1, 2 * len(taps) - 1

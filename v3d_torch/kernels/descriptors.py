@@ -58,7 +58,7 @@ def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) ->
         best, second, nearest = MAX_DISTANCE, MAX_DISTANCE, -1
         for j in range(len(b)):
             distance = hamming_distance(a, i, b, j)
-            if distance < second:  # most are not
+            if distance < second:  # rarely true
                 if distance < best:
                     best, second, nearest = distance, best, j
                 else:

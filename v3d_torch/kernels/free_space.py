@@ -22,7 +22,7 @@ def _is_free(
     x: float, y: float, z: float, T_cw: Array, nearest_depth: Depth, intrinsics: Intrinsics, bounds: Bounds,
     limits: Limits,
 ) -> float:  # fmt: skip
-    """1 if a point of the world lies in free space, 0 if it lies on a surface, NaN if that is unknown."""
+    """Return 1 if a point (world frame) lies in free space, 0 if it lies on a surface, NaN if this is unknown."""
     min_depth, _, relative_tolerance, min_tolerance = limits
     x, y, z = transform(T_cw, x, y, z)
     inside, u, v = project_to_image(x, y, z, min_depth, intrinsics, bounds)
@@ -79,7 +79,7 @@ def newly_occupied(
         intrinsics: Intrinsics of the camera.
         bounds: Extent of the image.
         limits: Range of depths and tolerances.
-        appeared: 1 for free space, 0 for a surface, NaN if unknown; written, (h, w).
+        appeared: 1 for free space, 0 for a surface, NaN if unknown, (h, w); written.
     """
     min_depth, max_depth, _, _ = limits
     height, width = appeared.shape

@@ -16,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 @device
 def _select_largest(labels: Ints) -> Mask:
-    """Points of the largest cluster, shape (N,); of two of the same size, the one with the lower label."""
+    """Mask of the points of the largest cluster, shape (N,); of equal clusters, the one with the lower label."""
     sizes = np.zeros(len(labels) + 1, np.int64)
     for label in labels:
         sizes[label] += label >= 0
@@ -34,12 +34,12 @@ def instance_cloud(
         depth: Depth, metres, (H, W); 0 = no measurement.
         mask: Pixels of the instance, (H, W).
         rays: Ray of every n-th pixel, in row-major order, (R, 3).
-        step: Distance of two pixels with a ray, pixels.
+        step: Step n between the pixels.
         max_depth: Largest depth of a point, metres.
         voxel_size: Side of a voxel, metres.
         eps: Radius of DBSCAN, metres.
-        min_samples: Number of points in a neighbourhood that makes its centre a core point.
-        cloud_pixels: Result: pixels of the mask whose point belongs to the largest cluster, (H, W); False before.
+        min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
+        cloud_pixels: Pixels of the mask whose point belongs to the largest cluster, (H, W), written; false before.
 
     Returns:
         Mean point of each voxel, metres, (M, 3), and mask of the voxels in the largest cluster, (M,).

@@ -69,15 +69,15 @@ def _intersect(a: Mask, b: Mask, both: Mask) -> None:
 def fill_components(
     components: NDArray[np.int32], count: int, seeds: Mask, reachable: Mask, step: int, min_fraction: float
 ) -> Mask:
-    """Select the reachable pixels of the components that mostly consist of seeds, and of their neighbour cells.
+    """Select the reachable pixels of the components with enough seeds, and of their neighbour cells.
 
     Args:
-        components: Number of the component of each cell, (h, w); 0 for cells of none.
-        count: Number of components, with 0.
+        components: Index of the component of each cell, (h, w); 0 for cells without a component.
+        count: Number of components, including component 0.
         seeds: Seed cells, (h, w).
         reachable: Reachable pixels, (H, W).
         step: Side of a cell, pixels.
-        min_fraction: Minimum fraction of a component that are seeds.
+        min_fraction: Minimum fraction of seeds in a component.
 
     Returns:
         Selected pixels, (H, W).

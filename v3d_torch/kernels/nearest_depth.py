@@ -10,7 +10,7 @@ from v3d_torch.kernels.compiler import device, kernel
 Depth = NDArray[np.float32]
 
 _MAX = np.finfo(np.float32).max
-"""Depth of a pixel without measurement: farther than any other."""
+"""Depth of pixels without measurement: larger than any measured depth."""
 
 
 @device
@@ -28,7 +28,7 @@ def _min(a: Depth, b: Depth, minimum: Depth) -> None:
 
 @device
 def _lower(a: Depth, minimum: Depth) -> None:
-    """Update a minimum in place: loops over overlapping arrays of different names do not use vector instructions."""
+    """Update a minimum in place; in one loop with `_min`, arrays could overlap and would not be vectorised."""
     for x in range(minimum.size):
         minimum[x] = a[x] if a[x] < minimum[x] else minimum[x]
 
@@ -41,11 +41,11 @@ def _write(a: Depth, b: Depth, depth: Depth, nearest: Depth) -> None:
 
 @kernel("(f4[:,::1], i8)")
 def nearest_depth(depth: Depth, radius: int) -> Depth:
-    """Minimum depth in a square around each pixel, by the algorithm of van Herk along columns.
+    """Minimum depth in a square around each pixel (van Herk's algorithm along columns).
 
     Args:
         depth: Depth, metres, (H, W); 0 = no measurement.
-        radius: Half the side of the square without its centre, pixels.
+        radius: Radius of the square, pixels: its side is 2 radius + 1.
 
     Returns:
         Depth, metres, (H, W); 0 for a pixel without measurement.

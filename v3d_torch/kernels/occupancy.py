@@ -20,10 +20,10 @@ VOLUME = SIDE**3
 """Voxels in a block."""
 
 FREE, HIT = 1, 2
-"""Observation of a voxel in one view; 0 is none."""
+"""Observations of a voxel in one view; 0 if it was not observed."""
 
 UNKNOWN = -128
-"""Log-odds of a voxel that was never observed, which no other voxel has."""
+"""Log-odds of voxels that were never observed, different from those of all other voxels."""
 
 Depth = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -45,7 +45,7 @@ def _nearest_depth(depth: Depth, row: int, column: int) -> float:
 
 @device
 def _enter(origin: float, direction: float) -> tuple[int, int, float, float]:
-    """First voxel of a ray along one axis, step to the next, depth at which the ray leaves the voxel, and per step."""
+    """Traversal of a ray along one axis: first voxel, step, depth at which the ray leaves the voxel, depth per step."""
     voxel = math.floor(origin)
     if direction > 0:
         return voxel, 1, (voxel + 1 - origin) / direction, 1 / direction
@@ -62,7 +62,7 @@ def _local_index(x: int, y: int, z: int) -> int:
 
 @device
 def _block_row(x: int, y: int, z: int, first: Ints, table: Table, blocks: Ints, count: int) -> tuple[int, int]:
-    """Row of the block with a voxel, which becomes row ``count`` if it has none; the number of rows."""
+    """Row of the block that contains a voxel, and number of rows; a new block gets the row ``count``."""
     x, y, z = x >> BITS, y >> BITS, z >> BITS
     i, j, k = x - first[0], y - first[1], z - first[2]
     row = table[i, j, k]
@@ -97,7 +97,7 @@ def _cast_ray(
         else:
             row = row if z >> BITS == (z + step_z) >> BITS else -1
             z, exit_z = z + step_z, exit_z + depth_z
-    if hit_depth > 0:  # else the surface is not static or too far
+    if hit_depth > 0:  # otherwise the surface is not static or too far away
         x = math.floor(origin[0] + direction[0] * hit_depth)
         y = math.floor(origin[1] + direction[1] * hit_depth)
         z = math.floor(origin[2] + direction[2] * hit_depth)
@@ -121,7 +121,7 @@ def observe_voxels(
         voxel_size: Side of a voxel, metres.
         max_depth: Depth beyond which nothing is observed, metres.
         tolerance: Depth error divided by the squared depth, 1/m.
-        reach: Bound of the distance between the blocks of the camera and of any sample, blocks.
+        reach: Upper bound of the distance between the block of the camera and the block of any sample, blocks.
 
     Returns:
         Coordinates of the blocks with observed voxels, (B, 3), in order of their first observation; observation of each
@@ -162,8 +162,8 @@ def add_observations(
         log_odds: Log-odds of all blocks, steps, (N, 4096); changed in place.
         slots: Row of each observed block, (B,).
         marks: Observations, (B, 4096).
-        hit: Added to a voxel that was hit, steps.
-        miss: Added to a voxel that was observed as free, steps.
+        hit: Log-odds added to a voxel that was hit, steps.
+        miss: Log-odds added to a voxel that was observed as free, steps.
         minimum: Smallest log-odds, steps.
         maximum: Largest log-odds, steps.
     """

@@ -24,7 +24,7 @@ def _linearise(
     T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, influence: Array, active: Mask,
     min_depth: float, H: Array, g: Array, chi2: Array,
 ) -> float:  # fmt: skip
-    """Robust cost of the active measurements; writes the normal equations and the squared errors of all."""
+    """Return the robust cost of the active measurements; write the normal equations and all squared errors."""
     H[:], g[:] = 0.0, 0.0
     J, cost = np.empty((3, 6)), 0.0
     for i in range(len(points)):
@@ -76,7 +76,7 @@ def refine_pose(
         damping_schedule: First, smallest and largest damping, and the factor between two steps.
 
     Returns:
-        Pose (4, 4), inliers (N,), measurements that took part in the last round (N,), squared residuals (N,),
+        Pose (4, 4), inliers (N,), mask of the measurements used in the last round (N,), squared residuals (N,),
         information matrix (6, 6).
     """
     first_damping, min_damping, max_damping, factor = damping_schedule

@@ -10,12 +10,12 @@ from v3d_torch.kernels.compiler import device
 Ints = NDArray[np.int64]
 
 _DIGIT = 11
-"""Bits of a digit: the counts of all digits stay in the processor's first cache."""
+"""Number of bits of a digit: the counts of all values of a digit fit into the processor's first-level cache."""
 
 
 @device
 def argsort(keys: Ints, bound: int) -> Ints:
-    """Order, shape (N,), in which the keys, from 0 to ``bound``, ascend; equal keys keep their order."""
+    """Return the indices that sort keys in [0, ``bound``], shape (N,); the order of equal keys is kept."""
     order, spare = np.arange(len(keys)), np.empty(len(keys), np.int64)
     begins, shift = np.empty(1 << _DIGIT, np.int64), 0
     while bound >> shift:

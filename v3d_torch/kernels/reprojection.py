@@ -58,7 +58,7 @@ def se3_exp(xi: Array) -> Array:
 
 @device
 def multiply(A: Array, B: Array) -> Array:
-    """Product of two matrices; for small ones a loop is faster than a call of BLAS."""
+    """Product of two matrices; for small matrices a loop is faster than BLAS."""
     C = np.zeros((A.shape[0], B.shape[1]))
     for i in range(A.shape[0]):
         for k in range(A.shape[1]):
@@ -77,7 +77,7 @@ def solve_symmetric(A: Array, b: Array) -> Array:
             total = A[i, j]
             for k in range(j):
                 total -= L[i, k] * L[j, k] * L[k, k]
-            L[i, j] = total if i == j else total / L[j, j]  # the diagonal of L holds D
+            L[i, j] = total if i == j else total / L[j, j]  # the diagonal of L stores D
         for k in range(j):
             x[j] -= L[j, k] * x[k]
     for j in range(n - 1, -1, -1):

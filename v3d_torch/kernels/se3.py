@@ -14,7 +14,7 @@ from v3d_torch.kernels.reprojection import SMALL_ANGLE
 Array = NDArray[np.float64]
 
 _MAX_NEWTON_STEPS = 8
-"""Rotations with rounding errors need two steps; a matrix that is far from any rotation is left to the twin."""
+"""Maximum number of steps: rotations with rounding errors need two; other matrices are computed by the twin."""
 
 _NEWTON_TOLERANCE = 1e-8
 """Change of the elements in the last step. Newton's method squares the error in each step."""
@@ -33,7 +33,7 @@ def invert(T: Array) -> Array:
 
 @kernel("(f8[:,::1],)")
 def orthonormalise(T: Array) -> tuple[bool, Array]:
-    """Replace the rotation of a rigid motion, (4, 4), by the nearest one: Newton's method for the polar decomposition.
+    """Replace the rotation of a rigid motion, (4, 4), by the nearest rotation: polar decomposition by Newton's method.
 
     N. Higham, Computing the polar decomposition with applications, SIAM J. Sci. Stat. Comput., 1986.
 

@@ -24,7 +24,7 @@ def project_to_cells(
 
     Args:
         points: Points, camera frame, metres, (P, 3), in any memory order.
-        min_depth: Depth up to which points are not projected, metres.
+        min_depth: Points with at most this depth are not projected, metres.
         cell: Side of the cells, pixels.
         intrinsics: Intrinsics of the camera.
         bounds: Extent of the image.
@@ -92,7 +92,7 @@ def select_pixels(
         box: First and last row (exclusive), first and last column (exclusive) of the box.
         grid: Row and column of the first cell, side of the cells in pixels, step n.
         tolerance: Tolerance of the depth, metres.
-        no_depth: Pixels without depth are selected if the lower limit is below this, metres; 0 to select none of them.
+        no_depth: Pixels without depth are selected if the lower limit is below this depth, metres; 0 to select none.
         mask: Selected pixels, (h, w); written in the box.
     """
     begin, end, left, right = box

@@ -37,7 +37,7 @@ def compensate_depth_delay(
         depth_image: Depth image, metres, (H, W); 0 = no measurement.
         velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
         delay: Depth stamp minus colour stamp, seconds.
-        max_depth: Depth beyond this counts as missing, metres.
+        max_depth: Depth above this counts as missing, metres.
         intrinsics: ``fx, fy, cx, cy``.
     """
     height, width = depth_image.shape
@@ -62,10 +62,10 @@ def compensate_rolling_shutter(
     Args:
         uv: Undistorted pixels, compensated with ``readout_jacobian``, (N, 2).
         row: Row in the recorded image, (N,).
-        inverse_depth: 1/m, (N,); 0 = no measurement.
+        inverse_depth: Inverse depth, 1/m, (N,); 0 = no measurement.
         velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
         K: Camera matrix, (3, 3).
-        readout_jacobian: Earlier derivative of ``uv`` by the readout, pixels per second, (N, 2).
+        readout_jacobian: Readout Jacobian with which ``uv`` was compensated, pixels per second, (N, 2); it is replaced.
         readout: Time from the first to the last row, seconds.
         rows: Number of rows of the image.
     """
@@ -75,7 +75,7 @@ def compensate_rolling_shutter(
         u = uv[i, 0] - readout * readout_jacobian[i, 0]
         v = uv[i, 1] - readout * readout_jacobian[i, 1]
         du, dv, _ = _motion_field(u, v, inverse_depth[i], velocity, intrinsics)
-        time = row[i] / (rows - 1) - 0.5  # of the row, from -0.5 to 0.5 readouts
+        time = row[i] / (rows - 1) - 0.5  # time of the row, from -0.5 to 0.5 readouts
         new_jacobian[i, 0], new_jacobian[i, 1] = -time * du, -time * dv
         new_uv[i, 0], new_uv[i, 1] = u + readout * new_jacobian[i, 0], v + readout * new_jacobian[i, 1]
     return new_uv, new_jacobian

@@ -27,7 +27,7 @@ def whiten(
     scale, offset = np.empty((3, len(uv))), np.empty((3, len(uv)))
     for i in range(len(uv)):
         w, sigma = inverse_depth[i], pixel_sigma[i]
-        # Dividing a number by a tensor, torch multiplies it by the reciprocal.
+        # Multiply by the reciprocal, as torch does when it divides a number by a tensor.
         scale[0, i], scale[1, i] = fx * (1 / sigma), fy * (1 / sigma)
         scale[2, i] = (1.0 if w > 0 else 0.0) / inverse_depth_sigma
         offset[0, i], offset[1, i] = (cx - uv[i, 0]) / sigma, (cy - uv[i, 1]) / sigma

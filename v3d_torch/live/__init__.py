@@ -1,4 +1,4 @@
-"""Live processing: capture, preprocessing and tracking beside each other, always on the newest frame."""
+"""Live processing: capture, preprocessing and tracking in parallel, each on the newest frame."""
 
 from __future__ import annotations
 

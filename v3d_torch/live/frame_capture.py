@@ -1,4 +1,4 @@
-"""Capture of frames in a thread, which hands on the newest one."""
+"""Capture of frames in a thread that provides the newest frame."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from v3d_torch.types import RGBDFrame
 _LOG = logging.getLogger(__name__)
 
 _MAX_REJECTED = 150
-"""Number of consecutive frames out of order after which the clock of the source counts as set back: 5 s at 30 Hz."""
+"""Number of consecutive frames out of order after which the clock of the source was set back: 5 s at 30 Hz."""
 
 _JOIN_TIMEOUT = 2.0
-"""Longest wait for the end of the thread, seconds. A source that blocks for longer ends with the process."""
+"""Maximum wait for the end of the thread, seconds. A source that blocks for longer ends with the process."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class CapturedFrame:
 
     Attributes:
         frame: Frame.
-        number: Number of frames of the source so far, this one and those that it passed over included.
+        number: Number of frames of the source so far, including this one and those that it skipped.
         captured_at: Time of capture in the clock of the computer, seconds.
     """
 
@@ -44,7 +44,7 @@ class FrameCapture:
 
     Args:
         source: Frames at their own rate.
-        check: Raises an error for a frame that is not valid, which ends the capture.
+        check: Function that raises an error for a frame that is not valid; the error ends the capture.
         clock: Clock of the computer.
 
     Attributes:
@@ -95,7 +95,7 @@ class FrameCapture:
             self.frames.close()
 
     def _is_in_order(self, frame: RGBDFrame) -> bool:
-        """Check whether a frame is later than all before; the first one of several that are not is logged."""
+        """Check whether a frame is later than all before; the first frame of several out of order is logged."""
         if frame.stamp > self._newest_stamp:
             self._newest_stamp, self._rejected_in_a_row = frame.stamp, 0
             return True

@@ -1,4 +1,4 @@
-"""Queue between two threads that holds the newest item only."""
+"""Queue between two threads that contains only the newest item."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ _T = TypeVar("_T")
 
 
 class LatestQueue(Generic[_T]):
-    """Queue of length one: a new item replaces one that was not taken yet.
+    """Queue of length one: a new item replaces an item that was not taken yet.
 
-    One thread puts items and closes the queue, another one takes them. However slow it is, no more than one item waits.
+    One thread puts items and closes the queue, another thread takes them. At most one item waits.
     """
 
     def __init__(self) -> None:
@@ -21,7 +21,7 @@ class LatestQueue(Generic[_T]):
         self._error: BaseException | None = None
 
     def put(self, item: _T) -> None:
-        """Put an item in place of the one that waits, if any. A closed queue ignores it."""
+        """Put an item, and discard an item that waits. A closed queue ignores the item."""
         with self._changed:
             if not self._is_closed:
                 self._item = item
@@ -34,7 +34,7 @@ class LatestQueue(Generic[_T]):
             The newest item; None if the queue is closed and empty.
 
         Raises:
-            BaseException: The error with which the queue was closed, once its last item was taken.
+            BaseException: The error with which the queue was closed, after its last item was taken.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._item is not None or self._is_closed)
@@ -47,7 +47,7 @@ class LatestQueue(Generic[_T]):
         """Accept no more items. Only the first call has an effect.
 
         Args:
-            error: Error that `take` raises after the last item; None if it returns None then.
+            error: Error that `take` raises after the last item; None if `take` returns None.
         """
         with self._changed:
             if not self._is_closed:

@@ -1,4 +1,4 @@
-"""Preprocessing of the newest frame while the one before is tracked."""
+"""Preprocessing of the newest frame while an earlier frame is tracked."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LiveFrame:
     Attributes:
         captured: Frame with the time of its capture.
         preprocessed: Frame for `V3DSLAM.track`.
-        is_segmented: True if the network sees the frame.
+        is_segmented: True if the network segments the frame.
     """
 
     captured: CapturedFrame
@@ -31,13 +31,13 @@ class LiveFrame:
 
 
 class LivePreprocessor:
-    """Two threads that preprocess one frame at a time: one extracts features, the other one segments.
+    """Two threads that preprocess one frame at a time: one extracts features, the other segments.
 
-    As soon as the features of a frame are complete, it replaces an earlier frame whose tracking has not begun, and is
-    ready for tracking, which waits for the segmentation where it needs it.
+    As soon as the features of a frame are complete, the frame is ready for tracking, and replaces an earlier frame
+    whose tracking has not begun. Tracking waits for the segmentation when it needs the instances.
 
-    The network sees a frame if it is at least the ``segmentation.interval``-th after the last tracked one that it saw.
-    While frames are left out, it sees at most every second frame, which gives time to catch up.
+    A frame is segmented if it is at least the ``segmentation.interval``-th after the last tracked frame that was
+    segmented. While frames are dropped, at most every second frame is segmented, so that tracking can catch up.
 
     Args:
         captured: Queue of captured frames.
@@ -63,17 +63,17 @@ class LivePreprocessor:
         self._thread.start()
 
     def begin_tracking(self, live: LiveFrame) -> None:
-        """Note that the tracking of a frame begins."""
+        """Record that the tracking of a frame begins."""
         if live.is_segmented:
             self._last_segmented = live.captured.number
         self._last_tracked = live.captured.number
 
     def end_tracking(self) -> None:
-        """Take the newest prediction of the pose, after the tracking of a frame."""
+        """Store the newest pose prediction, after the tracking of a frame."""
         self._prediction = self._slam.advance_predictions()
 
     def close(self) -> None:
-        """Stop the threads after the frame that they work on; the queue of captured frames is closed before."""
+        """Stop the threads after their current frame. Close the queue of captured frames first."""
         self.frames.close()
         self._thread.join()
         self._segmenter.shutdown()

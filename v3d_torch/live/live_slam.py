@@ -1,4 +1,4 @@
-"""SLAM on a live camera: capture, preprocessing and tracking beside each other, always on the newest frame."""
+"""SLAM on a live camera: capture, preprocessing and tracking in parallel, each on the newest frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame
 
 _TRIM_INTERVAL = 200
-"""Frames between two calls of `trim_memory`, which takes some milliseconds."""
+"""Number of frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,10 +28,10 @@ class LiveResult(FrameResult):
 
     Attributes:
         frame: Frame.
-        captured_at: Time of capture in the clock of the computer (`time.monotonic`), seconds; that of the camera is
-            ``stamp``.
-        finished_at: Time of this result in the same clock, seconds.
-        dropped: Number of frames that were left out since the previous result.
+        captured_at: Time of capture in the clock of the computer (`time.monotonic`), seconds; ``stamp`` is the time in
+            the clock of the camera.
+        finished_at: Time of this result in the clock of the computer, seconds.
+        dropped: Number of frames that were dropped since the previous result.
     """
 
     frame: RGBDFrame
@@ -46,10 +46,10 @@ class LiveResult(FrameResult):
 
 
 class LiveSLAM:
-    """Runs a camera through a system: capture, preprocessing and tracking work beside each other.
+    """Runs `V3DSLAM` on a live camera: capture, preprocessing and tracking run in parallel.
 
-    Each stage takes the newest frame that is ready, and nothing else waits. If tracking is slower than the camera,
-    frames are left out and counted. Iterate over the results, or call the object with a callback; both end with the
+    Each stage takes the newest frame that is ready, and no other frame waits. If tracking is slower than the camera,
+    frames are dropped and counted. Iterate over the results, or call the object with a callback; both end with the
     source.
 
     Args:
@@ -59,10 +59,10 @@ class LiveSLAM:
         clock: Clock of the computer.
 
     Attributes:
-        dropped: Number of frames that were left out so far.
+        dropped: Number of frames that were dropped so far.
 
     Raises:
-        ConfigError: If the configuration allows no threads (``prefetch=false``).
+        ConfigError: If the configuration does not allow threads (``prefetch=false``).
     """
 
     def __init__(self, source: Iterable[RGBDFrame], slam: V3DSLAM, clock: Clock = MONOTONIC_CLOCK) -> None:
@@ -76,7 +76,7 @@ class LiveSLAM:
 
     @property
     def rejected(self) -> int:
-        """Number of frames so far that were not later than all before them: late, doubled or out of order."""
+        """Number of frames so far that were not later than all frames before: late, duplicate or out of order."""
         return 0 if self._capture is None else self._capture.rejected
 
     def __iter__(self) -> Generator[LiveResult, None, None]:
@@ -84,7 +84,7 @@ class LiveSLAM:
 
         Raises:
             InputError: If the source ends with an error, or a frame is not valid.
-            ConfigError: If the segmenter returned something else than instances.
+            ConfigError: If the segmenter did not return valid `Instances`.
         """
         _warm_up(self.slam)
         self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
@@ -115,7 +115,7 @@ class LiveSLAM:
         """Run until the source ends, and call back with each result.
 
         Args:
-            on_result: Called in this thread. If it takes long, frames are left out.
+            on_result: Called in this thread. If it takes long, frames are dropped.
 
         Raises:
             InputError: As for iteration.
@@ -125,14 +125,14 @@ class LiveSLAM:
             on_result(result)
 
     def pose_at(self, stamp: float) -> CameraState:
-        """Return the camera at a time, see `V3DSLAM.pose_at`; from any thread."""
+        """Return the state of the camera at a time, see `V3DSLAM.pose_at`; can be called from any thread."""
         return self.slam.pose_at(stamp)
 
 
 def _warm_up(slam: V3DSLAM) -> None:
     """Call the stages without state on an empty image.
 
-    Libraries build tables at their first call, for a third of a second, in which ten frames would be left out.
+    Libraries build tables at their first call, for a third of a second, in which ten frames would be dropped.
     """
     size = slam.camera.height, slam.camera.width
     frame = RGBDFrame(0, 0.0, torch.zeros(3, *size, dtype=torch.uint8), torch.ones(1, *size))

@@ -29,8 +29,8 @@ from v3d_torch.runtime.batches import from_rows, to_rows
 _Array = NDArray[Any]
 
 SortedProblem = tuple[_Array, _Array, _Array, _Array, _Array, _Array, _Array]
-"""Scale, offset, chi-square threshold, weight and pose of the observations sorted by point; first observation of each
-point; free poses."""
+"""Arguments of the kernels: scale, offset, chi-square threshold, weight and pose of the observations sorted by point;
+first observation of each point; free poses."""
 
 
 class BundleAdjustment(NamedTuple):
@@ -82,29 +82,30 @@ def bundle_adjust(
     with Huber's kernel :math:`\rho`. The landmarks are eliminated; memory grows with P times L.
 
     The result is differentiable in all inputs except the initial poses and points, by the implicit function theorem:
-    memory does not grow with the iterations. The Hessian is that of the robust cost, with the dependence of the robust
-    weights on the residuals. Fixed poses are differentiable. The derivatives are as accurate as the optimum: train
-    with a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
+    memory does not grow with the iterations. The Hessian is that of the robust cost, including the dependence of the
+    robust weights on the residuals. The result is also differentiable in fixed poses. The derivatives are as accurate
+    as the optimum: train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not correct.
 
     Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000; Gould et al., On Differentiating Parameterized Argmin
     and Argmax Problems, 2016.
 
     Args:
         T_cw: Initial world-to-camera poses, shape :math:`(*, P, 4, 4)`. All inputs are floating point except indices
-            and masks, and computed with in float64.
+            and masks, and converted to float64.
         points: Initial positions of the landmarks, world frame, metres, shape :math:`(*, L, 3)`. Poses and landmarks
             that are padding have no observations; they must be finite, and are returned unchanged.
         uv: Observed pixels, undistorted, shape :math:`(*, M, 2)`.
-        pose: Index of the pose that made each observation, int64, shape :math:`(*, M)`.
+        pose: Index of the pose from which each observation was made, int64, shape :math:`(*, M)`.
         point: Index of the observed landmark, int64, shape :math:`(*, M)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured, as it is by default.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured. None if no depth was
+            measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
-        fixed: Poses that stay unchanged, bool, shape :math:`(*, P)`; only the first by default. Without a fixed pose
-            the world frame can drift.
-        weights: Weight of each observation, not negative, shape :math:`(*, M)`; 1 by default.
-        valid: Observations that are not padding, bool, shape :math:`(*, M)`; all by default.
+        fixed: Mask of the poses that stay unchanged, bool, shape :math:`(*, P)`; None for only the first. Without a
+            fixed pose the world frame can drift.
+        weights: Weight of each observation, not negative, shape :math:`(*, M)`; None for 1.
+        valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all.
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
 
@@ -135,7 +136,7 @@ def bundle_adjust(
 
 
 class _Minimum(NamedTuple):
-    """State of minimal cost, as in `BundleAdjustment`; infinite ``chi2`` for padding is still missing."""
+    """Solution of a bundle adjustment, as in `BundleAdjustment`, but with finite ``chi2`` for padding."""
 
     T_cw: Tensor
     points: Tensor
@@ -155,13 +156,13 @@ def sort_by_point(
     fixed: Tensor,
     points: int,
 ) -> Iterator[tuple[NDArray[np.int64], SortedProblem]]:
-    """Yield, for each problem of a batch, the order that sorts observations by point, and arguments of the kernels."""
+    """Sort the observations of each problem of a batch by point; yield their order and the arguments of the kernels."""
     batch = fixed.shape[:-1]
     columns = scale, offset, thresholds, weights, pose, point, fixed
     for row in zip(*(to_rows(each, batch) for each in columns), strict=True):
         order = np.argsort(row[5], kind="stable")
         of_points = np.searchsorted(row[5][order], np.arange(points + 1))
-        # Observations are the last dimension.
+        # The last dimension is that of the observations.
         yield order, (*(each.take(order, axis=-1) for each in row[:5]), of_points, np.flatnonzero(~row[6]))
 
 
@@ -214,7 +215,7 @@ def _minimise(
 
 
 class BundleAdjuster(torch.nn.Module):
-    """:func:`bundle_adjust` as a module. A standard deviation that is a `torch.nn.Parameter` can be learnt.
+    """:func:`bundle_adjust` as a module. Standard deviations that are a `torch.nn.Parameter` can be learned.
 
     Args:
         pixel_sigma: Standard deviation of u and of v, pixels.

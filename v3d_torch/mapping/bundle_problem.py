@@ -1,7 +1,7 @@
 """Least-squares problem of a bundle adjustment: residuals, normal equations, steps, derivatives of the optimum.
 
-All observations are the last dimension. An observation depends on nine unknowns, the left perturbation of its pose and
-the shift of its point, so that it adds a 9x9 block to the normal equations.
+The last dimension of all tensors is that of the observations. An observation depends on nine unknowns, the left
+perturbation of its pose and the shift of its point, and adds a 9x9 block to the normal equations.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class BundleResiduals(NamedTuple):
 
     Attributes:
         in_camera: Observed points, camera frame, metres, shape :math:`(..., 3, M)`.
-        projected: The observed points as `perspective` projects them, shape :math:`(..., 3, M)`.
+        projected: Observed points projected by `perspective`, shape :math:`(..., 3, M)`.
         R_cw: World-to-camera rotations, shape :math:`(..., 3, 3, M)`.
         whitened: Residuals divided by their standard deviations, shape :math:`(..., 3, M)`.
-        weights: Weights in the normal equations: given ones times those of the Huber kernel, shape :math:`(..., M)`.
+        weights: Weights in the normal equations: given weight times weight of Huber's kernel, shape :math:`(..., M)`.
     """
 
     in_camera: Tensor
@@ -61,7 +61,7 @@ class BundleProblem(NamedTuple):
         weights: Weight of each observation, 0 for padding, shape :math:`(..., M)`.
         pose: Index of the pose of each observation, int64, shape :math:`(..., M)`.
         point: Index of the point of each observation, int64, shape :math:`(..., M)`.
-        fixed: True for poses that stay unchanged, bool, shape :math:`(..., P)`.
+        fixed: Mask of the poses that stay unchanged, bool, shape :math:`(..., P)`.
     """
 
     scale: Tensor
@@ -92,16 +92,16 @@ class BundleProblem(NamedTuple):
         return self._assemble(blocks, (weighted * residuals.whitened[..., None, :, :]).sum(dim=-2), points)
 
     def remaining(self, residuals: BundleResiduals, derivative: Tensor, points: int) -> Tensor:
-        r"""Part of a change of the residuals that no change of the ``points`` points and of the poses explains.
+        r"""Part of a change of the residuals that no change of poses and points explains.
 
-        With the Jacobian :math:`J` by poses and points, a change :math:`j` of the residuals leaves
+        With the Jacobian :math:`J` by poses and points, the remaining part of a change :math:`j` of the residuals is
         :math:`j - J (J^T W J)^{-1} J^T W j`. Twice its products with :math:`W r` and :math:`W j` are the derivatives of
         the minimum cost (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
 
         Args:
             residuals: Residuals at the poses and points of the linearisation.
-            derivative: Changes of the whitened residuals to first order, shape :math:`(*, ..., 3, M)`, any number for
-                each problem.
+            derivative: First-order changes of the whitened residuals, shape :math:`(*, ..., 3, M)`; a problem can have
+                several changes.
             points: Number of points.
 
         Returns:
@@ -119,7 +119,7 @@ class BundleProblem(NamedTuple):
         return self._move(state, solve_normal_equations(self.linearise(residuals, state[1].shape[-2]), damping))
 
     def differentiate(self, state: State, T_cw: Tensor) -> State:
-        """The optimum ``state`` with its derivatives by the measurements, weights and the fixed poses in ``T_cw``."""
+        """Return the optimum ``state`` with derivatives by measurements, weights and the fixed poses in ``T_cw``."""
         constant = self.detach()
         T, X = constant._gather(state)
 
@@ -184,7 +184,7 @@ class BundleProblem(NamedTuple):
         )
 
     def _move(self, state: State, steps: tuple[Tensor, Tensor]) -> State:
-        """Move the free poses and the points by the steps that `solve_normal_equations` returns."""
+        """Apply the steps of `solve_normal_equations` to the free poses and the points."""
         (T_cw, points), (pose_step, point_step) = state, steps
         none = pose_step.new_zeros(*pose_step.shape[:-1], 1)
         xi = gather_columns(torch.cat([pose_step, none], dim=-1), self._rows[0]).mT
@@ -206,7 +206,7 @@ def prepare_bundle(
     weights: Tensor | None,
     valid: Tensor | None,
 ) -> tuple[BundleProblem, State]:
-    """Problem and initial state in float64 of the arguments of `v3d_torch.mapping.bundle_adjustment.bundle_adjust`."""
+    """Return the problem and the initial state, in float64, for the arguments of `bundle_adjust`."""
     KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "L", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])

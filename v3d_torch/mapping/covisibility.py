@@ -1,4 +1,4 @@
-"""Covisibility: which keyframes observe the same landmarks (ORB-SLAM, Mur-Artal et al., T-RO 2015, Sec. III-D)."""
+"""Covisibility of keyframes: their common landmarks (ORB-SLAM, Mur-Artal et al., T-RO 2015, Sec. III-D)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
     Returns:
         Number of shared landmarks of each keyframe, int64, shape :math:`(K,)`.
     """
-    # NumPy is faster here, and indices are faster than a mask.
+    # NumPy is faster here than torch, and indices are faster than a mask.
     keyframe, landmark, valid = (tables.observations[name].numpy() for name in ("keyframe", "landmark", "valid"))
     wanted = np.zeros(len(tables.landmarks), dtype=np.bool_)
     wanted[landmarks.numpy()] = True
@@ -40,7 +40,7 @@ def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Ten
         Indices of keyframes that observe at least one of the landmarks, int64, shape :math:`(<= count,)`.
     """
     shared = count_shared_landmarks(tables, landmarks).numpy()
-    score = shared * len(shared) + np.arange(len(shared))  # the newer keyframe first, if the counts are equal
+    score = shared * len(shared) + np.arange(len(shared))  # of equal counts, the newer keyframe is first
     order = np.argsort(-score)[:count]
     return torch.from_numpy(order[shared[order] > 0])
 
@@ -65,7 +65,7 @@ def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
 def covisibility_edges(tables: MapTables, min_shared: int) -> Tensor:
     """Find the edges of the pose graph: pairs of covisible keyframes, and pairs of consecutive active keyframes.
 
-    Two consecutive keyframes between which the camera was lost are no edge, because their relative pose is a guess.
+    There is no edge between consecutive keyframes if the camera was lost between them: their relative pose is unknown.
 
     Args:
         tables: Data of the map.

@@ -24,7 +24,7 @@ _CONFIRMATION_KEYFRAMES = 3
 """Number of later keyframes within which a second keyframe must observe a landmark (ORB-SLAM2)."""
 
 _MIN_OBSERVATIONS = 2
-"""Observations that confirm a landmark: by the keyframe that created it and by another one."""
+"""Number of observations of a confirmed landmark: by the keyframe that created it and by another keyframe."""
 
 
 def cull_landmarks(tables: MapTables) -> None:
@@ -46,7 +46,7 @@ def cull_landmarks(tables: MapTables) -> None:
 
 
 def cull_keyframes(tables: MapTables, references: Mapping[int, int]) -> None:
-    """Cull the given keyframes, in place: remove their observations and tie their poses to other keyframes.
+    """Cull the given keyframes, in place: remove their observations and attach their poses to other keyframes.
 
     Landmarks without an observation become inactive.
 
@@ -106,7 +106,7 @@ class _Neighbourhood:
         self._levels = int(self._octave.max()) + 1 if len(self._octave) else 1
 
     def redundant_ratios(self, min_views: int) -> NDArray[np.float64]:
-        """Ratio of each keyframe's landmarks that enough others observe at the same, the next or a finer octave."""
+        """Ratio of each keyframe's landmarks that enough other keyframes observe at the next octave or a finer one."""
         cell = self._landmark * self._levels + self._octave
         counts = np.bincount(cell, minlength=self._landmark_count * self._levels)
         up_to_octave = counts.reshape(-1, self._levels).cumsum(axis=1)
@@ -115,7 +115,7 @@ class _Neighbourhood:
         return redundant / np.bincount(self._keyframe, minlength=self._keyframe_count).clip(min=1)
 
     def most_covisible(self, keyframe: int) -> int:
-        """The other keyframe that shares most landmarks with the given one; the newest, if several share as many."""
+        """Return the other keyframe that shares most landmarks with the given one; the newest of several."""
         own = self._landmark[self._keyframe == keyframe]
         shared = np.bincount(self._keyframe[_contains(own, self._landmark, self._landmark_count)])
         shared[keyframe] = 0

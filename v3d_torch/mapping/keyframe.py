@@ -22,7 +22,7 @@ class Keyframe:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`; changed by bundle adjustment and loop correction.
         features: Features on static pixels; empty once the keyframe is culled.
         landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
-        disconnected: True if the keyframe is joined to the rest of the map only by a guessed pose.
+        disconnected: True if the pose of the keyframe relative to the rest of the map is only a guess.
         reference: Index of the reference keyframe. A culled keyframe moves rigidly with its reference keyframe; every
             other keyframe is its own reference.
     """
@@ -42,7 +42,7 @@ class Keyframe:
 
     @property
     def is_culled(self) -> bool:
-        """True if the keyframe has no observations any more and only its pose is used, by frames and landmarks."""
+        """True if the keyframe was culled: it has no observations, but frames and landmarks still use its pose."""
         return self.reference != self.index
 
     @property
@@ -64,7 +64,7 @@ def stack_poses(keyframes: Sequence[Keyframe]) -> Tensor:
 
 @dataclass(frozen=True)
 class Loop:
-    """Relative pose of two keyframes, measured when a place was recognised.
+    """Relative pose of two keyframes, measured by place recognition.
 
     Attributes:
         i: Index of the older keyframe.

@@ -15,8 +15,8 @@ from v3d_torch.mapping.tensor_table import TensorTable
 def select_new_landmarks(features: Features, landmarks: Tensor, max_landmarks: int, cell: int) -> Tensor:
     """Select unmatched features with depth, evenly over the image.
 
-    Distant features are included: their depth is uncertain and weighted accordingly, but they constrain the rotation,
-    and can be the only features if people cover most of the image.
+    Distant features are included. Their depth is uncertain and has a low weight, but they constrain the rotation, and
+    can be the only features if people cover most of the image.
 
     Args:
         features: Features of the keyframe.

@@ -20,11 +20,12 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.optim.reprojection import chi_square, reprojection_residuals
 
 _SEARCH_RADIUS = 3.0
-"""Radius of the projection matching, pixels at pyramid level 0 (ORB-SLAM2). Small, because both poses are known."""
+"""Search radius of the projection matching, pixels at pyramid level 0 (ORB-SLAM2); small, because both poses are
+known."""
 
 
 class LandmarkFusion:
-    """Fuses the landmarks of a new keyframe with those of its neighbours.
+    """Fuses the landmarks of a new keyframe with those of its covisible keyframes.
 
     Args:
         config: Configuration of the whole system.

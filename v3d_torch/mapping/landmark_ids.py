@@ -12,7 +12,7 @@ from v3d_torch.mapping.map_tables import MapTables
 
 _MAX_LANDMARKS_PER_OBSERVATION = 2
 """Ratio of landmarks to observations above which the table is compacted. Every active landmark has at least one
-observation, so that more than half of the landmarks are inactive then."""
+observation, so above this ratio more than half of the landmarks are inactive."""
 
 
 def contains(ids: Tensor, queries: Tensor, count: int) -> Tensor:
@@ -24,7 +24,7 @@ def contains(ids: Tensor, queries: Tensor, count: int) -> Tensor:
         count: Number of landmarks in the map.
 
     Returns:
-        True for queries in the set, False for -1, bool, shape :math:`(N,)`.
+        True for queries in the set, false for -1, bool, shape :math:`(N,)`.
     """
     table = torch.zeros(count + 1, dtype=torch.bool)  # index -1 is the last entry
     return table.index_fill_(0, ids, True)[queries]
@@ -52,7 +52,7 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
     rows = np.flatnonzero(valid & affected.take(observed))
     keyframe, landmark = keyframes[rows], observed[rows]
 
-    # Two observations by one keyframe: the two landmarks of the pair are distinct points.
+    # If one keyframe observes both landmarks of a pair, they are distinct points.
     keys = np.sort(keyframe * count + new_id[landmark])
     is_distinct = np.zeros(count, dtype=np.bool_)
     is_distinct[keys[1:][keys[1:] == keys[:-1]] % count] = True
@@ -90,7 +90,7 @@ def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None
         *(keyframe.landmarks for keyframe in tables.keyframes),
         *external_ids,
     ]
-    distinct = {tensor.data_ptr(): tensor for tensor in tensors if len(tensor)}.values()  # some share their memory
+    distinct = {tensor.data_ptr(): tensor for tensor in tensors if len(tensor)}.values()  # tensors can share memory
     needed = tables.landmarks["active"].clone()
     for ids in distinct:
         needed[ids[ids >= 0]] = True

@@ -21,11 +21,11 @@ _MAX_ITERATIONS = 5
 """Maximum number of Levenberg-Marquardt steps."""
 
 _COST_TOLERANCE = 1e-5
-"""Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations:
-a smaller change is a small fraction of one, and the next keyframe continues from there."""
+"""Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations, so
+a smaller change is a small fraction of one; the adjustment of the next keyframe continues from the result."""
 
 _LATE_CALIBRATION_INTERVAL = 10
-"""Interval in keyframes of the readout calibration after the first keyframes, for later rotations of the camera."""
+"""Interval of the readout calibration after the first keyframes, in keyframes; the camera can rotate more later."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LocalAdjustment:
     readout: Readout
 
     def apply(self, sparse_map: SparseMap) -> None:
-        """Write the result to the map that was adjusted, in place; the map must have no newer keyframe.
+        """Write the result to the map that was adjusted, in place. No keyframe may have been inserted since.
 
         Args:
             sparse_map: The map.
@@ -65,7 +65,7 @@ def local_bundle_adjust(
 ) -> LocalAdjustment | None:
     """Adjust a new keyframe together with its covisible keyframes and their landmarks, and detect outliers.
 
-    Other keyframes that observe the same landmarks take part with fixed poses.
+    Other keyframes that observe the same landmarks are included with fixed poses.
 
     Args:
         sparse_map: The map; it is not changed.

@@ -92,7 +92,7 @@ def fill_from_columns(columns: Columns, tables: MapTables, views: StaticViews) -
 
 
 def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticViews) -> str | None:
-    """Find a type, shape, value or index in columns that would break a later run.
+    """Find a type, shape, value or index in columns that would make a later run fail.
 
     Args:
         columns: Columns of a file.

@@ -1,7 +1,7 @@
 """Map files: save a map, and load it in a later run for localisation, extension or drawing.
 
 A map file is a zip archive of NumPy arrays (npz) without pickled objects, so that loading a file runs no code from it.
-Covisibility and the keyframe database are not stored, because they follow from the rest.
+Covisibility and the keyframe database are not stored, because they are computed from the rest.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
     Args:
         path: Path of the file, with any suffix.
         sparse_map: Keyframes and landmarks.
-        views: Static views of the keyframes; without them a later run cannot reconstruct this part of the map densely.
+        views: Static views of the keyframes; None to store none, so that a later run cannot reconstruct this part of
+            the map densely.
 
     Raises:
         OutputError: If the file cannot be written.

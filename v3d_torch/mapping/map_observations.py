@@ -44,13 +44,13 @@ class MapObservations:
 
         Args:
             K: Camera matrix, shape :math:`(3, 3)`.
-            fixed: Keyframes whose poses stay unchanged, bool, shape :math:`(P,)`.
+            fixed: Mask of the keyframes whose poses stay unchanged, bool, shape :math:`(P,)`.
         """
         return {**vars(self.measured), "pose": self.pose, "point": self.point, "K": K, "fixed": fixed}
 
 
 def select_observations(tables: MapTables, window: Tensor, config: Config, *, with_neighbours: bool) -> MapObservations:
-    """Select the observations of the active landmarks that some keyframes observe and that are observed twice.
+    """Select the observations of all active landmarks that given keyframes observe, if they have two observations.
 
     Args:
         tables: Data of the map.

@@ -96,7 +96,7 @@ class MapTables:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the data of the map by what `state_dict` returned; the objects are shared, not copied."""
+        """Replace the data of the map by a state of `state_dict`; the objects are shared, not copied."""
         self.keyframes = state["keyframes"]
         self.landmarks = state["landmarks"]
         self.observations = state["observations"]

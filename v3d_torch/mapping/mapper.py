@@ -56,11 +56,11 @@ class Mapper:
         return keyframe
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the data that the keyframe decision keeps from frame to frame; the map has its own state."""
+        """Return the state of the keyframe decision; the map has its own state."""
         return {"most_tracked": self._most_tracked, "untracked_since": self._untracked_since}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self._most_tracked = state["most_tracked"]
         self._untracked_since = state["untracked_since"]
 
@@ -77,10 +77,10 @@ class Mapper:
         return weak or frame.index - self.map.keyframes[-1].frame >= config.max_keyframe_interval
 
     def _needs_untracked_keyframe(self, stamp: float, features: Features, status: TrackingStatus) -> bool:
-        """Decide whether to continue the map from a pose that was not tracked in the map.
+        """Decide whether to extend the map from a pose that was not tracked in the map.
 
         This requires that tracking has failed for some time although the image had enough features. A map of an
-        earlier run is only continued after relocalisation in that map.
+        earlier run is extended only after relocalisation in that map.
         """
         config = self._config.mapping
         if status is TrackingStatus.LOST and self.map.keyframes and self.map.keyframes[-1].is_from_earlier_run:

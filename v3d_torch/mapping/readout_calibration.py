@@ -26,7 +26,7 @@ first ones have the least accurate camera motion."""
 
 _INFORMATION_WEIGHT = 0.1
 """Weight of the information from the curvature. Errors of depth and velocity are correlated between observations, so
-that the curvature overestimates the information; 0.1 stands for standard deviations that are three times larger."""
+the curvature overestimates the information; 0.1 corresponds to standard deviations that are three times larger."""
 
 
 def estimate_readout(
@@ -58,27 +58,28 @@ def estimate_readout(
     Args:
         seconds: Earlier estimate of the time from the first to the last row, seconds, for which ``uv`` was compensated,
             a number or shape :math:`(*)`.
-        information: Inverse variance of ``seconds``, 1/s^2, a number or shape :math:`(*)`; infinite if it is known.
+        information: Inverse variance of ``seconds``, 1/s^2, a number or shape :math:`(*)`; infinite if the readout is
+            known.
         readout_jacobian: Derivatives of ``uv`` by the readout, pixels per second, shape :math:`(*, M, 2)`; see
             :func:`compensate_rolling_shutter`.
         T_cw: Poses at the minimum of the bundle adjustment, shape :math:`(*, P, 4, 4)`. These and all other arguments
             are those of :func:`bundle_adjust`.
         points: Landmarks at the minimum, world frame, metres, shape :math:`(*, L, 3)`.
         uv: Observed pixels, undistorted, shape :math:`(*, M, 2)`.
-        pose: Index of the pose that made each observation, int64, shape :math:`(*, M)`.
+        pose: Index of the pose from which each observation was made, int64, shape :math:`(*, M)`.
         point: Index of the observed landmark, int64, shape :math:`(*, M)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured, as it is by default.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured. None if no depth was
+            measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
-        fixed: Poses that stayed unchanged, bool, shape :math:`(*, P)`; only the first by default.
-        weights: Weight of each observation, not negative, shape :math:`(*, M)`; 1 by default.
-        valid: Observations that are not padding, bool, shape :math:`(*, M)`; all by default.
+        fixed: Mask of the poses that stayed unchanged, bool, shape :math:`(*, P)`; None for only the first.
+        weights: Weight of each observation, not negative, shape :math:`(*, M)`; None for 1.
+        valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all.
 
     Returns:
-        The new ``seconds`` and ``information``, with the dtype of ``T_cw``, shape :math:`(*)` each. They are the
-        earlier ones if these are known, or if the cost has no minimum because the camera stood still or moved
-        uniformly.
+        The new ``seconds`` and ``information``, with the dtype of ``T_cw``, shape :math:`(*)` each. They equal the
+        inputs if the readout is known, or if the cost has no minimum because the camera stood still or moved uniformly.
     """
     problem, state = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
@@ -179,7 +180,7 @@ def reduced_cost_derivatives(
 
 
 class ReadoutEstimator(torch.nn.Module):
-    """:func:`estimate_readout` as a module. A standard deviation that is a `torch.nn.Parameter` can be learnt.
+    """:func:`estimate_readout` as a module. Standard deviations that are a `torch.nn.Parameter` can be learned.
 
     Args:
         pixel_sigma: Standard deviation of u and of v, pixels.

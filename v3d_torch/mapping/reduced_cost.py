@@ -12,8 +12,8 @@ from v3d_torch.mapping.bundle_problem import BundleProblem, State
 def differentiate_minimum_cost(problem: BundleProblem, state: State, jacobian: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of the minimum cost by parameters of the camera, as sums over the observations of each pose.
 
-    The second derivatives are twice the Schur complement of poses and points: twice the information on the parameters
-    when poses and points are unknown (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
+    The second derivatives are twice the Schur complement of poses and points, which is the information on the
+    parameters if poses and points are unknown (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
 
     Args:
         problem: Bundle adjustment of P poses, without batch dimensions.

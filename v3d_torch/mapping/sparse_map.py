@@ -38,7 +38,7 @@ class SparseMap(MapTables):
 
     @classmethod
     def empty(cls, config: Config, camera: PinholeCamera) -> SparseMap:
-        """Create an empty map with the readout of the camera, or the expected readout if the camera gives none.
+        """Create an empty map with the readout of the camera, or of the configuration if the camera states none.
 
         Args:
             config: Configuration of the whole system.
@@ -130,7 +130,7 @@ class SparseMap(MapTables):
         return self.select_landmarks(covisibility.observed_landmarks(self, self.covisible_keyframes(landmarks, count)))
 
     def select_landmarks(self, landmarks: Tensor) -> LocalMap:
-        """Return the active ones of the given landmarks as a local map.
+        """Return the active landmarks among the given ones as a local map.
 
         Args:
             landmarks: IDs, ascending, int64, shape :math:`(L,)`.
@@ -172,7 +172,7 @@ class SparseMap(MapTables):
             previous[culled] @ invert(previous[references[culled]]) @ T_cw[references[culled]]
         )
         T_new_old = (invert(T_cw) @ previous)[:, :3].flatten(1).T.numpy()
-        # One element of the matrices for all landmarks at a time: faster than a small matrix product for each.
+        # Multiply element by element for all landmarks at once; faster than a small matrix product for each landmark.
         owner = self.landmarks["keyframe"].numpy()
         elements = np.stack([element.take(owner) for element in T_new_old]).reshape(3, 4, -1)
         x, y, z = self.landmarks["point"].numpy().T.copy()

@@ -54,13 +54,13 @@ class StaticViews:
 
     Args:
         camera: Camera of the frames.
-        stride: Every n-th pixel is stored, by row and by column.
+        stride: Every n-th row and column is stored.
 
     Attributes:
         stride: Stride of the views, pixels of the frames.
         camera: Camera of the views, without distortion.
-        rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a view's pixel is the exact ray
-            of the frame's pixel that it was taken from.
+        rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a pixel is the exact ray of the
+            pixel of the frame from which it was sampled.
     """
 
     UNIT = 0.0002
@@ -120,5 +120,5 @@ class StaticViews:
         return {"views": self._views}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the views by what `state_dict` of views of the same camera and stride returned."""
+        """Replace the views by a state of `state_dict` of views with the same camera and stride."""
         self._views = state["views"]

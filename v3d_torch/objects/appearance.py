@@ -1,8 +1,8 @@
 """Appearance of instances: histograms of their colours.
 
-Clothes tell people apart when one hides another. A histogram hardly changes when the body or the camera turns, and
-needs no network. Brightness and both colour axes are binned coarsely, and each pixel also counts in the neighbouring
-bins, so that a change of light shifts little.
+The colours of clothes distinguish people when one occludes another. A histogram hardly changes when the body or the
+camera turns, and needs no network. Brightness and both colour axes have coarse bins, and each pixel also counts in the
+neighbouring bins, so that a change of light changes the histogram little.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _COLOUR_STEP = 10
 40."""
 
 _STRIDE = 4
-"""Every n-th pixel is counted: a person at 5 m still has some hundred of them."""
+"""Every n-th row and column is counted; a person at 5 m still has some hundred of these pixels."""
 
 _MIN_PIXELS = 10
-"""Minimum number of counted pixels: with fewer the appearance is unknown."""
+"""Minimum number of counted pixels; with fewer the appearance is unknown."""
 
 
 _BRIGHTNESS = np.arange(256) * _BINS // 256
@@ -35,7 +35,7 @@ _CHROMA = np.clip((np.arange(256) - 128) // _COLOUR_STEP + _BINS // 2, 0, _BINS 
 
 
 def _smoothing_matrix() -> Tensor:
-    """Return the matrix that spreads each bin over its neighbours, float32, shape (D, D)."""
+    """Return the matrix that distributes each bin over its neighbours, float32, shape (D, D)."""
     distance = np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS)))
     axis = np.where(distance == 0, 0.5, np.where(distance == 1, 0.25, 0.0))
     axis /= axis.sum(axis=1, keepdims=True)
@@ -67,13 +67,13 @@ def colour_histograms(image: Tensor, masks: Tensor) -> Tensor:
 
 
 def histogram_similarity(a: Tensor, b: Tensor) -> Tensor:
-    """Bhattacharyya coefficient of histograms: 1 for equal ones, 0 for such without a common bin.
+    """Bhattacharyya coefficient of histograms: 1 if they are equal, 0 if they have no common bin.
 
     Args:
         a: Histograms that sum to 1, shape :math:`(*, A, D)`.
         b: Histograms that sum to 1, shape :math:`(*, B, D)`.
 
     Returns:
-        Similarity of all pairs, shape :math:`(*, A, B)`; NaN if a histogram is.
+        Similarity of all pairs, shape :math:`(*, A, B)`; NaN if one of the histograms is NaN.
     """
     return a.sqrt() @ b.sqrt().transpose(-1, -2)

@@ -11,14 +11,14 @@ from torch import Tensor
 def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: Tensor | None = None) -> Tensor:
     """Match each instance to the object that it continues, if any.
 
-    Of all assignments, the one with the largest total log-likelihood ratio is chosen. A pair whose ratio is not
-    positive is never matched: the instance is rather a new object.
+    The assignment maximises the total log-likelihood ratio. A pair whose ratio is not positive is never matched: its
+    instance is more likely a new object.
 
     Args:
-        log_ratio: Log-likelihood ratio of N instances continuing T objects, shape :math:`(B, T, N)`; -inf for a pair
-            that is impossible.
-        tracked: Objects that exist, bool, shape :math:`(B, T)`; all by default.
-        present: Instances that exist, bool, shape :math:`(B, N)`; all by default.
+        log_ratio: Log-likelihood ratio that instance n continues object t, shape :math:`(B, T, N)`; -inf for impossible
+            pairs.
+        tracked: Mask of the objects that are not padding, bool, shape :math:`(B, T)`; None for all.
+        present: Mask of the instances that are not padding, bool, shape :math:`(B, N)`; None for all.
 
     Returns:
         Index of the object that each instance continues, from 0 to T - 1, or -1; int64, shape :math:`(B, N)`.

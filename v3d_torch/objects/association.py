@@ -1,8 +1,8 @@
-"""Association evidence: how much likelier an instance is if it continues a track than if it is a new object.
+"""Association evidence: likelihood of an instance if it continues a track, relative to that of a new object.
 
 Each kind of evidence is a log-likelihood ratio, as in multiple hypothesis tracking (Blackman, 2004): position, overlap
-of the masks, appearance, class and vacancy. They add up to one number per pair, which is positive if the instance
-rather continues the track.
+of the masks, appearance, class and vacancy. Their sum for a pair is positive if the instance more likely continues the
+track than is a new object.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import torch
 from torch import Tensor
 
 _NEW_OBJECT_VOLUME = 10.0
-"""Inverse density of new objects, cubic metres: somewhere in the view of the camera, one appears."""
+"""Inverse density of new objects, cubic metres: about the volume that the camera observes."""
 
 _TAIL = 4.0
 """Degrees of freedom of Student's t-distribution of the innovations: some people turn or stop at once, and some masks
-cover half of a person, so that errors are large more often than a normal distribution has it."""
+cover half of a person, so that large errors are more frequent than in a normal distribution."""
 
 _MAX_VARIANCE = 1.0
 """Maximum variance of a coordinate, square metres: people who are out of view for seconds mostly stay in the room."""
 
 _COVERAGE_WEIGHT = 3.0
-"""Evidence of a mask that covers the predicted mask completely, or, with the opposite sign, not at all."""
+"""Evidence of a mask that covers the predicted mask completely; its negative if the masks do not overlap."""
 
 _OVERLAP_WEIGHT = 2.0
 """Evidence of equal masks, in addition to coverage."""
 
 _SIMILARITY_WEIGHT, _NEUTRAL_SIMILARITY = 25.0, 0.88
-"""Slope and zero of the evidence of a similarity: histograms of one person some frames apart are mostly more
-alike, those of two people mostly less."""
+"""Slope of the evidence over the similarity of histograms, and the similarity at which it is zero: histograms of one
+person some frames apart are usually more similar, those of two people less."""
 
 _MIN_APPEARANCE, _MAX_APPEARANCE = -4.0, 1.5
-"""Bounds of the evidence of appearance: dark clothes are alike, and light and the visible part of a body change."""
+"""Bounds of the evidence of appearance: dark clothes look similar, and light and the visible part of a body change."""
 
 _CLASS_CHANGE = -2.0
-"""Evidence of another class: the class of an object flickers."""
+"""Evidence of a different class; it is small, because the class of an object can change between frames."""
 
 _VACANCY_RATE, _MAX_VACANCY = 30.0, 6.0
-"""Evidence against a track per second for which its predicted place was observed to be empty, and its maximum."""
+"""Evidence against a track per second for which its predicted place was observed to be empty, and its upper bound."""
 
 
 def position_log_ratio(squared_distance: Tensor, variance: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ def position_log_ratio(squared_distance: Tensor, variance: Tensor) -> Tensor:
 
 
 def overlap_log_ratio(coverage: Tensor, overlap: Tensor, visible: Tensor) -> Tensor:
-    """Log-likelihood ratio of masks. A predicted mask of a hidden object speaks against nothing.
+    """Log-likelihood ratio of masks; never negative for an object that is hidden at its predicted position.
 
     Args:
         coverage: Intersection of instance and predicted mask, divided by the smaller area, shape :math:`(T, N)`.
@@ -71,7 +71,8 @@ def overlap_log_ratio(coverage: Tensor, overlap: Tensor, visible: Tensor) -> Ten
     Returns:
         Log-likelihood ratio, shape :math:`(T, N)`.
     """
-    # An object that is not seen where it was predicted may be elsewhere: its mask speaks against no instance.
+    # An object that is not visible at its predicted position can be elsewhere, so its mask is no evidence against an
+    # instance.
     against = (2 * visible - 1).clamp(min=0)[:, None]
     weight = torch.where(coverage < 0.5, against, (2 * visible).clamp(max=1)[:, None])
     return _COVERAGE_WEIGHT * weight * (2 * coverage - 1) + _OVERLAP_WEIGHT * overlap
@@ -94,7 +95,7 @@ def class_log_ratio(same_class: Tensor) -> Tensor:
     """Log-likelihood ratio of classes.
 
     Args:
-        same_class: Pairs of the same class, bool, shape :math:`(*)`.
+        same_class: Mask of the pairs of the same class, bool, shape :math:`(*)`.
     """
     return torch.where(same_class, 0.0, _CLASS_CHANGE).to(torch.float64)
 

@@ -14,13 +14,13 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 
 _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
-"""FLANN_INDEX_KDTREE_SINGLE, an exact KD-tree for few dimensions. It is faster here than SciPy's."""
+"""FLANN_INDEX_KDTREE_SINGLE, an exact KD-tree for few dimensions; faster here than the one of SciPy."""
 
 _MAX_COORDINATE = 1e18
-"""Metres. Squared distances between larger coordinates overflow in float32."""
+"""Maximum coordinate, metres: squared distances between larger coordinates overflow in float32."""
 
 _MIN_POINTS_FOR_THREADS = 20_000
-"""Points from which the search runs in several threads: it then takes much longer than starting a thread."""
+"""Number of points from which the search uses several threads: it then takes much longer than starting a thread."""
 
 
 def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_valid: Tensor | None = None) -> Tensor:
@@ -37,8 +37,8 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
     Args:
         p: Point clouds P, metres, float32 or float64, shape :math:`(B, N, 3)`.
         q: Point clouds Q, metres, dtype of ``p``, shape :math:`(B, M, 3)`.
-        p_valid: Points of ``p`` that exist, bool, shape :math:`(B, N)`; all by default.
-        q_valid: Points of ``q`` that exist, bool, shape :math:`(B, M)`; all by default.
+        p_valid: Mask of the points of ``p`` that are not padding, bool, shape :math:`(B, N)`; None for all.
+        q_valid: Mask of the points of ``q`` that are not padding, bool, shape :math:`(B, M)`; None for all.
 
     Returns:
         Chamfer distances, square metres, shape :math:`(B,)`; NaN if one of the two clouds is empty. Differentiable in

@@ -16,20 +16,20 @@ from v3d_torch.kernels import dbscan as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _MAX_PAIRS = 2**25
-"""Upper bound on the number of neighbour pairs that are listed at once. It bounds memory."""
+"""Maximum number of neighbour pairs that are listed at once; it bounds the memory."""
 
 _BLOCK = 2**20
-"""Number of neighbours that are listed in one block, if a cloud has more pairs than `_MAX_PAIRS`."""
+"""Number of neighbours in one block, if a cloud has more than `_MAX_PAIRS` pairs."""
 
 _MAX_NEIGHBOUR_CELLS = 13.5
-"""Upper bound on the pairs per squared number of points in a cell: each of the 27 cells around a point can hold its
-neighbours, and every pair counts once."""
+"""Upper bound on the number of pairs, divided by the sum of the squared numbers of points in the cells: the neighbours
+of a point can lie in 27 cells, and every pair counts once."""
 
 _HASH_PRIMES = (73856093, 19349663, 83492791)
 """Spatial hash of a cell (Teschner et al., VMV 2003)."""
 
 _HASH_MASK = 0xFFFF
-"""Size of the hash table less one."""
+"""Bit mask of the hash: size of the hash table minus one."""
 
 Ints = NDArray[np.signedinteger]
 Pairs = tuple[Ints, Ints]
@@ -55,14 +55,15 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     """Label the density-connected clusters of every cloud of a batch.
 
     A point with at least ``min_samples`` points within ``eps`` (itself and the boundary included) is a core point; core
-    points within ``eps`` of each other share a cluster. Clusters are numbered by their first core point, and a border
-    point joins the lowest-numbered cluster that reaches it: the labels are exactly those of scikit-learn.
+    points within ``eps`` of each other belong to the same cluster. Clusters are numbered by their first core point. A
+    border point belongs to the cluster with the lowest number that has a core point within ``eps``. The labels are
+    exactly those of scikit-learn.
 
     Args:
         points: Point clouds, metres, float32 or float64, shape :math:`(B, N, 3)`.
-        valid: Points that exist, bool, shape :math:`(B, N)`; the values of all other points are ignored.
+        valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`; the values of padding are ignored.
         eps: Radius of a neighbourhood, metres.
-        min_samples: Number of points in a neighbourhood that makes its centre a core point.
+        min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
 
     Returns:
         Cluster of each point, from 0 in every cloud; -1 for noise and for points that are not valid; int64, shape
@@ -96,7 +97,7 @@ def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
     counts, blocks = _neighbours(points, eps)
     core = counts >= min_samples
 
-    # Connect core points. int32 halves the memory traffic, because components are read for every pair.
+    # Connect core points. Components are read for every pair, and int32 halves the memory traffic.
     component = np.arange(size, dtype=np.int32)
     borders: list[Pairs] = []  # (border point, core point that reaches it)
     for a, b in blocks:
@@ -106,7 +107,7 @@ def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
         for one_core, border, other in ((a_core > b_core, b, a), (b_core > a_core, a, b)):
             borders.append((border[one_core], other[one_core]))
 
-    # Number the components by their lowest core point: of repeated indices, the last assignment stays.
+    # Number the components by their lowest core point: with repeated indices, the last assignment is kept.
     cores = np.flatnonzero(core)[::-1]
     first = np.full(size, size)
     first[component[cores]] = cores
@@ -133,8 +134,8 @@ def _neighbours(points: NDArray[np.float64], eps: float) -> tuple[Ints, Iterable
 def _max_pairs(points: NDArray[np.float64], eps: float) -> float:
     """Return an upper bound on the number of neighbour pairs.
 
-    Neighbours lie in the same or in adjacent cells of side ``eps``. The bound follows from the sum of squared cell
-    counts. Hash collisions of cells only raise it.
+    Neighbours lie in the same or in adjacent cells of side ``eps``. The bound is a multiple of the sum of squared
+    numbers of points in the cells. Hash collisions of cells can only increase it.
     """
     one_cell = _MAX_NEIGHBOUR_CELLS * len(points) ** 2
     if one_cell <= _MAX_PAIRS:
@@ -145,7 +146,7 @@ def _max_pairs(points: NDArray[np.float64], eps: float) -> float:
 
 
 def _pairs_in_blocks(tree: cKDTree, counts: Ints, eps: float) -> Iterator[Pairs]:
-    """Yield every pair once, in blocks of bounded size; each block holds the neighbours of some adjacent points."""
+    """Yield every pair once, in blocks of bounded size; each block contains the neighbours of some adjacent points."""
     order = tree.indices
     block = np.cumsum(counts[order]) // _BLOCK
     for points in np.split(order, np.flatnonzero(np.diff(block)) + 1):
@@ -178,7 +179,7 @@ class DBSCAN(torch.nn.Module):
 
     Args:
         eps: Radius of a neighbourhood, metres.
-        min_samples: Number of points in a neighbourhood, its centre included, that makes the centre a core point.
+        min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
     """
 
     def __init__(self, eps: float, min_samples: int) -> None:

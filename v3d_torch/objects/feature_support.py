@@ -1,8 +1,8 @@
-"""Feature support of static objects: features on the object fit the camera motion as well as those elsewhere.
+"""Feature support of static objects: features on a static object fit the camera motion as well as other features.
 
-A person whose motion is not known yet is masked, to be safe. But a segmentation network also labels rotated furniture
-as people, sometimes over most of the image, and then too few pixels remain for tracking. Features resolve this: few
-features on a walking person fit the motion that the rest of the image agrees on.
+A person whose motion is not known yet is masked. But a segmentation network also labels rotated furniture as people,
+sometimes over most of the image, and then too few pixels remain for tracking. Features distinguish the two: few
+features on a walking person fit the camera motion.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 MIN_SUPPORT_RATIO = 0.5
-"""An object is supported if the inlier ratio of its features is at least this fraction of the inlier ratio outside of
-all objects: on a static object both are alike, on a walking person nearly no feature is an inlier."""
+"""Minimum inlier ratio of the features of a supported object, as a fraction of the inlier ratio outside of all objects:
+on a static object both are similar, on a walking person nearly no feature is an inlier."""
 
 MIN_SUPPORTING_FEATURES = 10
-"""Minimum number of inliers on a supported object: some inliers lie on the contour of whatever occludes it."""
+"""Minimum number of inliers on a supported object: a few inliers can lie on the contour of an object in front of it."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class FeatureSupport:
 
     Attributes:
         pixel: Pixel (column, row) of each feature, int64, shape :math:`(N, 2)`.
-        inlier: Features that are matched to the previous frame and fit the camera motion, bool, shape :math:`(N,)`.
+        inlier: Mask of the features that are matched to the previous frame and fit the camera motion, bool, shape
+            :math:`(N,)`.
     """
 
     pixel: Tensor
@@ -44,7 +45,7 @@ class FeatureSupport:
             min_inliers: Minimum number of inliers on the object.
 
         Returns:
-            Objects that are supported, bool, shape :math:`(K,)`.
+            Mask of the supported objects, bool, shape :math:`(K,)`.
         """
         if len(masks) == 0:
             return self.inlier.new_zeros(0)

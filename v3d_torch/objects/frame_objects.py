@@ -61,8 +61,8 @@ class FrameObjects:
         static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
         static_without_people: Pixels of ``static_mask`` that show no person, not even a static one, for the coloured
             map; bool, shape :math:`(H, W)`.
-        vote_pairs: Votes between objects that counted over any baseline: id of the voter and id of the object with the
-            vote, sorted.
+        vote_pairs: Votes that counted over any baseline: id of the voting object and id of the object voted for,
+            sorted.
     """
 
     objects: list[TrackedObject]

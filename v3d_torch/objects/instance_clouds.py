@@ -27,7 +27,7 @@ class InstanceClouds:
 
     Attributes:
         points: Voxel means, camera frame, metres, float32, shape :math:`(N, P, 3)`.
-        valid: Points that exist, bool, shape :math:`(N, P)`; False for padding.
+        valid: Mask of the points that are not padding, bool, shape :math:`(N, P)`; False for padding.
         centroid: Mean of the points, float32, shape :math:`(N, 3)`; NaN if a cloud has too few points.
         cloud_pixels: Pixels of each mask whose point belongs to the cloud, bool, shape :math:`(N, H, W)`.
     """
@@ -69,7 +69,7 @@ class InstanceBackProjector:
 def _compute_clouds_compiled(
     depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig
 ) -> InstanceClouds:
-    # No cloud is wider than this, and the kernels number only that many cells.
+    # No cloud is wider than this; the kernels can number only this many cells.
     max_width = 2 * config.max_depth * max(float(np.abs(rays).max()), 1.0)
     if depth.dtype != torch.float32 or max_width > MAX_CELLS / 2 * min(config.eps, config.voxel_size):
         return NotImplemented
@@ -89,11 +89,11 @@ def _compute_clouds_compiled(
 
 @compiled_by(_compute_clouds_compiled)
 def _compute_clouds(depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig) -> InstanceClouds:
-    """Compute the clouds of masks (N, H, W) of a depth image (H, W); ``rays`` are those of every n-th pixel, (R, 3)."""
+    """Compute the clouds of masks (N, H, W) of a depth image (H, W), with the rays (R, 3) of every n-th pixel."""
     points, valid, pixel = _back_project(depth, masks, rays, config)
     points, valid, _, voxel = voxel_pool(points, valid, config.voxel_size)
     labels = dbscan(points, valid, config.eps, config.min_samples)
-    # The paper keeps as many clusters as there are instances. Here each instance has its own cloud and keeps one.
+    # The paper keeps as many clusters as there are instances. Here each instance has its own cloud, with one cluster.
     valid = largest_clusters(labels, valid, 1)
     return _with_centroids(points, valid, _cloud_pixels(masks, valid, voxel, pixel, config.stride), config.min_points)
 

@@ -19,8 +19,8 @@ from v3d_torch.objects.track_matching import (
     DEPTH_TOLERANCE,
     DetectedInstances,
     PredictedTracks,
-    compare_lost_tracks,
     compare_tracks,
+    compare_without_masks,
     detect_instances,
     predict_tracks,
 )
@@ -47,9 +47,10 @@ class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
     The instances of a frame continue tracks in four stages, each an optimal assignment: first confirmed tracks, then
-    lost ones, then new ones that are not confirmed yet; instances without a class continue what is left. A track that
-    is not detected is predicted with its mask for a short time. Then it is lost: it has no mask any more, but keeps its
-    id for some seconds, in case it was hidden or out of view. The state (tracks and next id) is part of
+    those without masks, then new ones that are not confirmed yet; instances without a class continue what is left. If
+    an object is not detected any more and may move, its mask is predicted for a short time. Nobody needs the mask of
+    furniture, whose pixels tracking uses: it rests for this time, without a mask. Then both are lost: they keep their
+    ids for some seconds, in case they were hidden or out of view. The state (tracks and next id) is part of
     ``state_dict()``.
 
     Args:
@@ -58,7 +59,8 @@ class InstanceTracker(torch.nn.Module):
         voxel_size: Spacing of the points of the clouds, metres.
 
     Attributes:
-        tracks: Tracks that were detected in the newest frame, or missed for at most the maximum time.
+        tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
+        resting: Tracks that cannot move by themselves and were missed for at most the maximum time.
         lost: Confirmed tracks that were missed for longer.
     """
 
@@ -71,12 +73,14 @@ class InstanceTracker(torch.nn.Module):
         self._next_id = 1
         self._last_stamp = -torch.inf
         self.tracks: list[Track] = []
+        self.resting: list[Track] = []
         self.lost: list[Track] = []
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the tracks and the next id, for ``state_dict()``."""
         return {
             "tracks": list(self.tracks),
+            "resting": list(self.resting),
             "lost": list(self.lost),
             "next_id": self._next_id,
             "last_stamp": self._last_stamp,
@@ -88,7 +92,8 @@ class InstanceTracker(torch.nn.Module):
         Args:
             state: Result of `get_extra_state`.
         """
-        self.tracks, self.lost = list(state["tracks"]), list(state["lost"])
+        self.tracks, self.resting = list(state["tracks"]), list(state["resting"])
+        self.lost = list(state["lost"])
         self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
 
     def forward(
@@ -111,7 +116,7 @@ class InstanceTracker(torch.nn.Module):
             appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
         Returns:
-            Tracks that were detected, or missed for at most the maximum time, sorted by id.
+            Tracks that were detected, or may move and were missed for at most the maximum time, sorted by id.
         """
         camera, stride = self._camera, self._stride
         detected = detect_instances(stamp, instances, clouds, appearance, T_wc, stride)
@@ -143,7 +148,7 @@ class InstanceTracker(torch.nn.Module):
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
-        for track in (*self.tracks, *self.lost):
+        for track in (*self.tracks, *self.resting, *self.lost):
             track.apply_world_correction(T_new_old)
 
     def _match(self, predicted: PredictedTracks, detected: DetectedInstances) -> dict[int, Track]:
@@ -164,7 +169,7 @@ class InstanceTracker(torch.nn.Module):
                 free_tracks[i], free_instances[j] = False, False
 
         assign(confirmed, labelled)
-        for track, j in self._match_lost(detected, labelled & free_instances):
+        for track, j in self._match_without_masks(detected, labelled & free_instances):
             matches[j] = track
             free_instances[j] = False
         assign(~confirmed, labelled)
@@ -172,15 +177,21 @@ class InstanceTracker(torch.nn.Module):
         assign(named, ~labelled)
         return matches
 
-    def _match_lost(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:
-        """Match instances to lost tracks, which become tracks again; return the pairs."""
-        if not self.lost or not bool(columns.any()):
+    def _match_without_masks(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:
+        """Match instances to resting and lost tracks, which are tracked again; return the pairs."""
+        labels = set(detected.labels[columns].tolist())
+        candidates = [track for track in (*self.resting, *self.lost) if track.label in labels]
+        if not candidates:
             return []
-        evidence = compare_lost_tracks(self.lost, detected, self._config)
-        found = [(self.lost[i], j) for i, j in _assign(evidence, torch.ones(len(self.lost), dtype=torch.bool), columns)]
+        evidence = compare_without_masks(candidates, detected, self._config)
+        pairs = _assign(evidence, torch.ones(len(candidates), dtype=torch.bool), columns)
+        found = [(candidates[i], j) for i, j in pairs]
         for track, _ in found:
-            track.restart(detected.stamp)
-            self.lost.remove(track)
+            if track in self.lost:
+                track.restart(detected.stamp)
+                self.lost.remove(track)
+            else:
+                self.resting.remove(track)
             self.tracks.append(track)
         return found
 
@@ -206,32 +217,43 @@ class InstanceTracker(torch.nn.Module):
     def _predict_missed_tracks(
         self, stamp: float, depth: Tensor, predicted: PredictedTracks, updated: Sequence[Track]
     ) -> list[Track]:
-        """Predict the masks of missed tracks, except those that have gone or are lost, and return them."""
-        missed, lost = [], []
+        """Predict the masks of the missed tracks that may move and have neither gone nor are lost; return these."""
+        missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
         covered = self._covered(predicted.tracks, predicted.masks & pack_masks(has_depth, self._stride), updated)
         for i, track in enumerate(predicted.tracks):
             if track in updated:
+                continue
+            if not track.may_move:
+                track.drop_masks()
+                resting.append(track)
                 continue
             seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
                 track.vacant_time += stamp - self._last_stamp
             if track.vacant_time > _MAX_VACANT_TIME:
                 continue
-            is_late = stamp - track.newest.stamp > self._config.max_missed_time
-            if is_late or covered[i]:
+            if stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:
                 lost.append(track)
                 continue
             mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
             track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
             track.visible = bool(predicted.visible[i])
             missed.append(track)
+        self._update_tracks_without_masks(stamp, resting, lost)
+        return missed
+
+    def _update_tracks_without_masks(self, stamp: float, resting: Sequence[Track], lost: Sequence[Track]) -> None:
+        """Store resting tracks, or lose them if they were missed for too long; forget lost tracks after some time."""
+        longest = self._config.max_missed_time
+        self.resting = [track for track in resting if stamp - track.newest.stamp <= longest]
+        lost = [*lost, *(track for track in resting if stamp - track.newest.stamp > longest)]
         for track in lost:
-            track.lose()
-        remembered = self._config.max_missed_time + self._config.max_lost_time
+            track.drop_masks()
+            track.drop_history()
+        remembered = longest + self._config.max_lost_time
         candidates = [*self.lost, *(track for track in lost if track.is_confirmed)]
         self.lost = [track for track in candidates if stamp - track.newest.stamp <= remembered]
-        return missed
 
     def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
         """Check for each track whether its predicted mask belongs to a detected track of the same class.

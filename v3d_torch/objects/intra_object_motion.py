@@ -17,8 +17,8 @@ class Deformation(NamedTuple):
     Attributes:
         distance: Root-mean-square nearest-neighbour distance, :math:`\sqrt{D / 2}` with D the Chamfer distance, metres,
             dtype of the clouds, shape :math:`(B,)`; NaN if one of the two clouds is empty.
-        deforming: Objects whose distance is at least the threshold, bool, shape :math:`(B,)`; False if the distance is
-            NaN.
+        deforming: Mask of the objects whose distance is at least the threshold, bool, shape :math:`(B,)`; False if the
+            distance is NaN.
     """
 
     distance: Tensor
@@ -41,9 +41,9 @@ def intra_object_motion(
     Args:
         previous: Clouds at the earlier time, metres, float32 or float64, shape :math:`(B, N, 3)`.
         current: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
-        distance_threshold: Distance from which an object is deforming, metres.
-        previous_valid: Points of ``previous`` that exist, bool, shape :math:`(B, N)`; all by default.
-        current_valid: Points of ``current`` that exist, bool, shape :math:`(B, M)`; all by default.
+        distance_threshold: Minimum distance of a deforming object, metres.
+        previous_valid: Mask of the previous points that are not padding, bool, shape :math:`(B, N)`; None for all.
+        current_valid: Mask of the current points that are not padding, bool, shape :math:`(B, M)`; None for all.
         T_current_previous: Transform from the frame of ``previous`` to that of ``current``, shape :math:`(B, 4, 4)`, or
             :math:`(4, 4)` for all objects; None if the frames are the same.
 
@@ -64,7 +64,7 @@ def intra_object_motion(
 
 
 def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
-    """Transform the valid points by T. Set all others to the origin: NaN would spread to the gradient of T."""
+    """Transform the valid points by T, and set the padding to the origin, because NaN would reach the gradient of T."""
     KORNIA_CHECK_SHAPE(T, ["4", "4"] if T.ndim == 2 else [str(points.shape[0]), "4", "4"])
     if valid is not None:
         points = torch.where(valid[..., None], points, 0)
@@ -76,7 +76,7 @@ class IntraObjectMotion(torch.nn.Module):
     """:func:`intra_object_motion` as a module.
 
     Args:
-        distance_threshold: Distance from which an object is deforming, metres.
+        distance_threshold: Minimum distance of a deforming object, metres.
     """
 
     def __init__(self, distance_threshold: float) -> None:

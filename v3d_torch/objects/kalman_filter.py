@@ -8,14 +8,14 @@ from torch import Tensor
 from v3d_torch.config import TrackerConfig
 
 _INITIAL_SPEED_SIGMA = 1.0
-"""Standard deviation of the initial velocity, m/s: a new object is as likely to move at walking speed as to rest."""
+"""Standard deviation of the initial velocity, m/s: a new object can be at rest or walk."""
 
 _MIN_SPEED = 1e-9
-"""Lower bound of a divisor, m/s."""
+"""Lower bound of the speed as a divisor, m/s."""
 
 
 class ConstantVelocityKalmanFilter:
-    """Position and velocity of one object. The three axes are independent and have the same covariance.
+    """Constant-velocity Kalman filter of one object; the three axes are independent and have the same covariance.
 
     Args:
         config: Noise and maximum speed.
@@ -94,10 +94,10 @@ class ConstantVelocityKalmanFilter:
         return pp, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
-        """Transform the state into the corrected world.
+        """Transform the state into the corrected world frame.
 
         Args:
-            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+            T_new_old: Transform from the old to the corrected world frame, float64, shape :math:`(4, 4)`.
         """
         R, t = T_new_old[:3, :3], T_new_old[:3, 3]
         self._position, self._velocity = R @ self._position + t, R @ self._velocity

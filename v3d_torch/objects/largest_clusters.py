@@ -15,13 +15,13 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
 
     Args:
         labels: Cluster of each point, -1 = noise, int64, shape :math:`(B, N)`.
-        valid: Points that exist, bool, shape :math:`(B, N)`.
+        valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`.
         n: Number of clusters to keep, one number for all clouds or int64 of shape :math:`(B,)`. Of two clusters of the
             same size, the one with the lower label ranks first.
         min_points: Minimum number of points of a cluster that is kept.
 
     Returns:
-        Points of the selected clusters, bool, shape :math:`(B, N)`.
+        Mask of the points of the selected clusters, bool, shape :math:`(B, N)`.
     """
     KORNIA_CHECK_SHAPE(labels, ["B", "N"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in labels.shape])

@@ -15,7 +15,7 @@ from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 
 _MAX_COMPILED_RADIUS = 254
-"""The kernel stores distances, up to one pixel more than the radius, as uint8."""
+"""Maximum radius of the compiled dilation, pixels: the kernel stores distances up to the radius plus one as uint8."""
 
 
 def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Sequence[int]) -> Tensor:
@@ -30,7 +30,7 @@ def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Seq
         Value of the cell at each pixel, dtype of ``cells``, shape :math:`(..., H, W)`.
     """
     height, width = image_size
-    # Along rows first, because that copies little. NumPy's repeat is faster here than torch's.
+    # Repeat along rows first, because that copies less. NumPy is faster here than torch.
     pixels = cells.repeat(cell_size, axis=-1)[..., :width].repeat(cell_size, axis=-2)[..., :height, :]
     return torch.from_numpy(np.ascontiguousarray(pixels))
 

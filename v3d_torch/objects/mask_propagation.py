@@ -1,9 +1,9 @@
 """Propagation of object masks to a frame without segmentation.
 
-A network that sees every second frame halves the largest cost of a frame. Between two of its frames an object moves by
-a few centimetres, which its track predicts, and the depth of the new frame shows its outline: the pixels near the
-predicted points with the depth of these points. The objects of propagated masks are measured like those of the network,
-so that centroids, votes and Chamfer distances use the new depth and not a prediction.
+Segmentation of every second frame halves the largest cost of a frame. In the frame between, the track of an object
+predicts its points, and the depth image gives its outline: the pixels near the predicted points that have the depth of
+these points. Objects of propagated masks are measured like objects of network masks, so that centroids, votes and
+Chamfer distances come from the depth of the frame and not from a prediction.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ _DEPTH_TOLERANCE = 0.2
 
 
 def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, spacing: float) -> Instances:
-    """Redraw the objects that were detected in the previous frame.
+    """Compute the masks of detected objects that may move from the depth of the current frame.
 
-    Unlabelled objects are left out, because they are found anew in the depth of each frame.
+    Unlabelled objects are left out, because they are detected in the depth of every frame. Furniture is left out,
+    because tracking uses its pixels.
 
     Args:
         tracks: Tracks after the previous frame.
@@ -37,7 +38,11 @@ def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: Pinhol
     Returns:
         Instances with the classes of the tracks, score 0 and empty boxes.
     """
-    detected = [track for track in tracks if not track.missed and track.newest.is_located and track.label != UNLABELLED]
+    detected = [
+        track
+        for track in tracks
+        if track.may_move and not track.missed and track.newest.is_located and track.label != UNLABELLED
+    ]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
     projected = silhouettes([track.predict_cloud(view.stamp) @ R.T + t for track in detected], camera, spacing)
     masks = [each.mask(view.depth, 0, _DEPTH_TOLERANCE, include_missing=True) for each in projected]

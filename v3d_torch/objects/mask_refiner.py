@@ -1,8 +1,8 @@
 """Mask refinement: pixels of an object beyond the mask of the network.
 
-A network draws coarse contours, and of a person who is partly in the image it often segments the head and misses an
-arm. Depth corrects both. The rim of a mask belongs to the object if its depth agrees with the object's points. A
-surface that continues from there without a depth edge also belongs to the object, unless it was there before.
+The contours of a network are coarse, and its mask of a person who is partly in the image often misses an arm. Depth
+corrects both. Pixels around a mask belong to the object if their depth agrees with the object's points. A surface that
+continues from there without a depth edge also belongs to the object, unless the surface was there before the object.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class MaskRefiner:
 
 
 def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], tuple[slice, slice]]:
-    """Return the number of connected components, the component of each cell, and the rows and columns of the latter."""
+    """Return the number of connected components, and the component of each cell in the returned rows and columns."""
     # Crop to the region, with a margin of one cell for the final dilation.
     left, top, width, height = cv2.boundingRect(region)
     crop = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
@@ -130,7 +130,8 @@ def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int,
         min_fraction: Minimum fraction of a surface that lies on the object.
 
     Returns:
-        Reachable pixels of the connected surfaces of which enough lies on the object, bool, shape :math:`(H, W)`.
+        Reachable pixels of the connected surfaces that lie on the object to a sufficient fraction, bool, shape
+        :math:`(H, W)`.
     """
     count, components, (rows, columns) = _components(region.view(torch.uint8).numpy())
     size = np.bincount(components.ravel(), minlength=count)
@@ -148,7 +149,7 @@ def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int,
 
 
 def _smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> NDArray[np.bool_]:
-    """Return every n-th pixel around which depth varies by less than a fraction of it, within half the step.
+    """Check at every n-th pixel whether the depth within half the step of it varies by less than ``edge_ratio``.
 
     Args:
         depth: Depth, metres, shape (H, W); 0 = no measurement.

@@ -19,15 +19,15 @@ from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.objects.voting import vote_with_free_space
 
 MOVED_FRACTION = 0.5
-"""An object has moved if at least this fraction of its visible points appeared or vacated: contours and partial
-occlusion affect only a part of a static object."""
+"""Minimum fraction of the visible points of a moved object that appeared or vacated: contours and partial occlusion
+affect only a part of a static object."""
 
 DEFORMED_FRACTION = 0.1
-"""An object has deformed if at least this fraction of its visible points appeared or vacated. Silhouettes err by a
-pixel or two, which is some hundredths of a person; a torso of 0.4 m that sways by 4 cm reaches this fraction."""
+"""Minimum fraction of the visible points of a deformed object that appeared or vacated. The error of silhouettes is one
+or two pixels, some hundredths of a person; a torso of 0.4 m that sways by 4 cm reaches this fraction."""
 
 DetectionPairs = dict[Track, tuple[Detection3D, Detection3D]]
-"""Earlier and newest detection of each object that has both."""
+"""Earlier and newest detection of each object for which both exist."""
 
 
 def detection_pairs(tracks: Iterable[Track], baselines: Iterable[float]) -> dict[float, DetectionPairs]:
@@ -115,7 +115,8 @@ class VoteEvidence:
     Attributes:
         votes: Maximum number of votes of each compared object over the baselines.
         dynamic: Objects that are voted dynamic over some baseline, or that appeared.
-        vote_pairs: Votes that counted over some baseline: id of the voter and id of the object with the vote, sorted.
+        vote_pairs: Votes that counted over some baseline: id of the voting object and id of the object voted for,
+            sorted.
     """
 
     votes: dict[Track, int]
@@ -130,7 +131,7 @@ def hough_vote_evidence(
     previous_stamp: float,
     config: VotingConfig,
 ) -> VoteEvidence:
-    """Let the objects vote over all baselines (paper, Alg. 1).
+    """Vote over all baselines (paper, Alg. 1).
 
     Args:
         detected: Tracks that are detected in the frame.
@@ -146,7 +147,7 @@ def hough_vote_evidence(
         return VoteEvidence({}, set(), [])
     max_votes: dict[Track, int] = {}
     vote_pairs: set[tuple[int, int]] = set()
-    # A newly detected object has no earlier distance that could have changed: only the free-space check votes on it.
+    # A newly detected object has no earlier distance to compare, so only the free-space check votes for it.
     dynamic = {track for track in detected if free_space.has_appeared(track)}
     for baseline in config.baselines:
         compared = pairs[baseline]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
+
+from v3d_torch.geometry.packed_masks import count_common_pixels, pack_masks
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,11 @@ class NewlyOccupied:
         Returns:
             Fraction for each object and baseline, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
         """
-        step, appeared = self.stride, self.appeared.flatten(1)
+        baselines = len(self.appeared)
         if not masks:
-            return appeared.new_zeros(0, len(appeared))
-        inside = np.stack([mask.numpy()[::step, ::step] for mask in masks]).reshape(len(masks), -1)
-        # float32 counts pixels exactly and is faster.
-        indicators = torch.cat([appeared == 1, ~appeared.isnan()]).to(torch.float32)
-        counts = torch.from_numpy(inside.astype(np.float32)) @ indicators.T
-        new, known = counts.to(appeared.dtype).chunk(2, dim=1)
+            return self.appeared.new_zeros(0, baselines)
+        inside = pack_masks(torch.stack([mask[:: self.stride, :: self.stride] for mask in masks]))
+        indicators = pack_masks(torch.cat([self.appeared == 1, ~self.appeared.isnan()]))
+        counts = count_common_pixels(inside, indicators).to(torch.float64)
+        new, known = counts[:, :baselines], counts[:, baselines:]
         return (new / known).masked_fill(known < min_pixels, torch.nan)

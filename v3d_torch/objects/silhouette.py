@@ -27,7 +27,7 @@ _NO_DEPTH = 1e6
 """Depth of cells without points, metres: farther than any measurement."""
 
 _MIN_DEPTH = 0.1
-"""Points nearer than this, or behind the camera, are not projected, metres."""
+"""Minimum depth of projected points, metres."""
 
 ProjectedCells = tuple[NDArray[np.int64], NDArray[np.float32]]
 """Cell (column, row), shape (P, 2), and depth, metres, shape (P,), of the points of a cloud that are in the image."""
@@ -211,7 +211,7 @@ class Silhouette:
         return float((np.abs(self._measured_depth(depth) - self._z) < tolerance).mean())
 
     def count_seen_through(self, depth: Tensor, tolerance: float) -> int:
-        """Return the number of projected points behind which a surface is measured: their place is empty.
+        """Count the projected points behind which a surface is measured, so that their place is empty.
 
         Args:
             depth: Measured depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
@@ -227,6 +227,6 @@ class Silhouette:
 
 
 def _pixels_of_cells(first: int, count: int, step: int, size: int) -> slice:
-    """Return the range of every n-th pixel within ``count`` cells from ``first`` on, along one axis."""
+    """Return the range of every n-th pixel of ``count`` cells that start with the cell ``first``, along one axis."""
     begin, end = max(-(-first * _CELL // step), 0), min(-(-(first + count) * _CELL // step), size)
     return slice(begin, max(begin, end))

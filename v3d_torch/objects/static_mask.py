@@ -1,4 +1,4 @@
-"""Static mask: the pixels of a frame that tracking can use, and those of them that show no person."""
+"""Static mask: pixels of a frame that tracking can use, and the subset that shows no person."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
-from v3d_torch.segmentation.coco import UNLABELLED
+from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 
 _CENTROID_SIGMA = 0.05
 """Standard deviation of the centroid of a fully visible object, metres: arms and legs swing by more, the error of the
@@ -117,6 +117,11 @@ class Track:
         return self.detections[-1]
 
     @property
+    def may_move(self) -> bool:
+        """True if the object can move by itself or has moved; false for furniture that was always at rest."""
+        return self.label not in RIGID or self.last_dynamic > -torch.inf
+
+    @property
     def velocity(self) -> Tensor:
         """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
         return self._filter.velocity
@@ -184,15 +189,18 @@ class Track:
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
 
-    def lose(self) -> None:
-        """Drop the masks and all but the newest detection, which only an object in view needs."""
+    def drop_masks(self) -> None:
+        """Drop the masks: the object is not detected, and not predicted either."""
         nothing = torch.zeros(0, 0, dtype=torch.bool)
         self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True)
         self.visible = False
+
+    def drop_history(self) -> None:
+        """Drop all but the newest detection: motion is not measured across a long absence."""
         self.detections = self.detections[-1:]
 
     def restart(self, stamp: float) -> None:
-        """Forget the detections before an object was lost: motion is measured anew.
+        """Forget the detections from before the object was lost; motion is measured anew.
 
         Args:
             stamp: Timestamp of the first detection afterwards, seconds.

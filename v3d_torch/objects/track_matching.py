@@ -28,7 +28,8 @@ _MIN_VISIBLE_FRACTION = 0.5
 """An object is visible at its predicted position if the depth agrees with more than this fraction of its points."""
 
 _MAX_BESIDE_COVERAGE = 0.1
-"""An instance lies beside a predicted mask if their intersection is less than this fraction of the smaller area."""
+"""An instance does not overlap a predicted mask if their intersection is less than this fraction of the smaller
+area."""
 
 _MIN_COVERAGE = 0.5
 """An instance covers a predicted mask if their intersection is at least this fraction of the smaller area."""
@@ -39,7 +40,7 @@ DEPTH_TOLERANCE = 0.2
 
 @dataclass(frozen=True)
 class DetectedInstances:
-    """Instances of a frame, as the tracker compares them.
+    """Instances of a frame, prepared for the comparison with tracks.
 
     Attributes:
         stamp: Timestamp, seconds.
@@ -61,7 +62,7 @@ class DetectedInstances:
 
 @dataclass(frozen=True)
 class PredictedTracks:
-    """Tracks at their predicted positions in a frame.
+    """Tracks predicted to the time of a frame.
 
     Attributes:
         tracks: T tracks.
@@ -123,7 +124,7 @@ def predict_tracks(
     spacing: float,
     stride: int,
 ) -> PredictedTracks:
-    """Predict tracks, and check whether they are visible there.
+    """Predict tracks, and check whether they are visible at their predicted positions.
 
     Args:
         tracks: Tracks.
@@ -149,9 +150,9 @@ def predict_tracks(
 def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Add up the evidence for each pair of a track and an instance.
 
-    An instance can continue a track of its class within the gate or whose predicted mask it covers, and any track whose
-    last or predicted mask it overlaps: the position jumps when an object is hidden. An instance beside an object that
-    is visible at its predicted position is another object.
+    An instance can continue a track of its class if it lies within the gate or covers the predicted mask. It can
+    continue a track of any class if it overlaps the last or the predicted mask, because the position jumps when an
+    object is partly hidden. An instance that does not overlap the predicted mask of a visible track is another object.
 
     Args:
         predicted: T tracks.
@@ -161,7 +162,7 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     Returns:
         Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
     """
-    # The last mask is exact if little moves. The predicted mask follows fast walkers and a turning camera.
+    # The last mask is accurate if little moves; the predicted mask follows fast walkers and a turning camera.
     last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
     intersection = count_common_pixels(predicted.masks, detected.masks)
     areas, predicted_areas = count_pixels(detected.masks), count_pixels(predicted.masks)[:, None]
@@ -185,11 +186,11 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     return evidence.masked_fill(~possible, -torch.inf)
 
 
-def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    """Add up the evidence for each pair of a lost track and an instance; a lost track has no predicted mask.
+def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+    """Add up the evidence for each pair of a track without a predicted mask and an instance.
 
     Args:
-        tracks: T lost tracks.
+        tracks: T tracks.
         detected: N instances.
         config: Gates.
 
@@ -203,7 +204,7 @@ def compare_lost_tracks(tracks: Sequence[Track], detected: DetectedInstances, co
 
 
 def _position_evidence(tracks: Sequence[Track], detected: DetectedInstances, possible: Tensor) -> Tensor:
-    """Evidence of the positions of the possible pairs, 0 for the others, shape (T, N)."""
+    """Evidence of the positions of possible pairs, 0 for other pairs, shape (T, N)."""
     squared_distance = torch.full(possible.shape, torch.nan, dtype=torch.float64)
     variance = torch.ones_like(squared_distance)
     for i, j in possible.nonzero().tolist():
@@ -226,7 +227,7 @@ def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
 
 
 def _within_gate(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    """Check which instances are within the distance that each track can have moved, bool, shape (T, N)."""
+    """Mask of the pairs whose distance is within the maximum motion of the track, bool, shape (T, N)."""
     predicted = torch.stack([track.predict_centroid(detected.stamp) for track in tracks])
     observed = torch.stack([detection.centroid for detection in detected.detections])
     elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)

@@ -1,8 +1,7 @@
 """Unlabelled instances: newly occupied regions that no instance of the segmentation covers.
 
-The network misses tilted or partly visible people, and has no class for a carried box. But their points do not fit the
-camera motion: they lie in space that an earlier view observed as free. Connected regions of such pixels become
-instances without a class.
+The network misses tilted or partly visible people, and has no class for a carried box. But the points of moving objects
+lie in space that an earlier view observed as free. Connected regions of such pixels become instances without a class.
 """
 
 from __future__ import annotations
@@ -22,7 +21,8 @@ _OPENING_KERNEL = np.ones((3, 3), np.uint8)
 """Isolated newly occupied pixels are depth noise; opening by this kernel removes them (pixels of `NewlyOccupied`)."""
 
 _RIM_KERNEL = np.ones((5, 5), np.uint8)
-"""Pixels this near to an instance are its rim, which a coarse mask cuts off (pixels of `NewlyOccupied`)."""
+"""Distance within which pixels belong to the contour of an instance, which a coarse mask cuts off (pixels of
+`NewlyOccupied`)."""
 
 
 def unlabelled_instances(

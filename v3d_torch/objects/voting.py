@@ -1,4 +1,4 @@
-"""Spatial-reasoned Hough voting: moving objects without the camera pose (paper, Sec. III-C, Alg. 1)."""
+"""Hough voting with spatial reasoning: detection of moving objects without camera pose (paper, Sec. III-C, Alg. 1)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 from v3d_torch.config import VotingConfig
 
 _STATIC_VOTER_RATIO = 0.5
-"""Beside the free-space check, an object votes only if its own centroid moved by less than this fraction of the
-distance threshold. Then at least half of every change that counts as a vote is motion of the other object."""
+"""Maximum motion of the centroid of a voting object if the free-space check is enabled, as a fraction of the distance
+threshold: then at least half of every change that counts as a vote is motion of the other object."""
 
 
 class Votes(NamedTuple):
@@ -25,7 +25,7 @@ class Votes(NamedTuple):
             the diagonal and for objects that are not present.
         change: Absolute change of the distance between objects i and j, metres, shape :math:`(..., K, K)`; 0 on the
             diagonal and for objects that are not present.
-        dynamic: Objects with enough votes, bool, shape :math:`(..., K)`.
+        dynamic: Mask of the objects with enough votes, bool, shape :math:`(..., K)`.
     """
 
     votes: Tensor
@@ -42,7 +42,7 @@ def hough_vote(
     vote_threshold: float | Tensor,
     temperature: float | Tensor | None = None,
 ) -> Votes:
-    r"""Let every object vote for the objects whose distance to it has changed.
+    r"""Hough voting: each object votes for all objects whose distance to it has changed.
 
     The distance between two static objects does not depend on the camera position. Therefore the centroids of both
     times can stay in the camera frames of their own times, and no pose is needed. Row i of both inputs is the same
@@ -51,16 +51,16 @@ def hough_vote(
     Args:
         previous: Centroids at the earlier time, metres, shape :math:`(..., K, 3)`.
         current: Centroids at the current time, metres, shape :math:`(..., K, 3)`.
-        present: Objects that are observed at both times, bool, shape :math:`(..., K)`; the centroids of all others are
-            ignored.
-        distance_threshold: Change of a distance that counts as a vote, :math:`T_d`, metres.
-        vote_threshold: Number of votes that makes an object dynamic, :math:`T_v`.
-        temperature: Softness of the vote, metres: the indicator becomes the differentiable function
+        present: Mask of the objects that are observed at both times, bool, shape :math:`(..., K)`; the centroids of all
+            others are ignored.
+        distance_threshold: Minimum change of a distance that counts as a vote, :math:`T_d`, metres.
+        vote_threshold: Minimum number of votes of a dynamic object, :math:`T_v`.
+        temperature: Width of a soft vote, metres: the indicator is the differentiable function
             :math:`\sigma((change - T_d) / temperature)`. None for the step function of the paper.
 
     Returns:
-        Votes. ``change`` is differentiable in both centroids. With a temperature, ``pair`` and ``votes`` are
-        differentiable too, also in threshold and temperature if these are tensors.
+        Votes. ``change`` is differentiable in both inputs of centroids. With a temperature, ``pair`` and ``votes`` are
+        differentiable in centroids, and in thresholds and temperature if these are tensors.
     """
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
@@ -80,7 +80,7 @@ def hough_vote(
 
 
 def _pairwise_distances(centroids: Tensor, present: Tensor) -> Tensor:
-    """Return all pairwise distances, (..., K, K). Absent rows are set to the origin: NaN would spread to gradients."""
+    """Return all pairwise distances, (..., K, K). Absent rows are set to the origin: NaN would reach the gradients."""
     centroids = torch.where(present[..., None], centroids, 0)
     return torch.linalg.vector_norm(centroids[..., :, None, :] - centroids[..., None, :, :], dim=-1)
 
@@ -91,18 +91,18 @@ def vote_with_free_space(
     """Hough voting (paper, Alg. 1) with the free-space check as an additional voter and veto.
 
     Objects that moved, or whose centroid jumped because they were cut off, do not vote. An object is dynamic only if it
-    moved according to the free-space check and has enough votes, the vote of the check included.
+    moved according to the free-space check, and has enough votes including the vote of the check.
 
     Args:
         previous: Centroids of K objects at the earlier time, world frame, metres, shape :math:`(K, 3)`.
         current: Centroids of the same objects at the current time, shape :math:`(K, 3)`.
-        moved: Objects that moved according to the free-space check, bool, shape :math:`(K,)`; None for the rule of the
-            paper.
+        moved: Mask of the objects that moved according to the free-space check, bool, shape :math:`(K,)`; None if the
+            check is disabled, for the rule of the paper.
         config: Thresholds.
 
     Returns:
-        Number of votes for each object, int64, shape :math:`(K,)`; objects that are dynamic, bool, shape :math:`(K,)`;
-        and the votes between objects that counted, of column j for row i, int64, shape :math:`(K, K)`.
+        Number of votes for each object, int64, shape :math:`(K,)`; mask of the dynamic objects, bool, shape
+        :math:`(K,)`; and the votes between objects that counted, of column j for row i, int64, shape :math:`(K, K)`.
     """
     present = torch.ones(previous.shape[0], dtype=torch.bool)
     result = hough_vote(previous, current, present, config.distance_threshold, config.vote_threshold)
@@ -113,19 +113,19 @@ def vote_with_free_space(
     may_vote = ~moved & ((current - previous).norm(dim=1) < _STATIC_VOTER_RATIO * config.distance_threshold)
     pair = pair * may_vote
     votes = pair.sum(dim=1) + moved
-    # The voters on an object are all other objects that may vote, and the free-space check. If they are fewer than the
-    # vote threshold, all of them must agree.
+    # Voters on an object are all other objects that may vote, and the free-space check. If there are fewer of them than
+    # the vote threshold, all of them must vote for the object.
     voters = may_vote.sum() - may_vote.long() + 1
     return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), pair
 
 
 class HoughVoting(torch.nn.Module):
-    """:func:`hough_vote` as a module. A setting that is a `torch.nn.Parameter` can be learnt.
+    """:func:`hough_vote` as a module. A parameter given as a `torch.nn.Parameter` can be learned.
 
     Args:
-        distance_threshold: Change of a distance that counts as a vote, metres.
-        vote_threshold: Number of votes that makes an object dynamic.
-        temperature: Softness of the vote, metres; None for the step function of the paper.
+        distance_threshold: Minimum change of a distance that counts as a vote, metres.
+        vote_threshold: Minimum number of votes of a dynamic object.
+        temperature: Width of a soft vote, metres; None for the step function of the paper.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from v3d_torch.kernels.occupancy import UNKNOWN
 from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
 
 _BATCH = 1 << 20
-"""Voxels that are looked up together, to bound the memory."""
+"""Number of voxels that are looked up at once; it bounds the memory."""
 
 
 class NearestVoxels:
@@ -24,7 +24,7 @@ class NearestVoxels:
 
     Args:
         centres: Centres of the voxels, metres, float64, shape :math:`(N, 3)`; N can be 0.
-        max_distance: Distance up to which voxels are searched, metres.
+        max_distance: Maximum distance of a voxel that is found, metres.
     """
 
     def __init__(self, centres: Tensor, max_distance: float) -> None:
@@ -39,8 +39,8 @@ class NearestVoxels:
             points: Finite points, metres, float64, shape :math:`(P, 3)`.
 
         Returns:
-            Centre of the nearest voxel, shape :math:`(P, 3)`, and whether there is one within the distance, bool, shape
-            :math:`(P,)`; without one the centre is the point itself.
+            Centre of the nearest voxel, shape :math:`(P, 3)`, and mask of the points with a voxel within the distance,
+            bool, shape :math:`(P,)`; for other points, the centre is the point itself.
         """
         _, row = self._tree.query(points.numpy(), distance_upper_bound=self._max_distance)
         index = torch.from_numpy(np.asarray(row))

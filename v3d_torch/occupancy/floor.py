@@ -9,38 +9,38 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from v3d_torch.occupancy.gravity import UpDirection
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
+from v3d_torch.occupancy.up_direction import UpDirection
 
 _MAX_VOXELS = 8192
-"""Voxels that are used, which bounds the time; of more, every n-th is used."""
+"""Maximum number of voxels that are used, to bound the time; a larger number is subsampled."""
 
 _MAX_CANDIDATES = 1024
-"""Normals that are compared with all others as up direction; of more, every n-th is used."""
+"""Maximum number of normals that are tested as up direction; a larger number is subsampled."""
 
 _NORMAL_RADIUS = 2
-"""Voxels around a voxel whose states give its normal."""
+"""Radius of the neighbourhood whose states determine the normal of a voxel, voxels."""
 
 _DIRECTION_TOLERANCE = math.radians(10)
-"""Error of the normal of a single voxel, as the states around it are coarse."""
+"""Maximum error of the normal of a single voxel, radians; it is large, because the states around a voxel are coarse."""
 
 _FACING_TOLERANCE = math.radians(30)
-"""Largest angle between up and the normal of a voxel of the floor; at the foot of a wall the normal is tilted."""
+"""Maximum angle between up and the normal of a voxel of the floor, radians; near a wall the normal is tilted."""
 
 _MIN_VOXELS = 30
-"""Smallest number of voxels that determine a direction or a plane."""
+"""Minimum number of voxels for a direction or a plane."""
 
 _MAX_LEVELS = 6
-"""Levels of horizontal surfaces that are used: floor, tables, shelves."""
+"""Maximum number of levels of horizontal surfaces: floor, tables, shelves."""
 
 _MIN_AREA = 0.25
-"""Smallest visible area of a floor, square metres; steps and boxes are smaller."""
+"""Minimum visible area of a floor, square metres; steps and boxes are smaller."""
 
 _MAX_BELOW = 0.2
-"""Largest number of voxels below the floor, as a fraction of its own: below a table there are more."""
+"""Maximum number of voxels below the floor, as a fraction of the voxels of the floor: below a table there are more."""
 
 _REFINEMENTS = 3
-"""Times that direction and plane are fitted again to their voxels."""
+"""Number of times that direction and planes are refitted to their voxels."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class Floor:
 def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     """Find the floor of a map.
 
-    The up direction is the normal with which most other normals agree: those of floor, tables and ceiling are parallel.
-    Then the levels at which most upward voxels lie are found, and parallel planes are fitted to all of them, because
-    often only a small part of the floor is visible. The floor is the lowest level that is large enough and has few
-    voxels below it. All voxels are hypotheses, so that nothing is random.
+    The up direction is the normal with which most other normals agree: the normals of floor, tables and ceiling are
+    parallel. Then the levels with the most voxels that face up are found, and parallel planes are fitted to all levels,
+    because often only a small part of the floor is visible. The floor is the lowest level that is large enough and has
+    few voxels below it. All voxels are hypotheses, so the result is deterministic.
 
     Args:
         occupancy: Map.
@@ -105,7 +105,7 @@ def _voxel_normals(occupancy: OccupancyMap, points: Tensor) -> Tensor:
 
 
 def _common_direction(normals: Tensor, up: UpDirection) -> Tensor | None:
-    """The direction near up with which most normals agree, up or down, (3,); None if too few do."""
+    """Direction near up, (3,), to which most normals are parallel or antiparallel; None if too few are."""
     candidates = normals[normals @ up.direction > math.cos(up.tolerance)]
     candidates = candidates[:: max(math.ceil(len(candidates) / _MAX_CANDIDATES), 1)]
     agreeing = ((normals @ candidates.T).abs() > math.cos(_DIRECTION_TOLERANCE)).sum(dim=0)
@@ -120,7 +120,7 @@ def _common_direction(normals: Tensor, up: UpDirection) -> Tensor | None:
 
 
 def _find_levels(heights: Tensor, size: float) -> list[Tensor]:
-    """Masks of the points at each level, (N,) each, by number of points: a level is two voxels high."""
+    """Masks of the points at each level, (N,) each, sorted by number of points; a level is two voxels high."""
     free, levels = torch.ones_like(heights, dtype=torch.bool), []
     for _ in range(_MAX_LEVELS):
         own = heights[free].sort().values
@@ -144,14 +144,14 @@ def _fit_normal(points: Tensor, levels: list[Tensor], size: float, direction: Te
 
 
 def _lowest_level(heights: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
-    """The lowest level of enough points with these heights (N,), of which each covers an area."""
+    """Lowest level with enough points, given their heights (N,) and the area that each point covers."""
     heights = heights.sort().values
     counts = _count_near(heights, heights, size)
     below = torch.searchsorted(heights, heights - size)
     is_floor = (counts >= _MIN_VOXELS) & (counts * area >= _MIN_AREA) & (below <= _MAX_BELOW * counts)
     if not bool(is_floor.any()):
         return None
-    # The lowest voxels of a floor are noise; its height is that at which most of them lie.
+    # The lowest voxels of a floor are noise; the height of the floor is that of most voxels.
     near = heights <= heights[is_floor][0] + 2 * size
     offset = heights[int(torch.where(near, counts, 0).argmax())]
     offset = heights[(heights - offset).abs() <= size].mean()

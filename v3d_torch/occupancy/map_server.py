@@ -1,4 +1,4 @@
-"""2D grids as files of ROS's map_server: an image ``.pgm`` and its description ``.yaml``."""
+"""2D grids as files of the map_server of ROS: an image ``.pgm`` and its description ``.yaml``."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.occupancy.occupancy_map import VoxelState
 
 _GREY = {VoxelState.OCCUPIED: 0, VoxelState.UNKNOWN: 205, VoxelState.FREE: 254}
-"""Grey values that map_saver writes. map_server reads a pixel as occupied if (255 - grey) / 255 is above the occupied
-threshold, as free below the free threshold, else as unknown."""
+"""Grey values of map_saver. map_server reads a pixel as occupied if (255 - grey) / 255 is above the occupied threshold,
+as free if it is below the free threshold, and otherwise as unknown."""
 
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of map_saver."""

@@ -1,4 +1,4 @@
-"""2D occupancy grid above the floor of an occupancy map, as planners of wheeled robots use it."""
+"""2D occupancy grid above the floor of an occupancy map, for planners of wheeled robots."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 
 _MIN_FREE = 0.5
-"""Smallest fraction of the heights above a free cell that was observed as free: a ray high above it is not enough."""
+"""Minimum fraction of the heights above a free cell that was observed as free; a single ray high above it is not
+enough."""
 
 
 @dataclass(frozen=True)

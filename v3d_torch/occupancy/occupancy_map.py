@@ -20,7 +20,7 @@ from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
 _LOG = logging.getLogger(__name__)
 
 _KEPT_FRACTION = 0.9
-"""Fraction of the maximum number of blocks that is kept when blocks are removed, so that this is rare."""
+"""Fraction of the maximum number of blocks that is kept when blocks are removed, so that removal is rare."""
 
 
 class VoxelState(IntEnum):
@@ -34,7 +34,7 @@ class VoxelState(IntEnum):
 class OccupancyMap:
     """Voxel grid with log-odds of occupancy, in the world frame.
 
-    Voxel (i, j, k) is the cube between the corners (i, j, k) and (i + 1, j + 1, k + 1), times the size of a voxel. It
+    Voxel (i, j, k) is the cube between the corners (i, j, k) and (i + 1, j + 1, k + 1) in units of the voxel size. It
     is occupied if its probability is at least 0.5, and unknown if it was never observed. All queries take batches of
     points.
 
@@ -69,8 +69,8 @@ class OccupancyMap:
 
         Args:
             depth: Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement. Pixels can be subsampled.
-            static: Mask of static pixels, bool, shape :math:`(h, w)`. The others are no obstacles; they only show that
-                the space in front of them is free.
+            static: Mask of static pixels, bool, shape :math:`(h, w)`. Other pixels are not obstacles; they only show
+                that the space in front of them is free.
             rays: Viewing ray of each pixel at unit depth, float32, shape :math:`(h, w, 3)`; see `PinholeCamera.rays`.
             T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
         """
@@ -162,7 +162,7 @@ class OccupancyMap:
         self._nearest = None
 
     def _offsets(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Vectors from the nearest occupied voxels to points, (..., 3), and which are not truncated, (...)."""
+        """Vectors from the nearest occupied voxels to points, (..., 3), and mask of those not truncated, (...)."""
         if self._nearest is None:
             self._nearest = NearestVoxels(self.occupied_points, self.config.max_distance)
         nearest, near = self._nearest(points.detach().reshape(-1, 3).to(torch.float64))
@@ -177,7 +177,7 @@ class OccupancyMap:
         return (self.blocks.voxels_where(mask).to(torch.float64) + 0.5) * self.config.voxel_size
 
     def _remove_farthest(self, camera: Tensor) -> None:
-        """Remove the blocks farthest from the camera, but none that reaches into the window around it."""
+        """Remove the blocks farthest from the camera, but no block within the window around the camera."""
         side = SIDE * self.config.voxel_size
         gap = cube_gap(camera, self.blocks.coordinates, side)
         kept = max(int(_KEPT_FRACTION * self.config.max_blocks), 1)

@@ -1,4 +1,4 @@
-"""Growth of the occupancy map frame by frame, and its correction when the poses of the frames are corrected."""
+"""Occupancy mapping: integration of frames, and correction of the map when poses are corrected."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.floor import Floor, find_floor
-from v3d_torch.occupancy.gravity import UpDirection, estimate_up
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.range_view import RangeView
+from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 from v3d_torch.occupancy.view_store import ViewStore, displacement
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import TrackingStatus
@@ -23,25 +23,25 @@ from v3d_torch.types import TrackingStatus
 _LOG = logging.getLogger(__name__)
 
 _CHECK_INTERVAL = 10
-"""Views between two checks whether poses were corrected: about a second."""
+"""Number of views between two checks for corrected poses: about a second."""
 
 _MAX_DISPLACEMENT = 0.5
-"""Largest displacement of a view with which the map stays as it is, voxels."""
+"""Maximum displacement of a view that does not cause a rebuild of the map, voxels."""
 
 _FIRST_SEARCH = 16
 """Number of views after which the floor is first searched: a second and a half. It is searched again whenever their
 number has doubled, because a search takes up to a tenth of a second."""
 
 _REBUILD_VIEWS = 4
-"""Views that are added again with each new view while the map is rebuilt: a rebuild is spread over many frames."""
+"""Number of stored views that are added with each new view during a rebuild, which is spread over many frames."""
 
 
 class OccupancyMapper:
     """Adds frames to an occupancy map.
 
-    The range views that were added are stored. When bundle adjustment or a loop has moved one of them by more than half
-    a voxel, the map is rebuilt from all of them beside the current map, a few views per frame, and then replaces it.
-    A map after a rebuild is the map that the corrected poses would have given from the start.
+    All added range views are stored. When bundle adjustment or a loop has moved one of them by more than half a voxel,
+    a new map is built from all views, a few per frame, and then replaces the current map. It equals the map that the
+    corrected poses would have given from the start.
 
     Args:
         config: Occupancy map.
@@ -49,20 +49,18 @@ class OccupancyMapper:
 
     Attributes:
         map: The occupancy map.
-        accelerometer: Unit vector against gravity in the frame of the first camera, float64, shape :math:`(3,)`, as an
-            accelerometer at rest measures it; None without accelerometer.
+        up: Approximate up direction, which `find_floor` refines.
         floor: Floor of the map when it was last found; None before.
     """
 
-    def __init__(self, config: OccupancyConfig, camera: PinholeCamera, accelerometer: Tensor | None = None) -> None:
+    def __init__(self, config: OccupancyConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._camera = camera
-        self.accelerometer = accelerometer
         self.map = OccupancyMap(config)
+        self.up = estimate_up()
         self.floor: Floor | None = None
         self._store = ViewStore(config.max_views)
         self._count = 0
-        self._up_votes: Tensor | None = None
         self._rebuilt: OccupancyMap | None = None
         self._rebuilt_views = 0
 
@@ -71,21 +69,16 @@ class OccupancyMapper:
         """True while the map is rebuilt after a correction of the poses."""
         return self._rebuilt is not None
 
-    @property
-    def up(self) -> UpDirection:
-        """Approximate up direction, which `find_floor` refines."""
-        return estimate_up(self.accelerometer, self._up_votes)
-
-    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up_votes: Tensor | None = None) -> None:
+    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up: UpDirection | None = None) -> None:
         """Add a frame, if it is due and its pose is known.
 
         Args:
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             poses: Poses of all frames up to this one.
-            up_votes: Sum of the votes of the segmentation for the up direction, see `estimate_up`; None without.
+            up: Up direction as it is known now; None if nothing new is known.
         """
-        self._up_votes = up_votes
+        self.up = up or self.up
         frame = len(poses) - 1
         if frame % self._config.interval != 0 or not _is_reliable(poses):
             return
@@ -132,7 +125,7 @@ class OccupancyMapper:
             "store": self._store.state_dict(),
             "count": self._count,
             "floor": self.floor,
-            "up_votes": self._up_votes,
+            "up": self.up,
             "rebuilt": None if self._rebuilt is None else self._rebuilt.state_dict(),
             "rebuilt_views": self._rebuilt_views,
         }
@@ -142,7 +135,7 @@ class OccupancyMapper:
         self.map.load_state_dict(state["map"])
         self._store.load_state_dict(state["store"])
         self._count, self._rebuilt_views = state["count"], state["rebuilt_views"]
-        self._up_votes, self.floor = state["up_votes"], state["floor"]
+        self.up, self.floor = state["up"], state["floor"]
         self._rebuilt = None
         if state["rebuilt"] is not None:
             self._rebuilt = OccupancyMap(self._config)

@@ -60,7 +60,7 @@ def write_octomap(path: Path, occupancy: OccupancyMap) -> None:
 
 
 def _morton_codes(voxels: NDArray[np.int64]) -> Codes:
-    """Interleave the bits of coordinates: x is the lowest of each three bits."""
+    """Interleave the bits of coordinates: x is the lowest bit of each three."""
     codes = np.zeros(len(voxels), np.uint64)
     keys = (voxels + _HALF).astype(np.uint64)
     for bit in range(_DEPTH):
@@ -92,6 +92,6 @@ def _encode(codes: Codes, states: NDArray[np.uint64]) -> tuple[NDArray[np.uint64
         depths.append(np.full(len(parents) - int(merged.sum()), _DEPTH - height))
         words.append(word[~merged])
         codes, states = parents, np.where(merged, word & np.uint64(3), np.uint64(_INNER))
-    # Depth-first: a node comes before its descendants, and they before the next child.
+    # Depth-first order: a node precedes its descendants, which precede the next child.
     order = np.lexsort([np.concatenate(depths), np.concatenate(firsts)])
     return np.concatenate(words)[order], count

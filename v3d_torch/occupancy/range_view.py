@@ -12,11 +12,11 @@ from torch.nn.functional import max_pool2d
 from v3d_torch.geometry.camera import PinholeCamera
 
 UNIT = 0.0002
-"""Unit of stored depth, metres, as in `StaticViews`."""
+"""Unit of stored depth, metres, the same as in `StaticViews`."""
 
 _STEPS = 0.7548776662466927, 0.5698402909980532
-"""Steps of a sequence of offsets that covers the square evenly from its first elements on (Roberts, "The unreasonable
-effectiveness of quasirandom sequences", 2018): over time all pixels are used."""
+"""Steps of a quasirandom sequence of offsets, which covers the square evenly from the first elements on (Roberts, "The
+unreasonable effectiveness of quasirandom sequences", 2018), so that all pixels are used over time."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class RangeView:
         row: First row.
         column: First column.
         depth_units: Depth in units of `UNIT`, 0 = no measurement, uint16, shape :math:`(h, w)`.
-        static: Mask of samples on static surfaces whose neighbours are static too, bool, shape :math:`(h, w)`: next to
-            a moving object some samples belong to it, because masks are off by some pixels.
+        static: Mask of samples that are static and whose neighbours are static, bool, shape :math:`(h, w)`: masks are
+            inaccurate by some pixels, so samples next to a moving object can belong to it.
     """
 
     row: int
@@ -64,6 +64,6 @@ class RangeView:
 
 
 def _samples(image: Tensor, row: int, column: int, stride: int) -> Tensor:
-    """Samples of an image (H, W, ...): as many for every offset."""
+    """Samples of an image (H, W, ...); their number is the same for every offset."""
     height, width = image.shape[0] // stride, image.shape[1] // stride
     return image[row::stride, column::stride][:height, :width]

@@ -47,15 +47,15 @@ def observe_voxels(
 ) -> Observations:
     """Find the voxels that a view observes as free or hits (Hornung et al., "OctoMap", Autonomous Robots 2013).
 
-    A voxel is free if a ray leaves it before the surface, by at least half a voxel and the depth error. The surface is
-    that of the nearest sample among the ray's own and its eight neighbours: then rays that graze a floor do not remove
-    it, and rays beside the edge of an object do not remove what is behind the edge. A voxel in which a static sample
-    lies is hit, also if other rays pass through it.
+    A voxel is free if a ray leaves it before the surface, by at least half a voxel plus the depth error. The depth of
+    the surface is the minimum over the sample of the ray and its eight neighbours, so that rays at grazing incidence do
+    not remove a floor, and rays beside the edge of an object do not remove the object. A voxel that contains a static
+    sample is hit, even if other rays pass through it.
 
     Args:
         depth: Depth of samples, metres, float32, shape :math:`(h, w)`; 0 = no measurement.
-        static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`. The others hit nothing: their rays only
-            show the space in front of them.
+        static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`. Other samples hit no voxel; they only
+            show that the space in front of them is free.
         rays: Viewing ray of each sample at unit depth, float32, shape :math:`(h, w, 3)`.
         T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
         voxel_size: Side of a voxel, metres.

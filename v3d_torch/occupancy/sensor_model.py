@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from v3d_torch.config import OccupancyConfig
 
 _MAX_STEPS = 127
-"""Largest log-odds that a voxel of 8 bits holds, steps."""
+"""Maximum log-odds of a voxel of 8 bits, steps."""
 
 
 @dataclass(frozen=True)
 class SensorModel:
     r"""Log-odds :math:`\log \frac{p}{1 - p}` in steps.
 
-    With whole numbers the sum does not depend on rounding, and a voxel takes one byte.
+    Log-odds are whole numbers of steps, so that sums have no rounding errors and a voxel takes one byte.
 
     Attributes:
         hit: Log-odds of a hit, steps, at least 1.

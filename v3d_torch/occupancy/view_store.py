@@ -18,19 +18,19 @@ LEVER = 2.0
 """Distance at which rotations are measured as displacements, metres: the typical depth in a room."""
 
 _MIN_CELL, _MAX_CELL = 0.05, 0.4
-"""Smallest and largest side of a cell of poses, metres: at the largest, neighbouring views still overlap by most of
-their images."""
+"""Minimum and maximum side of a cell of poses, metres: even in the largest cell, most of the images of two views
+overlap."""
 
 _KEPT_FRACTION = 0.9
-"""Fraction of the capacity that is kept when views are removed, so that this is rare."""
+"""Fraction of the capacity that is kept when views are removed, so that removal is rare."""
 
 
 class ViewStore:
     """Range views in the order of time.
 
-    If there are too many, the space of poses is divided into cells, and the newest view of each cell is kept, which
-    shows what has been taken away since. The cells grow until the views are few enough. If the largest cells do not
-    suffice, the views farthest from the camera are removed.
+    If there are too many views, the space of poses is divided into cells, and only the newest view of each cell is
+    kept, which also shows which objects were removed. The cells grow until the views are few enough. If the largest
+    cells do not suffice, the views farthest from the camera are removed.
 
     Args:
         capacity: Maximum number of views.
@@ -38,7 +38,8 @@ class ViewStore:
     Attributes:
         views: Views.
         frames: Position of each view's frame in the pose history.
-        T_cw: World-to-camera pose with which each view is in the occupancy map, float64, shape :math:`(N, 4, 4)`.
+        T_cw: World-to-camera pose with which each view was added to the occupancy map, float64, shape
+            :math:`(N, 4, 4)`.
     """
 
     def __init__(self, capacity: int) -> None:

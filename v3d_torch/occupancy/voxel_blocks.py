@@ -1,7 +1,7 @@
 """Sparse voxel grid: log-odds of occupancy in blocks of 16 x 16 x 16 voxels, found by the keys of their coordinates.
 
-Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing", 2013. The keys are sorted instead of
-hashed, so that many voxels are looked up by one tensor operation.
+Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing", 2013. Keys are sorted instead of hashed, so
+that one tensor operation looks up many voxels.
 """
 
 from __future__ import annotations

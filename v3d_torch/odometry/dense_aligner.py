@@ -1,6 +1,6 @@
 """Dense RGB-D alignment: camera motion from all pixels, for blur, low light and few corners, where features fail.
 
-Brightness and inverse depth are two images that the same motion warps. Both residuals are minimised together, coarse to
+Brightness and inverse depth are two images warped by the same motion. Both residuals are minimised together, coarse to
 fine, with the weights of a t-distribution (Kerl, Sturm and Cremers: Robust Odometry Estimation for RGB-D Cameras, ICRA
 2013; Dense Visual SLAM for RGB-D Cameras, IROS 2013). The inverse depth of a plane is linear in the image, so the
 whitened residual is a point-to-plane distance in units of the sensor noise.
@@ -23,17 +23,17 @@ from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_ma
 from v3d_torch.runtime.batches import common_batch
 
 _COARSE_INVERSE_DEPTH_SIGMA = 0.02
-"""Minimum standard deviation of inverse depth above the finest level, 1/m. It gives brightness more weight there: depth
-is measured at another time than colour, so in a fast turn its residuals have their optimum at another motion."""
+"""Minimum standard deviation of inverse depth on all levels but the finest, 1/m. It reduces the weight of depth there:
+depth is measured at another time than colour, and in a fast turn the two fit different motions."""
 
 _MIN_INLIER_RATIO = 0.75
-"""Minimum fraction of the points with depth in both views whose depth agrees."""
+"""Minimum fraction of the points whose depth agrees, among the points with depth in both views."""
 
 _MIN_CORRELATION = 0.9
 """Minimum correlation of the brightness of both views. Unlike a residual, it does not depend on exposure."""
 
 _TOLERANCE = 1e-3
-"""Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
+"""Relative change of the cost at convergence. Convergence is quadratic, so the next step would change far less."""
 
 
 class DenseAlignment(NamedTuple):
@@ -42,7 +42,7 @@ class DenseAlignment(NamedTuple):
     Attributes:
         T_ba: Maps points from the reference's camera a to the current camera b, float64, shape :math:`(*, 4, 4)`.
         reliable: True if all measures of quality are within their limits, bool, shape :math:`(*)`. All other attributes
-            have this shape, too, if no other is given.
+            have this shape unless stated otherwise.
         overlap: Fraction of the reference points that lie on static pixels of the current view.
         inliers: Number of points whose depth agrees in both views, int64.
         inlier_ratio: Inliers as a fraction of the points with depth in both views.
@@ -52,7 +52,7 @@ class DenseAlignment(NamedTuple):
         geometric_rms: Root mean square of the inverse-depth residuals, 1/m.
         information: Information matrix (inverse covariance) of the left perturbation ``exp(xi) @ T_ba``,
             ``xi = [translation, rotation]``, metres and radians, with gain and bias marginalised, float64, shape
-            :math:`(*, 6, 6)`. It treats pixels as independent, so its scale is too large.
+            :math:`(*, 6, 6)`. It assumes that the errors of pixels are independent, so its scale is too large.
         observability: Ratio of the smallest to the largest eigenvalue of the information, with translation in units of
             the median depth.
     """
@@ -85,26 +85,26 @@ def align_depth(
 
     Brightness and inverse-depth residuals are minimised together, coarse to fine, with the weights of a t-distribution,
     and with gain and bias between the two images. The pairs of a batch are aligned one after the other, because the
-    number of usable pixels of each differs. Without gradients.
+    number of usable pixels differs between them. The result has no gradients.
 
     Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013; Dense Visual SLAM for RGB-D
     Cameras, IROS 2013.
 
     Args:
         grey_a: Brightness of the reference images, from 0 to 1, with lens distortion, floating point, shape
-            :math:`(*, 1, H, W)`; computed with in float32.
+            :math:`(*, 1, H, W)`; converted to float32.
         depth_a: Depth of the reference images, metres, shape :math:`(*, 1, H, W)`; 0 = no measurement.
         grey_b: Brightness of the current images, shape :math:`(*, 1, H, W)`.
         depth_b: Depth of the current images, metres, shape :math:`(*, 1, H, W)`.
         camera: Camera of all images, with lens distortion.
         T_ba: Predicted motion, from the reference's camera to the current one, shape :math:`(*, 4, 4)`; the identity by
             default.
-        static_a: Pixels of the reference images to align, bool, shape :math:`(*, H, W)`; all by default.
-        static_b: Pixels of the current images to align, bool, shape :math:`(*, H, W)`; all by default.
-        config: Pyramid levels, noise, limits of the quality; the defaults if None.
+        static_a: Pixels of the reference images to align, bool, shape :math:`(*, H, W)`; None for all.
+        static_b: Pixels of the current images to align, bool, shape :math:`(*, H, W)`; None for all.
+        config: Pyramid levels, noise, limits of the quality; None for the default.
 
     Returns:
-        The motion and its quality. NaN, and not reliable, if an image has no contrast or no depth.
+        The motion and its quality; all NaN and not reliable if an image has no contrast or no depth.
     """
     align = DenseAligner(config or DenseOdometryConfig(), camera)
     alignment: DenseAlignment = align(grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b)
@@ -112,7 +112,7 @@ def align_depth(
 
 
 class DenseAligner(torch.nn.Module):
-    """:func:`align_depth` as a module, which computes the camera models of its pyramid once.
+    """:func:`align_depth` as a module that computes the camera models of its pyramid levels once.
 
     Args:
         config: Pyramid levels, noise, limits of the quality.
@@ -123,8 +123,8 @@ class DenseAligner(torch.nn.Module):
     """Minimum standard deviation of brightness on the coarsest level: half an 8-bit step."""
 
     _MAX_DEPTH_SIGMAS = 5.0
-    """Depth agrees up to this many standard deviations of inverse depth: colour-depth delay and depth edges make the
-    residuals heavy-tailed."""
+    """Maximum difference at which depths agree, in standard deviations of inverse depth. It is large because the delay
+    between colour and depth, and depth edges, make the residuals heavy-tailed."""
 
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
         super().__init__()
@@ -169,7 +169,7 @@ class DenseAligner(torch.nn.Module):
         ]
         failed = _failed_alignment(
             grey_a.device
-        )  # also the first of all, which is dropped, so that none can be stacked
+        )  # starts with an extra element, dropped below, so that an empty batch can be stacked
         rows = [failed, *(failed if alignment is None else alignment for alignment in alignments)]
         stacked = (torch.stack(list(column))[1:] for column in zip(*rows, strict=True))
         return DenseAlignment(*(column.reshape((*batch, *column.shape[1:])) for column in stacked))

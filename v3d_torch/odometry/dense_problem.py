@@ -17,15 +17,15 @@ State = tuple[Tensor, Tensor]  # T_ba (4, 4); gain and bias from the reference's
 System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba @ exp(xi), gain, bias
 
 _DAMPING_FACTOR = 1e3
-"""Additional damping. The Jacobian is the reference's and only approximates that of the current view; with less damping
-a step after a rejected one is rejected, too."""
+"""Damping added to that of Levenberg-Marquardt. The Jacobian of the reference only approximates that of the current
+view; with less damping, the step after a rejected step is rejected, too."""
 
 _REGULARISATION = 1e-9
-"""Added to the diagonal of the normal equations, which are singular without valid residuals."""
+"""Number added to the diagonal of the normal equations, which are singular without valid residuals."""
 
 _OCCLUSION_RATIO = 0.1
-"""A point is occluded if the inverse depth in the current view differs from the expected one by more than this
-fraction: the views then show different surfaces, and their difference contains no information on the motion."""
+"""Maximum relative difference between the inverse depth in the current view and the expected one. Beyond it a point is
+occluded: the views show different surfaces, and their difference contains no information on the motion."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class AlignmentProblem:
 
     Args:
         reference: Level of the reference view; its reference points are aligned.
-        current: Level of the current view, in which the points are looked up.
+        current: Level of the current view, into which the points are projected.
         initial_state: Motion ``T_ba``, gain and bias.
         inverse_depth_sigma: Minimum standard deviation of inverse depth, 1/m.
         config: Degrees of freedom of the t-distribution.
@@ -66,8 +66,8 @@ class AlignmentProblem:
     """Smallest depth of a point, metres, below the range of any RGB-D camera; keeps 1/z finite."""
 
     _GRADIENT_NOISE = 0.3
-    """Variance of the noise in brightness gradients over the squared scale of the residuals. The Sobel gradient has
-    12/64 of a pixel's variance; the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its
+    """Variance of the noise of brightness gradients, divided by the squared scale of the residuals. The Sobel gradient
+    has 12/64 of a pixel's variance; the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its
     variance."""
 
     def __init__(
@@ -125,15 +125,15 @@ class AlignmentProblem:
         costs, weights = student_t((residuals.values / self._sigma).square(), self._degrees_of_freedom)
         weights = (weights * residuals.valid / self._sigma.square()).flatten()
         weighted = (self._jacobian * weights[:, None]).T
-        # Occluded points keep their clamped cost; otherwise a motion could lower the cost by occluding outliers.
+        # Occluded points have a constant cost; otherwise a motion that occludes outliers would lower the cost.
         counted = torch.stack([residuals.valid[0], residuals.valid[1] | residuals.occluded])
         return costs[counted].mean(), (weighted @ self._jacobian, weighted @ residuals.values.flatten())
 
     def information(self, system: System, valid_brightness: Tensor) -> Tensor:
         """Information matrix of ``xi``, with gain and bias marginalised, shape (6, 6).
 
-        Gradient noise looks like texture: on stripes, the motion along them would seem observable. Its contribution is
-        known from the residuals and subtracted. The result can be indefinite.
+        Noise of the gradients has the effect of texture: motion along stripes would seem observable. The contribution
+        of the noise is known from the residuals, and is subtracted. The result can be indefinite.
 
         Args:
             system: Normal equations.

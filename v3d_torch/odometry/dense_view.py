@@ -26,8 +26,8 @@ class LevelCamera:
     Attributes:
         camera: Intrinsics at the size of the level.
         distortion_jacobian: Derivative of distorted by undistorted pixels at every pixel, float32, shape
-            :math:`(H, W, 2, 2)`: a gradient (row vector) by distorted pixels times this is the gradient by undistorted
-            pixels.
+            :math:`(H, W, 2, 2)`: a gradient by distorted pixels (row vector) times this matrix is the gradient by
+            undistorted pixels.
     """
 
     camera: PinholeCamera
@@ -81,7 +81,7 @@ class Level:
 
     Attributes:
         channels: Brightness and inverse depth (1/m), float32, shape :math:`(2, H, W)`. NaN for pixels that are not
-            static or not measured, so that any interpolation that involves them is NaN, too.
+            static or not measured, so that every interpolation that uses them is NaN, too.
         level_camera: Camera model of this level.
         config: Number of reference points, threshold of depth edges.
     """
@@ -92,10 +92,10 @@ class Level:
 
     @cached_property
     def reference_points(self) -> ReferencePoints:
-        """The pixel of strongest brightness gradient of each grid cell, among the pixels with depth.
+        """Pixel with the strongest brightness gradient of each grid cell, among the pixels with depth.
 
-        Near the solution the current view looks like the reference, so the Jacobians are computed once from the
-        reference's gradients and not in every step (inverse composition; Baker and Matthews, IJCV 2004).
+        Near the solution the current view is similar to the reference, so the Jacobians are computed once from the
+        gradients of the reference and not in every step (inverse composition; Baker and Matthews, IJCV 2004).
         """
         gradient = spatial_gradient(self.channels[None])[0]  # Sobel; 2 x (x, y) x H x W
         inverse_depth = self.channels[1]
@@ -152,7 +152,7 @@ class DenseView:
 
 
 def _halve(inverse_depth: Tensor, edge_ratio: float) -> Tensor:
-    """Inverse depth at half the size: mean of the nearest surface among four pixels, 0 if none is measured."""
+    """Inverse depth at half the resolution: mean over the nearest surface in each block of four pixels, or 0."""
     height, width = inverse_depth.shape[-2:]
     four = pixel_unshuffle(inverse_depth[:, : height // 2 * 2, : width // 2 * 2], 2)
     near = four > (1 - edge_ratio) * four.amax(dim=0, keepdim=True)

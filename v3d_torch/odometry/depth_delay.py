@@ -1,9 +1,9 @@
 """Depth-delay compensation: the depth image was taken at another time than the colour image.
 
 The colour and depth cameras of many RGB-D sensors are not synchronised; the images of a pair are up to half a frame
-period apart (Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012). Meanwhile a moving camera
-shifts the image by several pixels. The depth of a feature is therefore read where the feature was when depth was
-measured, and converted to the depth at the time of the colour image.
+period apart (Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012). In this time, a moving
+camera shifts the image by several pixels. The depth of a feature is therefore sampled where the feature was at the time
+of the depth image, and converted to the depth at the time of the colour image.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def _compensate_compiled(
 
 
 class DepthDelayCompensation:
-    """Gives features their depth at the time of the colour image.
+    """Computes the depth of features at the time of the colour image.
 
     Args:
         config: Configuration of the whole system: whether compensation is enabled, maximum depth.

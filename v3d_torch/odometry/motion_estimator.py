@@ -24,7 +24,7 @@ _PNP_THRESHOLD = 4.0
 error of the points adds to the pixel error."""
 
 _MAX_ROTATION_RATE = 6.3
-"""Fastest plausible rotation of a camera in a hand or on a robot, rad/s: a full turn in a second."""
+"""Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class RelativeMotion:
         return self.twist / elapsed
 
     def is_plausible(self, elapsed: float, max_speed: float) -> bool:
-        """Check whether a camera in a hand or on a robot can move this fast.
+        """Check whether a handheld camera or a camera on a robot can move this fast.
 
         Args:
             elapsed: Time between the views, seconds.
@@ -107,7 +107,7 @@ class MotionEstimator:
             b: Features of the later view.
             elapsed: Time between the views, seconds; bounds the plausible motion.
             initial_guess: Predicted ``T_ba``, float64, shape :math:`(4, 4)`; None if unknown, as in loop detection.
-                Without a prediction all features of a are matched, because only few of them are expected in b.
+                Without a prediction all features of a are matched, because b is expected to observe only few of them.
 
         Returns:
             None if fewer than ``min_inliers`` matches agree on a motion, or if the motion is not plausible.

@@ -19,7 +19,7 @@ from v3d_torch.types import RGBDFrame
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """Observations of a frame, restricted to its static pixels as soon as these are known.
+    """Observations of a frame, restricted to its static pixels once these are known.
 
     Attributes:
         frame: The frame as it was recorded.
@@ -75,7 +75,7 @@ class CameraMotion:
 
 
 class Odometry:
-    """Estimates the camera motion between two frames: features first, dense alignment if they fail.
+    """Estimates the camera motion between two frames: from features, or by dense alignment if features fail.
 
     Args:
         config: Configuration of the whole system.

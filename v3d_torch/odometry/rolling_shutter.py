@@ -127,18 +127,19 @@ def compensate_rolling_shutter(
 
     Args:
         uv: Undistorted pixels, as observed or compensated with ``readout_jacobian``, floating point, shape
-            :math:`(*, N, 2)`. All inputs are computed with in float64.
+            :math:`(*, N, 2)`. All inputs are converted to float64.
         row: Row of each pixel in the recorded image, shape :math:`(*, N)`.
-        inverse_depth: Inverse depth of each pixel, 1/m, shape :math:`(*, N)`; 0 = not measured, such a pixel is moved
-            as one that is infinitely far.
+        inverse_depth: Inverse depth of each pixel, 1/m, shape :math:`(*, N)`; 0 = not measured. A pixel without depth
+            is treated as infinitely far.
         velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, shape
             :math:`(*, 6)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
         readout: Time from the first to the last row, seconds, a number or shape :math:`(*)`; negative if the rows are
             read from the bottom up.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
         height: Number of rows of the image.
-        readout_jacobian: Earlier result for the same readout and another velocity, which is replaced; none by default.
-        valid: Pixels that are not padding, bool, shape :math:`(*, N)`; all by default.
+        readout_jacobian: Readout Jacobian with which ``uv`` was compensated before, for the same readout and another
+            velocity; that compensation is replaced. None if ``uv`` was not compensated.
+        valid: Mask of the pixels that are not padding, bool, shape :math:`(*, N)`; None for all.
 
     Returns:
         Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv`` and of shape
@@ -178,7 +179,7 @@ def compensate_features(features: Features, velocity: Tensor, readout: Readout, 
 
 
 class RollingShutterCompensation(torch.nn.Module):
-    """:func:`compensate_rolling_shutter` as a module. A readout that is a `torch.nn.Parameter` can be learnt.
+    """:func:`compensate_rolling_shutter` as a module. A readout given as a `torch.nn.Parameter` can be learned.
 
     Args:
         readout: Time from the first to the last row, seconds.

@@ -1,4 +1,4 @@
-"""Linear systems of poses joined by edges, as in a pose graph: sparse on the CPU, dense elsewhere."""
+"""Linear systems of pose graphs, with a block for each edge: sparse on the CPU, dense elsewhere."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ def solve_block_system(
 ) -> Tensor:
     r"""Solve damped normal equations :math:`H\, \xi = -g` over the free poses.
 
-    Each edge adds its block to the rows and columns of its two poses, 6 for each pose. On the CPU, without gradients,
-    the systems of a batch are factorised together by SciPy's SuperLU; their size may be some thousands of poses. Else
-    they are solved densely, whatever the values of ``fixed``.
+    Each edge adds its block to the rows and columns of its two poses, 6 for each pose. On the CPU and without
+    gradients, the systems of a batch are factorised together by SciPy's SuperLU, which is suitable for some thousands
+    of poses. Otherwise they are solved densely, with the same size whatever the values of ``fixed``.
 
     Args:
         blocks: Part of H of each edge (i, j), shape :math:`(..., E, 12, 12)`: 6 unknowns of i, then 6 of j.
         gradient: Part of g of each edge, shape :math:`(..., E, 12)`.
         edges: Indices (i, j) of the poses of each edge, int64, shape :math:`(..., E, 2)`.
-        fixed: Poses that are no unknowns, bool, shape :math:`(..., N)`.
-        damping: Factor of the diagonal of H that is added to it, a number or shape :math:`(...)`.
+        fixed: Mask of the poses that are fixed, bool, shape :math:`(..., N)`.
+        damping: Multiple of the diagonal of H that is added to it, a number or shape :math:`(...)`.
         regularisation: Number that is added to the diagonal of H.
 
     Returns:
-        Steps :math:`\xi` of all poses, 0 for fixed ones, shape :math:`(..., N, 6)`.
+        Steps :math:`\xi` of all poses, 0 for fixed poses, shape :math:`(..., N, 6)`.
     """
     if can_read(blocks) and not gradient.requires_grad:
         return _solve_sparse(blocks, gradient, edges, fixed, damping, regularisation)

@@ -5,12 +5,13 @@ An optimum :math:`x` of a cost with parameters :math:`\theta` is a root of the g
 .. math::
     \frac{dx}{d\theta} = - \left( \frac{\partial g}{\partial x} \right)^{-1} \frac{\partial g}{\partial \theta}
 
-whatever the steps that led to :math:`x`: they need not be stored, and the initial estimate has no influence (Gould et
-al., On Differentiating Parameterized Argmin and Argmax Problems, 2016). :math:`\partial g / \partial x` is the Hessian
-of the cost, not its Gauss-Newton approximation, so that the derivatives are exact also where residuals are not 0.
+independently of the steps that led to :math:`x`: they need not be stored, and the initial estimate has no influence
+(Gould et al., On Differentiating Parameterized Argmin and Argmax Problems, 2016). :math:`\partial g / \partial x` is
+the Hessian of the cost, not its Gauss-Newton approximation, so that the derivatives are exact even if residuals are not
+0.
 
-A solver finds the optimum without gradients. One Newton step from there, with a constant Hessian, has the value 0 and
-the derivative above.
+A solver finds the optimum without gradients. One Newton step from there, with the Hessian held constant, has the value
+0 and the derivative above.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from torch.func import jvp, vmap
 
 
 def needs_gradient(*tensors: Tensor) -> bool:
-    """Check whether the derivatives of a result with respect to any of its inputs can be asked for."""
+    """Check whether derivatives with respect to any of the tensors are tracked."""
     if torch._C._are_functorch_transforms_active():
         return True
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
 
 def zero_with_gradient(step: Tensor) -> Tensor:
-    """Zero with the derivatives of a Newton step. At the optimum the step itself is only the rest of the solver."""
+    """Return zero with the derivatives of a Newton step, whose value at the optimum is only the error of the solver."""
     return step - step.detach()
 
 
 def jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Jacobians of a function that maps each row of its argument to a row of the result, by forward differentiation.
+    """Jacobians of a function from rows of its argument to rows of its result, by forward-mode differentiation.
 
     Args:
         function: Function from shape :math:`(..., n)` to shape :math:`(..., m)`.

@@ -6,26 +6,26 @@ import torch
 from torch import Tensor
 
 _MAX_BLOCKS = 10
-"""Maximum number of blocks. Ten give a standard deviation that is itself accurate to a quarter, and are long enough
-that the errors of two blocks are hardly correlated."""
+"""Maximum number of blocks. With ten blocks, the standard deviation is accurate to a quarter of itself, and the blocks
+are long enough for their errors to be nearly uncorrelated."""
 
 MIN_BLOCKS = 4
-"""Smallest number of blocks with a finite covariance: the t-distribution of fewer has none."""
+"""Minimum number of blocks: with fewer, the variance of the t-distribution is not finite."""
 
 
 def jackknife_covariance(gradient: Tensor, hessian: Tensor) -> Tensor:
     r"""Covariance of the minimum of a cost that is a sum over groups of observations.
 
     Observations of a group, such as those of one image, have common errors: motion blur, an inaccurate velocity.
-    Successive groups observe the same landmarks. The inverse Hessian, which takes all errors as independent, is then
-    far too small. The jackknife observes how the minimum changes when a block of successive groups is left out
+    Successive groups observe the same landmarks. The inverse Hessian, which assumes independent errors, is then far
+    too small. The jackknife computes how the minimum changes when a block of successive groups is left out
     (Efron, The Jackknife, the Bootstrap and Other Resampling Plans, 1982; Kuensch, Annals of Statistics 1989). Here
     each change is one Newton step, :math:`(H - H_k)^{-1} g_k` with the gradient and the Hessian of the block at the
     minimum, so that influential blocks count in full (Bell and McCaffrey, Survey Methodology 2002).
 
     Args:
-        gradient: First derivatives of each group's cost, in the order of time, float64, shape :math:`(K, C)`. They can
-            belong to another point than the minimum: the second derivatives move them there.
+        gradient: First derivatives of each group's cost, in the order of time, float64, shape :math:`(K, C)`. The point
+            at which they are taken need not be the minimum: the second derivatives move them to it.
         hessian: Second derivatives of each group's cost, float64, shape :math:`(K, C, C)`.
 
     Returns:

@@ -18,13 +18,14 @@ State = TypeVar("State")
 System = TypeVar("System")
 
 _INITIAL_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-5, 1e-9, 1e9
-"""Damping relative to the diagonal of the normal equations. The first step is nearly a Gauss-Newton step."""
+"""Initial, minimum and maximum damping, relative to the diagonal of the normal equations. The first step is nearly a
+Gauss-Newton step."""
 
 _DAMPING_FACTOR = 10
-"""Change of the damping after each step."""
+"""Factor by which the damping is reduced or increased after each step."""
 
 DAMPING_SCHEDULE = (_INITIAL_DAMPING, _MIN_DAMPING, _MAX_DAMPING, float(_DAMPING_FACTOR))
-"""The values above, for kernels."""
+"""The constants above, as arguments of kernels."""
 
 _SCALE_ITERATIONS = 10
 """Fixed-point iterations for the scale of a t-distribution; each one reduces the error by a constant factor."""
@@ -99,7 +100,7 @@ class OptimisationResult(Generic[State, System]):
         cost_before: Costs of the initial states, shape :math:`(...)`.
         cost_after: Costs of ``state``, shape :math:`(...)`.
         iterations: Number of steps tried for each problem, int64, shape :math:`(...)`.
-        converged: True for problems whose cost no longer changed, bool, shape :math:`(...)`.
+        converged: Mask of the problems that converged, bool, shape :math:`(...)`.
     """
 
     state: State
@@ -120,9 +121,9 @@ def levenberg_marquardt(
 ) -> OptimisationResult[State, System]:
     """Minimise the costs of a batch of independent problems by damped Gauss-Newton steps.
 
-    A step that lowers the cost is accepted and the damping reduced; otherwise the step is rejected and the damping
-    increased (Levenberg, 1944; Marquardt, 1963). Each problem of the batch has its own damping, and is no longer
-    changed once it has converged.
+    If a step lowers the cost, it is accepted and the damping is reduced; otherwise it is rejected and the damping is
+    increased (Levenberg, 1944; Marquardt, 1963). Each problem of the batch has its own damping, and stays unchanged
+    after it has converged.
 
     Args:
         state: Initial states: a tensor, or a tuple of tensors, whose first dimensions are those of the batch.
@@ -132,7 +133,7 @@ def levenberg_marquardt(
             :math:`(...)`, to the next states.
         iterations: Maximum number of steps.
         tolerance: Relative change of the cost below which a problem has converged.
-        finished: Problems that are not changed at all, bool, shape :math:`(...)`; none by default.
+        finished: Mask of the problems whose states are returned unchanged, bool, shape :math:`(...)`; None for none.
 
     Returns:
         The states with the lowest costs, and statistics.
@@ -147,7 +148,7 @@ def levenberg_marquardt(
         candidate = step(state, system, damping)
         new_cost, new_system = linearise(candidate)
         is_lower = new_cost < cost
-        # A heavily damped step changes the cost little anyway and does not indicate convergence.
+        # A small change of the cost after a heavily damped step does not indicate convergence.
         is_small = (damping < 1) & ((cost - new_cost).abs() <= tolerance * (cost + tolerance))
         accepted, count = is_lower & ~converged, count + ~converged
         state, system, cost = select(accepted, (candidate, new_system, new_cost), (state, system, cost))
@@ -158,12 +159,12 @@ def levenberg_marquardt(
 
 
 def select(mask: Tensor, new: Any, old: Any) -> Any:
-    """Select the elements of a batch from two values of the same form.
+    """Select the elements of a batch from two values of the same structure, as `torch.where` does for tensors.
 
     Args:
-        mask: True for elements of ``new``, false for those of ``old``, bool, shape :math:`(...)`.
-        new: A tensor of shape :math:`(..., *)`, or a tuple of such.
-        old: The same.
+        mask: True for elements of ``new``, false for elements of ``old``, bool, shape :math:`(...)`.
+        new: A tensor of shape :math:`(..., *)`, or a tuple of such tensors.
+        old: A value of the same structure and shapes as ``new``.
     """
     if mask.ndim == 0 and can_read(mask):  # a single problem: nothing to copy
         return new if mask else old

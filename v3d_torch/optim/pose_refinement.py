@@ -32,10 +32,10 @@ from v3d_torch.optim.reprojection import (
 from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
 _TOLERANCE = 1e-3
-"""Relative change of the cost at convergence. Gauss-Newton converges quadratically: the next step gains far less."""
+"""Relative change of the cost at convergence. Convergence is quadratic, so the next step would change far less."""
 
 _REGULARISATION = 1e-9
-"""Added to the diagonal of the normal equations, which are singular without measurements."""
+"""Number added to the diagonal of the normal equations, which are singular without measurements."""
 
 
 class PoseRefinement(NamedTuple):
@@ -92,7 +92,7 @@ class _Problem(NamedTuple):
         return (costs * influence).sum(dim=-1), weights * influence
 
     def normal_equations(self, at: _Residuals, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Halves of the Hessian, in the approximation of Gauss-Newton, and of the gradient: (..., 6, 6), (..., 6)."""
+        """Half of the Gauss-Newton Hessian, (..., 6, 6), and half of the gradient, (..., 6), of the cost."""
         J, weighted = perspective_jacobian(at.projected).flatten(-2), weights[..., None, :] * self.scale
         H = (J * (weighted * self.scale).flatten(-2)[..., None, :]) @ J.mT
         return H, (J @ (weighted * at.whitened).flatten(-2)[..., None])[..., 0]
@@ -103,7 +103,7 @@ class _Problem(NamedTuple):
         return self.residuals_at(se3_exp(-torch.linalg.solve(damped, gradient)) @ at.T_cw)
 
     def differentiate(self, T_cw: Tensor, active: Tensor, *, robust: bool) -> Tensor:
-        """The optimum ``T_cw`` of the active measurements, with its derivatives by points, measurements and weights."""
+        """Return the optimum ``T_cw`` of the active measurements, with derivatives by points, measurements, weights."""
 
         def gradient(xi: Tensor, problem: _Problem) -> Tensor:
             at = problem.residuals_at(se3_exp(xi) @ T_cw)
@@ -147,35 +147,36 @@ def refine_pose(
         \sum_k w_k\, \rho\left( \frac{\|u_k - \pi(T_{cw} X_k)\|^2}{\sigma_k^2}
             + \frac{(1 / z_k - 1 / \hat z_k)^2}{\sigma_d^2} \right)
 
-    in rounds: each round optimises the pose on the current inliers, then classifies all measurements anew. The first
-    half of the rounds uses Huber's kernel; the other half uses plain least squares. With one round, all measurements
-    take part in the robust optimum, without classification.
+    in rounds: each round optimises the pose on the current inliers, then classifies all measurements again. The first
+    half of the rounds uses Huber's kernel; the other half uses plain least squares. With one round, the pose is the
+    robust optimum of all measurements.
 
     The result is differentiable in all inputs except the prediction, by the implicit function theorem: memory does
-    not grow with the iterations. The Hessian is that of the robust cost of the last round, with the dependence of the
-    robust weights on the residuals. The classification is constant. The derivatives are as accurate as the optimum:
-    train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not those of the optimum.
+    not grow with the iterations. The Hessian is that of the robust cost of the last round, including the dependence of
+    the robust weights on the residuals. The classification is constant. The derivatives are as accurate as the optimum:
+    train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not correct.
 
     Mur-Artal and Tardos, ORB-SLAM2, T-RO 2017, Sec. III-C; Gould et al., On Differentiating Parameterized Argmin and
     Argmax Problems, 2016.
 
     Args:
-        T_cw: Predicted world-to-camera poses, shape :math:`(*, 4, 4)`. All inputs are floating point, and computed with
-            in float64.
+        T_cw: Predicted world-to-camera poses, shape :math:`(*, 4, 4)`. All inputs are floating point and converted to
+            float64.
         points: Landmark of each measurement, world frame, metres, shape :math:`(*, N, 3)`.
         uv: Measured pixels, undistorted, shape :math:`(*, N, 2)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0 = not measured, as it is by default.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0 = not measured. None if no depth was
+            measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, N)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, N)`.
-        weights: Weight of each measurement, not negative, shape :math:`(*, N)`; 1 by default.
-        valid: Measurements that are not padding, bool, shape :math:`(*, N)`; all by default.
+        weights: Weight of each measurement, not negative, shape :math:`(*, N)`; None for 1.
+        valid: Mask of the measurements that are not padding, bool, shape :math:`(*, N)`; None for all.
         rounds: Maximum number of rounds, at least 1.
         iterations: Maximum number of Levenberg-Marquardt steps in a round.
         tolerance: Relative change of the cost that ends a round.
 
     Returns:
-        The refined poses and their inliers, with the dtype of ``T_cw``. Without measurements, the predictions.
+        The refined poses and their inliers, with the dtype of ``T_cw``. A pose without measurements is the prediction.
 
     Example:
         Learn the weights of features through the poses of 32 frames:
@@ -183,7 +184,7 @@ def refine_pose(
         >>> import torch, v3d_torch as v3d
         >>> T_cw, K = torch.eye(4).repeat(32, 1, 1), torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
         >>> points = torch.rand(32, 50, 3) * 2 + torch.tensor([-1.0, -1.0, 2.0])
-        >>> quality = torch.rand(32, 50, 1)  # something known about each feature
+        >>> quality = torch.rand(32, 50, 1)  # a known property of each feature
         >>> noise = 5 * (1 - quality) * torch.randn(32, 50, 2)
         >>> uv = 500 * points[..., :2] / points[..., 2:] + K[:2, 2] + noise
         >>> network = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.Softplus())
@@ -272,7 +273,7 @@ def _minimise(
     iterations: int,
     tolerance: float,
 ) -> tuple[PoseRefinement, Tensor]:
-    """Refine poses, and return the mask of the measurements that took part in the last round, bool, (..., N), too."""
+    """Refine poses; return them and the mask of the measurements used in the last round, bool, (..., N)."""
     problem = _Problem(points, scale, offset, thresholds, weights, valid)
     at, inliers, active = problem.residuals_at(T_cw), valid, valid
     finished = torch.zeros(T_cw.shape[:-2], dtype=torch.bool, device=T_cw.device)
@@ -290,7 +291,7 @@ def _minimise(
 
 
 class PoseRefiner(torch.nn.Module):
-    """:func:`refine_pose` as a module. A standard deviation that is a `torch.nn.Parameter` can be learnt.
+    """:func:`refine_pose` as a module. Standard deviations that are a `torch.nn.Parameter` can be learned.
 
     Args:
         pixel_sigma: Standard deviation of u and of v, pixels.

@@ -36,7 +36,7 @@ optimisation step moves behind the camera."""
 
 
 INVERSE_DEPTH_SIGMA = TrackingConfig().inverse_depth_sigma
-"""Default standard deviation of inverse depth, 1/m: that of the configuration."""
+"""Default standard deviation of inverse depth, 1/m: the default of ``tracking.inverse_depth_sigma``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +47,9 @@ class Measurements:
         uv: Undistorted pixels, shape :math:`(..., M, 2)`.
         inverse_depth: Inverse of the measured depth along z, 1/m, shape :math:`(..., M)`; 0 = not measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
-        inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`. It is about
-            constant, like the disparity noise of any stereo or structured-light camera; the depth noise is this times
-            z^2 (Khoshelham and Elberink, Sensors 2012).
+        inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`. It is nearly
+            constant, as the noise of disparity of stereo and structured-light cameras is; the standard deviation of
+            depth is z^2 times as large (Khoshelham and Elberink, Sensors 2012).
     """
 
     uv: Tensor
@@ -59,7 +59,7 @@ class Measurements:
 
     @property
     def chi2_threshold(self) -> Tensor:
-        """Chi-square threshold of an inlier, at 95 %, for each measurement, shape :math:`(..., M)`."""
+        """Chi-square threshold of an inlier (95 % quantile) for each measurement, shape :math:`(..., M)`."""
         threshold = torch.full_like(self.inverse_depth, CHI2_THRESHOLD_2D)
         return threshold.masked_fill(self.inverse_depth > 0, _CHI2_THRESHOLD_3D)
 
@@ -71,14 +71,14 @@ def prepare_measurements(
     inverse_depth_sigma: Tensor | float,
     valid: Tensor | None,
 ) -> Measurements:
-    """Convert measurements to float64, and replace padding by numbers that spread neither NaN nor gradients.
+    """Convert measurements to float64, and replace the padding, so that it causes neither NaN nor gradients.
 
     Args:
         uv: Undistorted pixels, shape :math:`(..., M, 2)`.
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(..., M)`; None = not measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`.
-        valid: Measurements that are not padding, bool, shape :math:`(..., M)`; None = all.
+        valid: Mask of the measurements that are not padding, bool, shape :math:`(..., M)`; None for all.
     """
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
@@ -106,7 +106,7 @@ class WhitenedMeasurements(NamedTuple):
     offset: Tensor
 
     def residuals(self, projected: Tensor) -> Tensor:
-        """Whitened residuals of points given by `perspective`, both of shape :math:`(..., 3, M)`."""
+        """Whitened residuals, shape :math:`(..., 3, M)`, of points projected by `perspective`, of the same shape."""
         return torch.addcmul(self.offset, self.scale, projected)
 
 
@@ -161,11 +161,11 @@ def perspective_jacobian(projected: Tensor) -> Tensor:
     """Derivatives of `perspective` by the left perturbation of ``T_cw``.
 
     Args:
-        projected: Points given by `perspective`, shape :math:`(..., 3, M)`.
+        projected: Points projected by `perspective`, shape :math:`(..., 3, M)`.
 
     Returns:
-        Derivatives by translation, then rotation, shape :math:`(..., 6, 3, M)`; those by the translation are also the
-        derivatives by the points.
+        Derivatives by translation, then rotation, shape :math:`(..., 6, 3, M)`; the derivatives by translation equal
+        those by the points.
     """
     a, b, w = projected.unbind(dim=-2)  # (x/z, y/z, 1/z)
     o = torch.zeros_like(w)
@@ -189,8 +189,8 @@ def reprojection_residuals(points: Tensor, measured: Measurements, K: Tensor) ->
         K: Camera matrix, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Residuals in standard deviations, shape :math:`(..., M, 3)`; the third is 0 if depth was not measured. A
-        transposed view: the measurements are contiguous in memory.
+        Residuals in standard deviations, shape :math:`(..., M, 3)`; the third is 0 if depth was not measured. The
+        tensor is a transposed view, with the measurements contiguous in memory.
     """
     return whiten(measured, K).residuals(perspective(points.mT)).mT
 
@@ -204,8 +204,8 @@ def reprojection_jacobian(points: Tensor, measured: Measurements, K: Tensor) -> 
         K: Camera matrix, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Shape :math:`(..., M, 3, 6)`; the first three columns are the Jacobian by ``points``, too. A transposed view:
-        the measurements are contiguous in memory.
+        Jacobian, shape :math:`(..., M, 3, 6)`; the first three columns are also the Jacobian by ``points``. The tensor
+        is a transposed view, with the measurements contiguous in memory.
     """
     scale = whiten(measured, K).scale
     return (perspective_jacobian(perspective(points.mT)) * scale[..., None, :, :]).movedim(-1, -3).mT

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 REGULARISATION = 1e-6
-"""Added to all diagonals: makes blocks without observations solvable. Small beside the information of an observation,
-which is 1e4 per square metre and more."""
+"""Number added to all diagonals, which makes blocks without observations solvable. It is small compared with the
+information of an observation, at least 1e4 per square metre."""
 
 
 class NormalEquations(NamedTuple):
@@ -29,7 +29,7 @@ class NormalEquations(NamedTuple):
         U: Diagonal blocks of the poses, shape :math:`(..., 6, 6, F)`.
         V: Diagonal blocks of the points, shape :math:`(..., 3, 3, P)`.
         W: Point-by-pose block of each observation, shape :math:`(..., 3, 6, M)`.
-        pose_gradient: Gradient :math:`g_{pose}`, shape :math:`(*, ..., 6, F)`; there can be several for each matrix.
+        pose_gradient: Gradient :math:`g_{pose}`, shape :math:`(*, ..., 6, F)`; a matrix can have several gradients.
         point_gradient: Gradient :math:`g_{point}`, shape :math:`(*, ..., 3, P)`.
         pose: Index of the free pose of each observation, F for fixed poses, int64, shape :math:`(..., M)`.
         point: Index of the point of each observation, int64, shape :math:`(..., M)`.
@@ -62,8 +62,8 @@ def sum_columns(columns: Tensor, index: Tensor, count: int) -> Tensor:
 
     Args:
         columns: Matrices, shape :math:`(..., n, M)`.
-        index: Index of the sum that each column belongs to, int64, shape :math:`(..., M)`; columns with the index
-            ``count`` belong to none.
+        index: Index of the sum to which each column is added, int64, shape :math:`(..., M)`; columns with the index
+            ``count`` are ignored.
         count: Number of sums K.
 
     Returns:
@@ -81,9 +81,9 @@ def solve_normal_equations(system: NormalEquations, damping: Tensor | float) -> 
 
     Args:
         system: Normal equations of F poses and P points.
-        damping: Factor :math:`\lambda`, a number or shape :math:`(...)`; :math:`\lambda` times the diagonal is added.
-            The damping keeps unobservable directions in place, such as the depth of a point that was observed once
-            without depth.
+        damping: Factor :math:`\lambda`, a number or shape :math:`(...)`; :math:`\lambda` times the diagonal is added to
+            the diagonal. The damping keeps unobservable directions constant, such as the depth of a point that was
+            observed once without depth.
 
     Returns:
         Steps of the poses, shape :math:`(*, ..., 6, F)`, and of the points, shape :math:`(*, ..., 3, P)`.
@@ -103,14 +103,14 @@ def solve_normal_equations(system: NormalEquations, damping: Tensor | float) -> 
 
 
 def _gather_dense(blocks: Tensor, pose: Tensor, point: Tensor, F: int, P: int) -> Tensor:
-    """Dense matrix, transposed, of one 3x6 block for each observation: (..., 3, 6, M) to (..., 6 F, 3 P).
+    """Transposed dense matrix of the 3x6 blocks of all observations: (..., 3, 6, M) to (..., 6 F, 3 P).
 
     A local map is small, and most of its poses observe many of its points. The points are ordered by coordinate first.
     """
     coordinate, parameter = torch.arange(3, device=pose.device), torch.arange(6, device=pose.device)
     first = (18 * P * pose + point)[..., None, None, :]
     index = first + P * coordinate[:, None, None] + 3 * P * parameter[:, None]
-    dense = blocks.new_zeros(*blocks.shape[:-3], 18 * (F + 1) * P)  # one more pose for the blocks of fixed poses
+    dense = blocks.new_zeros(*blocks.shape[:-3], 18 * (F + 1) * P)  # an extra pose collects the blocks of fixed poses
     dense = dense.scatter_add(-1, index.flatten(-3), blocks.flatten(-3))
     return dense[..., : 18 * F * P].unflatten(-1, (6 * F, 3 * P))
 

@@ -1,4 +1,4 @@
-"""A whole sequence through the system: preprocessing ahead of the tracking, records of the run, and a viewer."""
+"""Processing of a whole sequence: preprocessing ahead of tracking, records of the run, and a viewer."""
 
 from __future__ import annotations
 

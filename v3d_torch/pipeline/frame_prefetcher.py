@@ -18,7 +18,7 @@ from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
 PendingFrame = Callable[[], PreprocessedFrame | None]
-"""Waits for a preprocessed frame; returns None after the last one."""
+"""Function that waits for a preprocessed frame; returns None after the last frame."""
 
 ReadFrame = tuple[RGBDFrame, dict[str, StageTime]] | None
 """A frame and the time that reading it took; None after the last frame."""
@@ -30,15 +30,15 @@ _R = TypeVar("_R")
 class FramePrefetcher:
     """Iterator over preprocessed frames for `V3DSLAM.track`.
 
-    Each frame is preprocessed with the pose prediction made some frames before. Therefore the results do not depend on
+    Each frame is preprocessed with the pose prediction made some frames before. Therefore the results are the same
     whether it is preprocessed in turn or ahead.
 
-    One thread reads the frames and extracts their features, another one segments them. Both work in the order of the
-    frames, and spend most of their time in compiled code that lets other threads run.
+    One thread reads the frames and extracts their features, another thread segments them. Both process the frames in
+    order, and spend most of their time in compiled code that releases the GIL.
 
     Args:
         frames: Frames to read.
-        slam: System that preprocesses the frames, and tracks each before it requests the next.
+        slam: System that preprocesses the frames; each frame must be tracked before the next one is requested.
         ahead: True to read and preprocess the next frames while one is tracked.
     """
 

@@ -1,4 +1,4 @@
-"""A whole sequence through the system, with its records and a viewer."""
+"""Pipeline: runs a whole sequence through `V3DSLAM`, with records and a viewer."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _SNAPSHOTS = 6
 """Number of frames in the figure of masks."""
 
 _TRIM_INTERVAL = 200
-"""Frames between two calls of `trim_memory`, which takes some milliseconds."""
+"""Number of frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 _CHECKED_KEYFRAMES = 15
-"""Number of keyframes at which camera and depth are checked: some seconds of a moving camera. A shorter run is checked
-at its end, and a live one, because a check takes up to a second. It is not repeated."""
+"""Number of keyframes after which camera and depth are checked: some seconds of a moving camera. A shorter run is
+checked at its end, and so is a live run, because a check takes up to a second. It is not repeated."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
@@ -86,7 +86,7 @@ class NullViewer:
 
 
 NULL_VIEWER = NullViewer()
-"""Viewer of a run that is not shown."""
+"""Viewer for runs without a viewer."""
 
 
 class ViewerGroup:
@@ -107,7 +107,7 @@ class ViewerGroup:
             viewer.show(frame, objects, slam, stage_times)
 
     def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
-        """Finish all viewers, also if one of them fails.
+        """Finish all viewers, even if one of them fails.
 
         Raises:
             OutputError: The errors of all viewers, in one line.
@@ -127,21 +127,21 @@ class Pipeline:
 
     Args:
         sequence: Frames, stored or live.
-        slam: System; frames of a stored sequence that it has processed already are skipped.
+        slam: System; frames of a stored sequence that it has already processed are skipped.
         masks: Folder for an image per frame of the pixels that tracking excludes; None for no images.
-        map_masks: Folder for an image per frame of the pixels that maps exclude, which are those of `masks` and all
-            people; None for no images.
-        viewer: Viewer that is shown each frame.
+        map_masks: Folder for an image per frame of the pixels that maps exclude: those of `masks`, and all people; None
+            for no images.
+        viewer: Viewer that shows each frame.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
-        skip_broken: True to pass over broken frames of a stored sequence, see `ReadableFrames`.
+        skip_broken: True to skip broken frames of a stored sequence, see `ReadableFrames`.
 
     Attributes:
         record: Records of the run.
         between_frames: False while a frame is processed, and if the processing of a frame failed.
 
     Raises:
-        ConfigError: If the sequence is live, and the configuration allows no threads.
+        ConfigError: If the sequence is live, and the configuration does not allow threads.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class Pipeline:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames of the sequence; of a stream, the number so far, with those that were left out."""
+        """Number of frames of the sequence; of a stream, the number so far, including dropped frames."""
         so_far = len(self.slam.poses) + self.record.live.dropped
         return len(self.sequence) if isinstance(self.sequence, Sized) else so_far
 
@@ -201,7 +201,7 @@ class Pipeline:
                         on_frame(frame, result)
         except V3DError as error:
             record.failure = str(error)
-        except Exception as error:  # an error of the program must not cost the results so far
+        except Exception as error:  # keep the results so far after an error of the program
             _LOG.exception("the run failed")
             reason = (str(error).splitlines() or [""])[0]
             record.failure = f"the program failed with {type(error).__name__}: {reason}; report it with the run.log"
@@ -300,7 +300,7 @@ class Pipeline:
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
 
     def _check_plausibility(self) -> None:
-        """Check whether camera and depth agree with the map so far, and record what does not."""
+        """Check whether camera and depth agree with the map so far, and record contradictions."""
         slam = self.slam
         self._warn(check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config))
         self.record.was_checked = True
@@ -316,7 +316,7 @@ class Pipeline:
             self.record.warnings.append(warning)
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep the most dynamic frame, and frames at equal intervals, which grow with the length of a live stream."""
+        """Keep the most dynamic frame, and frames at equal intervals, which increase during a live stream."""
         best = self.record.most_dynamic_snapshot
         if best is None or _dynamic_votes(snapshot.result) > _dynamic_votes(best.result):
             self.record.most_dynamic_snapshot = snapshot
@@ -337,7 +337,7 @@ class Pipeline:
         if self._with_mask_evaluation and isinstance(self.sequence, HasMotionMasks) and self.record.mask_error is None:
             try:
                 truth = self.sequence.motion_mask(frame.index)
-            except InputError as error:  # true masks only serve the evaluation
+            except InputError as error:  # only the evaluation needs true masks
                 self.record.mask_error = str(error)
         if truth is not None:
             masks = {each.id: each.mask for each in result.objects}

@@ -1,4 +1,4 @@
-"""Records of a run in addition to the trajectory, from which the results are written."""
+"""Records of a run from which the results are written, in addition to the trajectory."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ class FrameTimes:
 
     @property
     def wall(self) -> Tensor:
-        """Wall time of each stage, seconds, float64, shape :math:`(N, S)`; 0 on frames on which it did not run."""
+        """Wall time of each stage, seconds, float64, shape :math:`(N, S)`; 0 for stages that did not run."""
         return self._seconds()[..., 0]
 
     @property
     def cpu(self) -> Tensor:
-        """Processor time of each stage, seconds, float64, shape :math:`(N, S)`; 0 on frames on which it did not run."""
+        """Processor time of each stage, seconds, float64, shape :math:`(N, S)`; 0 for stages that did not run."""
         return self._seconds()[..., 1]
 
     def append(self, frame: RGBDFrame, times: Mapping[str, StageTime]) -> None:
@@ -95,7 +95,7 @@ class ObjectTable(TensorTable):
     """Objects of all frames, one row per frame and object.
 
     The columns are the index and timestamp of the frame, and id, COCO class, centroid (world frame, metres), votes,
-    Chamfer distance, position of the motion state in `MotionState`, and whether the network missed the object.
+    Chamfer distance, position of the motion state in `MotionState`, and true if the network missed the object.
     """
 
     def __init__(self) -> None:
@@ -133,7 +133,7 @@ class ObjectTable(TensorTable):
 
 
 class StateTable(TensorTable):
-    """States of the camera as they were known at each frame, one row per frame; see `CameraState` for the columns."""
+    """States of the camera at each frame, without later corrections, one row per frame; columns as in `CameraState`."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -161,14 +161,14 @@ class StateTable(TensorTable):
 
 
 class LiveTable(TensorTable):
-    """Latency of each frame of a live run, seconds, and number of frames that were left out before it."""
+    """Latency of each frame of a live run, seconds, and number of frames that were dropped before it."""
 
     def __init__(self) -> None:
         super().__init__(latency=((), torch.float64), dropped=((), torch.int64))
 
     @property
     def dropped(self) -> int:
-        """Number of frames that were left out."""
+        """Number of frames that were dropped."""
         return int(self["dropped"].sum())
 
     def append_result(self, result: LiveResult) -> None:
@@ -193,19 +193,19 @@ class RunRecord:
         times: Time spent on each frame.
         states: State of the camera at each frame.
         live: Latency of each frame of a live run; empty for a stored sequence.
-        rejected: Number of live frames that were late, doubled or out of order.
+        rejected: Number of live frames that were late, duplicate or out of order.
         dynamics: Objects of all frames.
         snapshots: Frames for the figure of masks.
-        most_dynamic_snapshot: The frame with the most votes for dynamic objects; of several, the one with most objects.
+        most_dynamic_snapshot: Frame with the most votes for dynamic objects; of several, that with the most objects.
         mask_evaluation: Comparison of the masks with true masks.
-        broken: Broken frames that were passed over.
+        broken: Broken frames that were skipped.
         seconds: Wall time of all frames, seconds.
-        failure: Reason why the run ended before the sequence; None if it did not.
+        failure: Reason why the run ended before the end of the sequence; None if it did not.
         interrupted: True if the user interrupted the run.
-        mask_error: Reason why the masks were not evaluated although there are true masks; None if there is none.
-        save_error: Reason why a checkpoint could not be written; None if there is none.
+        mask_error: Reason why the masks were not evaluated although there are true masks; None if there was no error.
+        save_error: Reason why a checkpoint could not be written; None if there was no error.
         warnings: Contradictions between the images and the camera, one sentence each.
-        was_checked: True once camera and depth were checked.
+        was_checked: True if camera and depth were checked.
     """
 
     times: FrameTimes = field(default_factory=FrameTimes)

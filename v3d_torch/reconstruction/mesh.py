@@ -1,4 +1,4 @@
-"""Triangle mesh of the static scene: marching cubes on the truncated signed distances, tile by tile."""
+"""Triangle mesh of the static scene: marching cubes on a truncated signed distance function, tile by tile."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction.tsdf import BLOCK, integrate, surface_blocks
 
 _TILE = 16
-"""Blocks along a side of a tile, 2.6 m at 2 cm per voxel. The 2 million voxels of one tile are in memory at a time."""
+"""Number of blocks along a side of a tile, 2.6 m at 2 cm per voxel: 2 million voxels are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _assemble(values: Tensor, positions: Tensor) -> Tensor:
     sides = positions.amax(dim=0) + 1
     box = values.new_zeros(*sides.tolist(), BLOCK, BLOCK, BLOCK)
     box[tuple(positions.unbind(dim=1))] = values
-    # Of the next tiles only the first layer of voxels is used, for the cubes between two tiles.
+    # Only the first layer of voxels of the next tiles is used, for the cubes between two tiles.
     x, y, z = (BLOCK * sides).clamp(max=BLOCK * _TILE + 1).tolist()
     return box.permute(0, 3, 1, 4, 2, 5).reshape((BLOCK * sides).tolist())[:x, :y, :z].contiguous()
 
@@ -108,7 +108,7 @@ def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 def _vertex_colours(vertices: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
     """Mean colour of each vertex in the views that observe it, weighted by inverse squared depth; uint8, (V, 3).
 
-    Colours are fused for vertices and not for voxels, because there are far fewer vertices.
+    Colours are fused per vertex and not per voxel, because there are far fewer vertices.
     """
     sums, weights = vertices.new_zeros(len(vertices), 3), vertices.new_zeros(len(vertices), 1)
     for view in views:

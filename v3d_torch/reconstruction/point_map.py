@@ -17,7 +17,7 @@ from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.objects.free_space_check import DepthView, is_free_space
 
 _BATCH = 200_000
-"""Points that are collected before they are fused. Batches bound the memory, and are as fast as a single fusion."""
+"""Number of points that are fused at once. Batches bound the memory, and take no longer than a single fusion."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,9 @@ def fuse_points(views: StaticViews, config: Config) -> PointMap:
     """Fuse all views into one point per voxel: the mean position, colour and normal.
 
     Pixels without a normal are excluded. They lie at the edge of a surface, where depth is a mean of foreground and
-    background. A fused point is removed if at least as many views observe free space at its position as observe a
-    surface there. This removes people that a mask missed, because they are at one position in few views only.
+    background. A fused point is removed if the views that observe free space at its position are at least as many as
+    the views that observe a surface there. This removes people that a mask missed, because they are at one position in
+    few views only.
 
     Args:
         views: Static views of the keyframes.
@@ -94,7 +95,7 @@ def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) 
 
 
 def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) -> Tensor:
-    """Check which points at least one view, and at least as many views as observe a surface there, observe as free.
+    """Check which points are observed as free, by at least as many views as observe a surface there.
 
     Points closer together than the depth tolerance share one check, which is faster.
 

@@ -17,10 +17,10 @@ from v3d_torch.geometry.cell_keys import cell_keys, cells_of_keys
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 
 BLOCK = 8
-"""Voxels along a side of a block: large enough for tensor operations, small enough to stay near the surface."""
+"""Number of voxels along a side of a block: large enough for tensor operations, small enough to follow the surface."""
 
 _BLOCKS_PER_STEP = 1024
-"""Blocks that are projected into a view together; half a million voxels fit into the processor's cache."""
+"""Number of blocks that are projected into a view at once; half a million voxels fit into the processor's cache."""
 
 
 def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
@@ -48,9 +48,9 @@ def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
 def integrate(blocks: Tensor, views: StaticViews, config: DenseMapConfig) -> tuple[Tensor, Tensor]:
     """Mean truncated signed distance of the voxels of blocks, over all views.
 
-    In front of a surface every view counts, at any distance: observed free space removes objects that were present in
-    few views. Behind a surface a view counts within the truncation distance only, because the thickness of objects is
-    unknown.
+    Every view counts for voxels in front of its surface, at any distance: observed free space removes objects that were
+    present in few views. Behind its surface, a view counts only within the truncation distance, because the thickness
+    of objects is unknown.
 
     Args:
         blocks: Block coordinates, int64, shape :math:`(N, 3)`.

@@ -18,7 +18,7 @@ _LOG = logging.getLogger(__name__)
 class Autosave:
     """Saves results and checkpoints at the intervals of the configuration.
 
-    If they cannot be written, the run continues and ``record.save_error`` holds the reason.
+    If they cannot be written, the run continues, with the reason in ``record.save_error``.
 
     Args:
         folder: Folder of the results.

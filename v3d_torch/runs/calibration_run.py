@@ -1,4 +1,4 @@
-"""Calibration of the camera of a sequence: runs with a better camera each time, until it does not change."""
+"""Calibration of the camera of a sequence: runs are repeated with the calibrated camera until it converges."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Segmenter
 
 _MAX_RUNS = 4
-"""Maximum number of runs. A wrong focal length costs matches, which the next run with a better one finds."""
+"""Maximum number of runs. With a wrong focal length matches are missing; the next run with a better one finds more."""
 
 _CONVERGED = 0.5
-"""Largest change of an estimate between two runs at its convergence, in standard deviations."""
+"""Maximum change of an estimate between two runs at convergence, in standard deviations."""
 
 UNITS = {
     **dict.fromkeys(("fx", "fy", "cx", "cy"), "{}, pixels"),
@@ -36,7 +36,7 @@ UNITS = {
 """Names of the parameters with their units."""
 
 OpenSequence = Callable[[PinholeCamera | None], RGBDSequence]
-"""Opens a sequence with a given camera, or with its own."""
+"""Function that opens a sequence with a given camera; None for the camera of the sequence."""
 
 
 def calibrate_sequence(
@@ -48,8 +48,8 @@ def calibrate_sequence(
     """Calibrate the camera of a sequence.
 
     Args:
-        open_sequence: Opens the sequence.
-        make_segmenter: Makes the segmenter of a run.
+        open_sequence: Function that opens the sequence.
+        make_segmenter: Function that makes the segmenter of a run.
         config: Configuration of the runs.
         on_run: Called before each run with its number, from 1, and the number of frames; returns a function that is
             called after each frame.
@@ -85,7 +85,7 @@ def calibrate_sequence(
 
 
 def _is_converged(calibration: Calibration, previous: Calibration | None) -> bool:
-    """Check whether the last two runs told the same values, up to a part of their uncertainty."""
+    """Check whether the last two runs gave the same values, up to a fraction of their uncertainty."""
     if previous is None:
         return not any(each.taken for each in calibration.estimates)
     before = {each.name: each for each in previous.estimates}
@@ -109,12 +109,12 @@ def calibration_text(calibration: Calibration, name: str) -> str:
         comments.setdefault(field, []).append(
             f"{each.name} {_describe(each)}" if field != each.name else _describe(each)
         )
-    heading = f"# Calibrated by v3d-torch calibrate from {name}. Values are taken if the recording tells them.\n"
+    heading = f"# Calibrated by v3d-torch calibrate from {name}. Values are taken if the recording determines them.\n"
     return heading + camera_text(calibration.camera, {field: "; ".join(texts) for field, texts in comments.items()})
 
 
 def calibration_table(calibration: Calibration) -> Table:
-    """Return a table of all parameters: given, estimated, standard deviation, taken or left."""
+    """Return a table of all parameters: given value, estimate, standard deviation, and result."""
     table = Table(title="camera")
     for column in ("parameter", "given", "estimated", "+-", "result"):
         table.add_column(column, justify="left" if column in ("parameter", "result") else "right")

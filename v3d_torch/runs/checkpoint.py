@@ -57,7 +57,7 @@ class Checkpoint:
     """State of a run between two frames.
 
     Attributes:
-        folder: Folder of its results.
+        folder: Folder of the results of the run.
         request: Request of the run.
         sequence: Fingerprint of the processed part of the sequence, see `_fingerprint`.
         frames: Number of frames processed.
@@ -74,7 +74,7 @@ class Checkpoint:
 def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> None:
     """Write the state of a run to its folder.
 
-    A live stream cannot be resumed, because its frames do not come again; its checkpoint contains only the request.
+    A live stream cannot be resumed, because its frames are gone; its checkpoint contains only the request.
 
     Args:
         folder: Folder of the results.
@@ -131,11 +131,11 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
-    """Describe what has changed in the part of a sequence that a checkpoint has processed; None if nothing has.
+    """Describe a change in the part of a sequence that a checkpoint has processed; None if there is no change.
 
-    Of that part, the timestamps and the sizes of all image files are compared, and the images of the last processed
-    frame. Frames after it can have been removed, added or replaced. The ground truth is not compared, because it is
-    used at the end only.
+    The timestamps and the sizes of all image files of that part are compared, and the images of the last processed
+    frame. Later frames can have been removed, added or replaced. The ground truth is not compared, because it is only
+    used at the end.
 
     Raises:
         InputError: If the last processed frame cannot be read.

@@ -42,7 +42,7 @@ def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_b
 
 
 def print_assumptions(source: RGBDStream, console: Console) -> None:
-    """Print what was assumed about a source because it is not stated: an estimated depth scale."""
+    """Print the assumptions about a source that does not state everything: an estimated depth scale."""
     if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
         console.print(f"note: {source.name}: {source.depth_scale_note}", markup=False, highlight=False)
 
@@ -63,7 +63,7 @@ def open_sequences(
     for name in dict.fromkeys(names):
         sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
         if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
-            raise sequence.groundtruth_error  # runs are compared by their scores, so all need ground truth
+            raise sequence.groundtruth_error  # runs are compared by their scores, so all need readable ground truth
         if sequence.name in sequences:
             raise InputError(f"{name}: another sequence has the same name, {sequence.name}; run them separately")
         sequences[sequence.name] = sequence
@@ -103,12 +103,12 @@ def run_with_progress(
         total = len(sequence) if isinstance(sequence, Sized) else None
         done = 0 if checkpoint is None else checkpoint.frames
         evaluation = run(TrackingBar(progress, total, interrupted, done))
-    run.pipeline.record.interrupted |= interrupted.is_set()  # also after the last frame, while results were written
+    run.pipeline.record.interrupted |= interrupted.is_set()  # includes Ctrl-C while results were written
     return run.pipeline, evaluation
 
 
 def compile_kernels(console: Console) -> None:
-    """Load the compiled kernels, or compile them with a progress bar: half a minute after an installation."""
+    """Load the compiled kernels, or compile them with a progress bar, which takes half a minute once."""
     bar = None
     with progress_bars(console) as progress, ExitStack() as resources:
         for compiled, left in compiler.compile_kernels():
@@ -122,7 +122,7 @@ def compile_kernels(console: Console) -> None:
 
 
 def _start_compiling_backwards() -> subprocess.Popen[bytes]:
-    """Start a second process that compiles the kernels from the last one on, and leaves them in the cache."""
+    """Start a second process that compiles the kernels, starting with the last one, and stores them in the cache."""
     command = "import v3d_torch.slam; from v3d_torch.kernels.compiler import compile_kernels as c; [*c(backwards=True)]"
     return subprocess.Popen(  # noqa: S603 - runs this package
         [sys.executable, "-c", command],
@@ -172,7 +172,7 @@ class TrackingBar:
         progress: Progress bars of the console.
         frames: Number of frames; None if it is not known.
         interrupted: Event that ends the run after the current frame.
-        done: Number of frames that are tracked already.
+        done: Number of frames that are already tracked.
         description: Text to the left of the bar.
     """
 

@@ -16,14 +16,14 @@ _SAMPLES = 5
 """Number of frames that are examined."""
 
 _MAX_PLAIN_SIGMA = 4.0
-"""Standard deviation of the grey values of an image without content, of 255: sensor noise in the dark is as large."""
+"""Maximum standard deviation of the grey values (0 to 255) of an image without content: sensor noise in the dark."""
 
 _MAX_EMPTY_FRACTION = 0.01
-"""Fraction of pixels with depth in a depth image without content."""
+"""Maximum fraction of pixels with depth in a depth image without content."""
 
 
 def diagnose(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
-    """Explain incomplete results of a run that no error ended.
+    """Explain incomplete results of a run that ended without an error.
 
     Args:
         pipeline: Pipeline that has run.

@@ -69,7 +69,7 @@ class _Warnings(logging.Handler):
 
 
 class _LogFile(logging.FileHandler):
-    """Log file that ignores a full disk: the run continues, and writing its results reports the error."""
+    """Log file that ignores a full disk: the run continues, and the error is reported when results are written."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         if not isinstance(sys.exception(), OSError):

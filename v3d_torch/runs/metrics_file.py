@@ -17,7 +17,7 @@ METRICS = "metrics.json"
 """Name of the file."""
 
 _MAX_DEPTH = 3
-"""Levels of folders above a run: a batch has sequence, configuration and seed."""
+"""Maximum number of folder levels above a run: a batch has sequence, configuration and seed."""
 
 
 class Metrics(BaseModel):
@@ -72,7 +72,7 @@ def suggest_folder(path: Path, file: str) -> str | None:
         file: Name of a file that the folder of a run has.
 
     Returns:
-        A suggestion in words; None if there is no such folder.
+        Text of a suggestion, for error messages; None if there is no such folder.
     """
     if path.is_file() and (path.parent / file).is_file():
         return f"pass its folder, {path.parent}"

@@ -1,7 +1,7 @@
-"""Debug mode: everything that a stage returns is checked for NaN and infinity, and the first such stage is named.
+"""Debug mode: the results of every stage are checked for NaN and infinity, and the error names the first such stage.
 
 A NaN spreads before it becomes visible, from a pose to a keyframe to the map. `CheckedSLAM` stops at the stage that
-returned it. Its results are byte-identical to those of `V3DSLAM`.
+returned it. Without NaN, its results are byte-identical to those of `V3DSLAM`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from v3d_torch.types import RGBDFrame
 _NOT_STAGES = frozenset(
     {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions", "occupancy"}
 )
-"""Public attributes of `V3DSLAM` that are not stages. The occupancy map is a result of whole numbers, in whose queries
-NaN is unknown space."""
+"""Public attributes of `V3DSLAM` that are not stages. The occupancy map consists of whole numbers, and NaN in its
+queries means unknown space."""
 
 MAY_BE_NAN = frozenset(
     {
@@ -87,7 +87,7 @@ def _check_tensor(name: str, tensor: Tensor, *, nan: bool, infinite: bool) -> No
 
 
 class CheckedStage(StageProxy):
-    """Wrapper of a stage that checks what its call and its methods return.
+    """Proxy of a stage that checks the results of its call and of its methods.
 
     Args:
         stage: Stage.

@@ -25,7 +25,8 @@ from v3d_torch.viz.trajectory_figure import draw_trajectory
 
 _FIGURES = {
     "masks.png": "Frames with the mask of each object in the colour of its motion state.",
-    "voting.png": "Frame with the most votes for dynamic objects: a line joins two objects if one voted for the other.",
+    "voting.png": "Frame with the most votes for dynamic objects: a line connects two objects, one of which voted for"
+    " the other.",
     "occupancy.png": "Occupancy map from above: free and occupied floor, and the distance to obstacles.",
     "clusters.png": "Point clouds of the objects in the same frame, before and after outlier rejection.",
 }
@@ -34,7 +35,7 @@ _FIGURES = {
 
 @dataclass(frozen=True)
 class StageSummary:
-    """Time of a stage, seconds; ``median`` and ``max`` are None if the times of the frames were not stored."""
+    """Time of a stage per frame, seconds; ``median`` and ``max`` are None if the times of frames were not stored."""
 
     name: str
     total: float
@@ -62,7 +63,7 @@ def render_page(run: StoredRun) -> str:
     stages = _stage_times(run)
     return environment.get_template("report_page.html").render(
         metrics=run.metrics,
-        folder=run.folder.resolve().name,  # resolved, because "latest" will be another run and "." has no name
+        folder=run.folder.resolve().name,  # resolved, because "latest" changes and "." is not a name
         evaluation=run.evaluation,
         pose_plots=_pose_plots(run),
         tracking_plots=_tracking_plots(run),

@@ -1,4 +1,4 @@
-"""Request of a run: everything that the user asks for, in one value."""
+"""Request of a run: all options given by the user, in one value."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class RunRequest:
         save_map: File to which the map is saved at the end; None to save no map.
         save_masks: True to write an image of the masked pixels for each frame.
         realtime: True to play the sequence at its own rate, like a live camera.
-        skip_broken: True to pass over broken frames, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
+        skip_broken: True to skip broken frames, see `v3d_torch.datasets.readable_frames.ReadableFrames`.
     """
 
     seq: str
@@ -84,9 +84,9 @@ class RunRequest:
         return RunRequest(config=self.config, **values)
 
     def conflicting_option(self, other: RunRequest) -> str | None:
-        """Return the first option that the other request sets to another value, as it is typed; None if none does.
+        """Return the first option that another request sets to a different value, as it is typed; None if none.
 
-        Options that name the location of the sequence do not conflict, because the sequence may have been moved, nor
+        Options with the location of the sequence do not conflict, because the sequence may have been moved, and neither
         does ``skip_broken``, because a broken frame may have ended the run.
         """
         options = self._options()

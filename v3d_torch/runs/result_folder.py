@@ -10,7 +10,7 @@ from pathlib import Path
 from v3d_torch.errors import OutputError
 
 _LOG = "run.log"
-"""Every run writes its log first, so this file marks the other files as results of a run."""
+"""Name of the log, which every run writes first: a folder with this file contains results of a run."""
 
 _RESULTS = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json"),
@@ -20,10 +20,10 @@ _RESULTS = (
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png"),
     *("masks/*.png", "map_masks/*.png"),
 )
-"""Files that a run, or the report of a run, writes in addition to the log."""
+"""Names of the files that a run, or the report of a run, writes in addition to the log."""
 
 _UNFINISHED = (".*.part*", "figures/.*.part*", "masks/.*.part*", "map_masks/.*.part*")
-"""Temporary files of a run that was killed while it wrote."""
+"""Pattern of the temporary files of a run that was killed while it wrote."""
 
 
 def make_result_folder(out: Path | None, name: str) -> Path:

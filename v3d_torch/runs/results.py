@@ -71,7 +71,7 @@ def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Eval
 
     Args:
         folder: Folder of the results; made if it is missing.
-        pipeline: Pipeline that has run, to the end or not.
+        pipeline: Pipeline that has run, to the end of the sequence or not.
         point_map: Point map of the static scene, from `Pipeline.flush`.
 
     Returns:
@@ -166,7 +166,7 @@ def _object_table(dynamics: ObjectTable) -> pa.Table:
 
 
 def _write_table(path: Path, table: pa.Table) -> None:
-    content = io.BytesIO()  # errors of files are then those of Python, not of pyarrow
+    content = io.BytesIO()  # so that Python, and not pyarrow, writes the file and raises the errors
     pq.write_table(table, content)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content.getvalue())

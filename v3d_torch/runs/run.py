@@ -1,4 +1,4 @@
-"""One run: a sequence through a new system, with its log, checkpoints and results."""
+"""One run: processes a sequence with a new system, and writes log, checkpoints and results."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class Run:
     """A run of one sequence, which writes all its files. The log goes to the file of `log_to`.
 
     Args:
-        request: Configuration and outputs of the run; its inputs are opened already.
+        request: Configuration and outputs of the run. Its inputs are not opened; they are the next arguments.
         sequence: Frames.
         segment: Segmenter.
         folder: Folder of the results; it exists.
-        viewer: Viewer that is shown each frame.
+        viewer: Viewer that shows each frame.
         known_map: Map of an earlier run in which the camera is localised; None to start a new map.
         checkpoint: Checkpoint of the same run to resume from; None to start with the first frame.
         save_checkpoints: False to save no checkpoints.
@@ -122,7 +122,7 @@ class Run:
 
 
 def describe_motion(objects: FrameObjects) -> str:
-    """Return the objects that are not static in words, by class and motion state; empty if there are none."""
+    """Return a text with the objects that are not static, by class and motion state; empty if there are none."""
     counts = Counter(
         f"{class_name(each.label)} {each.motion_state.value}"
         for each in objects.objects

@@ -109,7 +109,7 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, m
         masks: True to read the masks that the run saved; False for masks that exclude nothing.
 
     Returns:
-        Iterator over the frames, which raises an InputError if an image cannot be read or is not of the run.
+        Iterator over the frames, which raises an InputError if an image cannot be read or is not from the run.
 
     Raises:
         InputError: If the run saved no masks, or the source has fewer frames than the run had.
@@ -117,7 +117,7 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, m
     folder = run.folder / _MASKS
     if masks and not folder.is_dir():
         raise InputError(
-            f"{run.folder}: has no masks; run the sequence again with --save-masks, or keep what moves with --no-masks"
+            f"{run.folder}: has no masks; run the sequence again with --save-masks, or do not mask with --no-masks"
         )
     if isinstance(source, RGBDSequence) and frames.indices[-1] >= len(source):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Table of the time that each stage of a frame took, as ``--profile`` shows it."""
+"""Table of the time of each stage of a frame, for ``--profile``."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from v3d_torch.pipeline.run_record import RunRecord
 
 _PREPROCESSING = ("read", "segmentation", "depth", "features")
 _BACK_END = ("bundle", "loop")
-"""Stages that run beside the tracking of a frame; all other stages of a frame run one after the other."""
+"""Stages that run in parallel with tracking; all other stages of a frame run one after the other."""
 
 
 def stage_table(run: RunRecord) -> Table:
     """Return the milliseconds per frame of each stage, and of each chain of stages that run one after the other.
 
-    The slowest chain limits the frame rate, whatever the number of processors. A stage counts as 0 on frames on which
-    it did not run.
+    The slowest chain limits the frame rate, independently of the number of processors. A stage that did not run on a
+    frame counts as 0.
 
     Args:
         run: Record of a finished run with at least one frame.

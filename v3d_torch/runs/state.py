@@ -20,6 +20,7 @@ from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.range_view import RangeView
+from v3d_torch.occupancy.up_direction import UpDirection
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runtime.stage_timer import StageTime
@@ -32,7 +33,7 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 STATE_CLASSES: tuple[type, ...] = (
     *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus, CameraState),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
-    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView, Floor),
+    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, TrackerConfig, RangeView, Floor, UpDirection),
 )
 """Classes of the package that a saved state can contain; others are not read."""
 
@@ -57,7 +58,7 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
 
     Args:
         path: File.
-        segment: Segmenter; None for that of the configuration.
+        segment: Segmenter; None to create the one named in the configuration.
 
     Raises:
         InputError: If the file is missing, damaged, not a saved state, or from another version.

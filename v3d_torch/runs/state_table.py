@@ -1,4 +1,4 @@
-"""Table of the states of the camera, as they were known when each frame was tracked."""
+"""Table of the states of the camera at each frame, without later corrections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 def make_state_table(record: RunRecord) -> pa.Table:
-    """Make the table of states: status, pose, twist and covariance; latency and frames left out of a live run."""
+    """Make the table of states: status, pose, twist, covariances; for a live run also latency and dropped frames."""
     states, live = record.states, record.live
     T_wc, count = states["T_wc"].numpy(), len(states)
     quaternions = Rotation.from_matrix(T_wc[:, :, :3]).as_quat(canonical=True) if count else np.zeros((0, 4))

@@ -68,7 +68,7 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     metrics, trajectory = read_metrics(folder / METRICS), _read_poses(folder / "trajectory.txt")
     frames = len(metrics.status)
     if trajectory is not None and metrics.failure is not None:
-        # If the run was killed between the two files, the trajectory has more poses.
+        # If the run was killed after it wrote the trajectory and before metrics.json, the trajectory has more poses.
         trajectory = Trajectory(trajectory.stamps[:frames], trajectory.T_wc[:frames])
     if trajectory is not None and len(trajectory) != frames:
         raise InputError(
@@ -125,5 +125,5 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> pa.Table | None:
 def _read_config(path: Path) -> Config | None:
     try:
         return load_config(path) if path.is_file() else None
-    except ConfigError:  # from a version with other keys: it is shown, but not compared
+    except ConfigError:  # of a version with other keys; it is shown, but not compared
         return None

@@ -1,1 +1,1 @@
-"""Threads, memory, timing, padded batches, and checks of what callers pass in."""
+"""Threads, memory, timing, padded batches, and checks of arguments."""

@@ -14,7 +14,7 @@ from v3d_torch.kernels.compiler import to_array
 
 
 def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
-    """Convert values to float64, and replace those that are padding, so that they spread neither NaN nor gradients.
+    """Convert values to float64, and replace the padding, so that it causes neither NaN nor gradients.
 
     Args:
         values: Any shape.
@@ -27,18 +27,18 @@ def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
 
 
 def common_batch(*batches: torch.Size) -> torch.Size:
-    """Return the dimensions to which those of several batches broadcast; faster if they are equal."""
+    """Return the broadcast shape of several batch shapes; faster than torch if they are equal."""
     first, *others = batches
     return first if all(other == first for other in others) else torch.broadcast_shapes(*batches)
 
 
 def to_rows(tensor: Tensor, batch: torch.Size) -> NDArray[Any]:
-    """Return a batch of tensors as an array with one dimension for all dimensions of the batch."""
+    """Return a batch of tensors as an array in which all batch dimensions are flattened to one."""
     return to_array(tensor.reshape(batch.numel(), *tensor.shape[len(batch) :]) if batch else tensor[None])
 
 
 def from_rows(rows: Sequence[Sequence[Any]], batch: torch.Size) -> list[Tensor]:
-    """Return the results of a kernel as tensors with the dimensions of a batch, the inverse of `to_rows`.
+    """Return the results of a kernel as tensors with the batch dimensions, the inverse of `to_rows`.
 
     Args:
         rows: Results for each problem of the batch, at least one: arrays and numbers.

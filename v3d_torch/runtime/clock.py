@@ -1,4 +1,4 @@
-"""Clock of live processing, which tests replace by a simulated one."""
+"""Clock of live processing, replaceable by a simulated one in tests."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Clock that only goes forward."""
+    """Clock whose time never decreases."""
 
     def now(self) -> float:
         """Time since an arbitrary start, seconds."""
@@ -29,4 +29,4 @@ class MonotonicClock:
 
 
 MONOTONIC_CLOCK = MonotonicClock()
-"""Clock that is used if no other is given."""
+"""Default clock."""

@@ -1,4 +1,4 @@
-"""Checks of frames, instances and parameters that callers pass in, before they fail inside a stage."""
+"""Checks of frames, instances and parameters, so that wrong arguments do not fail inside a stage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import Instances, RGBDFrame
 
 _MAX_NORM_ERROR = 1e-3
-"""Largest difference of the length of a unit vector from 1."""
+"""Maximum difference between the length of a unit vector and 1."""
 
 TensorSpec = tuple[torch.dtype, tuple[int | str, ...]]
 """Dtype and shape of a tensor; dimensions with the same name have the same size."""
@@ -114,7 +114,7 @@ def fill_in(dimensions: Sequence[int | str], sizes: Mapping[str, int]) -> tuple[
 
 
 def describe_wrong_tensor(value: object, shape: tuple[int | str, ...], dtype: torch.dtype) -> str | None:
-    """Describe how a value differs from a tensor on the CPU.
+    """Describe how a value differs from a CPU tensor of the expected dtype and shape.
 
     Args:
         value: Value.
@@ -122,7 +122,7 @@ def describe_wrong_tensor(value: object, shape: tuple[int | str, ...], dtype: to
         dtype: Expected dtype.
 
     Returns:
-        Some words that follow "is" or "are"; None if the value is such a tensor.
+        Text that follows "is" or "are" in a message; None if the value is as expected.
     """
     if not isinstance(value, Tensor):
         found = describe_type(value)
@@ -138,5 +138,5 @@ def describe_wrong_tensor(value: object, shape: tuple[int | str, ...], dtype: to
 
 
 def describe_type(value: object) -> str:
-    """Return the class of a value in words."""
+    """Return the class name of a value, for messages."""
     return f"a {type(value).__qualname__}"

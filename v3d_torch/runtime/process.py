@@ -12,8 +12,8 @@ import torch
 def set_num_threads(threads: int) -> None:
     """Set the number of threads of torch and OpenCV.
 
-    The operations of a frame are small, and more threads mostly wait for each other. onnxruntime gets its number from
-    ``segmentation.threads``; kornia-rs reads RAYON_NUM_THREADS once, at its first call.
+    The operations of a frame are small, so that more threads mostly wait for each other. The threads of onnxruntime are
+    set by ``segmentation.threads``, those of kornia-rs by RAYON_NUM_THREADS, which it reads at its first call.
 
     Args:
         threads: Number of threads of each library.

@@ -1,4 +1,4 @@
-"""Proxy of a stage, from which wrappers that check its results are derived."""
+"""Proxy of a stage: base class of wrappers that check the results of the stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
 
 
 class StageProxy:
-    """Stage whose call can be checked; everything else is read from and written to the stage itself.
+    """Proxy that checks the results of a stage; attributes are read from and written to the stage itself.
 
     Args:
         stage: Stage.
@@ -30,7 +30,7 @@ class StageProxy:
         return result
 
     def _check(self, result: Any, *args: Any) -> None:
-        """Check the result of a call with some positional arguments."""
+        """Check the result of a call; the positional arguments of the call are passed on."""
         raise NotImplementedError
 
     def __getattr__(self, name: str) -> Any:

@@ -18,7 +18,7 @@ from v3d_torch.segmentation.suppression import non_maximum_suppression
 from v3d_torch.types import Instances
 
 _MAX_CANDIDATES = 1024
-"""Largest number of predictions that enter suppression: bounds its N x N matrix of overlaps, and is far above the
+"""Maximum number of predictions that enter suppression. It bounds the N x N matrix of overlaps, and is far above the
 number of predictions that pass a useful score threshold."""
 
 

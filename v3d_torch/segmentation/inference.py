@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 _BOX = 4
-"""Rows of the raw predictions that hold the box; class scores and mask coefficients follow."""
+"""Number of rows of the raw predictions for the box; class scores and mask coefficients follow."""
 
 _MARGIN = 2
 """Cells around a cell that its box and mask coefficients depend on: one for each of two 3x3 convolutions."""
@@ -31,7 +31,7 @@ _Array = NDArray[np.float32]
 
 
 class NetworkOutput(Protocol):
-    """Output of a network for one image, computed when it is asked for."""
+    """Output of a network for one image, computed on demand."""
 
     @property
     def scores(self) -> Tensor:
@@ -158,7 +158,7 @@ class SplitOutput:
             height, width = level.shape[2:]
             members = (first_cell <= indices) & (indices < first_cell + height * width)
             v, u = np.divmod(indices[members] - first_cell, width)
-            # Without members, one cell: the part has no form without this level.
+            # A level without cells gets a section of one cell, because the part needs an input for every level.
             rows, columns = (_section(x, size) if len(x) else slice(0, 1) for x, size in ((v, height), (u, width)))
             sections[name] = np.ascontiguousarray(level[:, :, rows, columns])
             section_width = columns.stop - columns.start
@@ -181,7 +181,7 @@ class SplitOutput:
         if len(levels) > 1:
             inputs, top, left = {LEVELS[level]: self._pyramid[level] for level in levels}, 0, 0
         else:
-            # A prototype depends on a 3x3 neighbourhood, that on 3x3 cells of twice the size.
+            # A prototype depends on a 3x3 neighbourhood, which depends on 3x3 cells of twice the size.
             height, width = self._pyramid[0].shape[2:]
             top, left = (max((side.start - 1) // 2 - 1, 0) for side in (rows, columns))
             bottom, right = (min(side.stop // 2 + 2, size) for side, size in ((rows, height), (columns, width)))
@@ -194,7 +194,7 @@ class SplitOutput:
 
 
 def _section(cells: NDArray[np.int64], size: int) -> slice:
-    """Rows or columns of a feature map that the results in some cells depend on."""
+    """Rows or columns of a feature map on which the results in some cells depend."""
     return slice(max(int(cells.min()) - _MARGIN, 0), min(int(cells.max()) + _MARGIN + 1, size))
 
 
@@ -219,7 +219,7 @@ def open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
-    # Waiting threads that spin would slow down torch, which computes between two calls.
+    # Spinning threads would slow down torch, which computes between two calls.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

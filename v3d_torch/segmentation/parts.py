@@ -1,8 +1,8 @@
 """Split of a network into parts, so that only the needed parts of its head are computed.
 
 The class scores are computed for all cells. Boxes, mask coefficients and prototypes are needed only near detected
-objects: the other parts of the head then run on sections of the feature maps. Convolutions see zeros beyond a section
-as beyond the image, so a section has a margin; all results inside are the same as those of the whole network.
+objects, so the other parts of the head run on sections of the feature maps. Convolutions are padded with zeros at the
+border of a section, so a section has a margin; inside it, all results equal those of the whole network.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def split(path: Path, targets: PartPaths) -> None:
 
 
 def _extract(model: onnx.ModelProto, inputs: Sequence[str], outputs: Sequence[str]) -> onnx.ModelProto:
-    """Part of a network between some tensors; inputs that the outputs do not depend on are left out."""
+    """Part of a network between given tensors; inputs on which the outputs do not depend are left out."""
     from onnx import TensorProto, helper
 
     producers = {name: node for node in model.graph.node for name in node.output}

@@ -31,8 +31,8 @@ _VERSION = 3
 earlier versions in the cache are not used."""
 
 _CALIBRATION_INTERVAL = 15
-"""Frames of the demo from one calibration frame to the next: the chosen frames show people in full and cut off by the
-image border, on dark and on bright backgrounds."""
+"""Interval between calibration frames, in frames of the demo: they show people in full and cut off by the image border,
+on dark and on bright backgrounds."""
 
 _FIRST_FLOAT_CONVOLUTIONS = 5
 """Number of convolutions at the input that stay in floating point: their errors propagate through all later layers, and

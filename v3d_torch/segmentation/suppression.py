@@ -9,15 +9,15 @@ from v3d_torch.geometry.packed_masks import count_common_pixels, pack_masks
 from v3d_torch.types import Instances
 
 _STRIDE = 4
-"""Masks are compared on every n-th row and column, pixels: prototype cells are this large, so masks have no finer
+"""Masks are compared on every n-th row and column, pixels: the size of a prototype cell, below which masks have no
 detail."""
 
 
 def non_maximum_suppression(boxes: Tensor, labels: Tensor, iou_threshold: float) -> Tensor:
     """Greedy non-maximum suppression within each class, on all boxes at once.
 
-    A box is kept if no better box that is kept overlaps it. The rule is applied to all boxes together until nothing
-    changes: after pass n at least the first n boxes are final; in practice three or four passes suffice.
+    A box is kept unless it overlaps a kept box with a higher score. The rule is applied to all boxes at once until
+    nothing changes: after pass n at least the first n boxes are final; in practice three or four passes suffice.
 
     Args:
         boxes: Left, top, right and bottom edges, best score first, pixels, shape :math:`(N, 4)`.

@@ -1,10 +1,10 @@
 """Segmentation of a rolled camera's images in upright orientation.
 
 Networks are trained on upright images and miss people who appear lying in the image of a rolled camera. The up
-direction is found without a gravity sensor, by the network itself: of the four quarter turns of an image, the upright
-one gets the most confident detections. A search segments all four turns, and each turn votes for a direction in the
-world. Correct votes add up as the camera turns, wrong ones cancel out. A few searches suffice, because the camera
-poses relate the up direction to each new frame.
+direction is estimated without a gravity sensor, by the network itself: of the four quarter turns of an image, the
+upright one gives the detections with the highest scores. A search segments all four turns, and each turn votes for a
+direction in the world frame. As the camera turns, correct votes add up and wrong votes cancel out. A few searches
+suffice, because the camera poses relate the up direction to each new frame.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ _PRIOR_WEIGHT = 0.5
 single confident detection outweighs the prior."""
 
 _CONFIDENT_WEIGHT = 10.0
-"""Length of the sum of votes, in detections of score 1, above which the up direction is settled: a few wrong votes
-cannot turn it then."""
+"""Length of the sum of votes, in detections of score 1, above which the up direction is settled, because a few wrong
+votes can no longer change it."""
 
 _SEARCH_INTERVAL = 8
-"""Calls between two searches until the up direction is settled: a quarter of a second at 30 Hz, so that a moving camera
-has a different view at each search."""
+"""Number of calls between two searches until the up direction is settled: a quarter of a second at 30 Hz, so that a
+moving camera has a different view at each search."""
 
 _SEARCH_CALLS = 128
-"""Calls during which searches are this frequent, about 4 s at 30 Hz: bounds the cost in scenes without detections,
-because a search takes four times as long as a plain call."""
+"""Number of calls during which searches are this frequent, about 4 s at 30 Hz. It bounds the cost in scenes without
+detections, because a search takes four times as long as a call without search."""
 
 
 _GRAVITY_WEIGHT = 2 * _CONFIDENT_WEIGHT
-"""Weight of a measured gravity, in detections of score 1: no search is needed then."""
+"""Weight of a measured gravity, in detections of score 1: so large that no search is needed."""
 
 
 class UprightSegmenter:
@@ -50,7 +50,7 @@ class UprightSegmenter:
         segment: Segmenter of frames of any size.
 
     Attributes:
-        segment: That segmenter.
+        segment: The segmenter of frames of any size.
     """
 
     def __init__(self, segment: Segmenter) -> None:
@@ -60,7 +60,7 @@ class UprightSegmenter:
         self._up = torch.tensor([0.0, -_PRIOR_WEIGHT, 0.0], dtype=torch.float64)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Segment a frame without a pose: upright if its gravity was measured, else in the orientation that it has."""
+        """Segment a frame without a pose: upright if its gravity was measured, else in its own orientation."""
         return self.segment(frame) if frame.gravity is None else self._segment_rotated(frame, _turns(-frame.gravity))
 
     def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
@@ -85,7 +85,7 @@ class UprightSegmenter:
             return self._segment_rotated(frame, self._upright_turns(T_cw))
         candidates = [self._segment_rotated(frame, turns) for turns in range(4)]
         for turns, instances in enumerate(candidates):
-            # Squared scores: other orientations give as many detections, but less confident ones.
+            # Squared scores, because other orientations give as many detections, but with lower scores.
             self._up = self._up + float(instances.scores.square().sum()) * T_cw[:3, :3].T @ _up_in_camera(turns)
         return candidates[self._upright_turns(T_cw)]
 
@@ -94,7 +94,7 @@ class UprightSegmenter:
         return {"calls": self._calls, "up": self._up.clone()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state that `state_dict` returned."""
+        """Restore a state of `state_dict`."""
         self._calls, self._up = state["calls"], state["up"].clone()
 
     def _is_search_due(self) -> bool:
@@ -132,7 +132,7 @@ def up_votes(state: Mapping[str, Any] | None) -> Tensor | None:
 
     Returns:
         Sum of the votes, in detections of score 1, world frame, float64, shape :math:`(3,)`; None if the segmenter is
-        no `UprightSegmenter`.
+        not an `UprightSegmenter`.
     """
     return state["up"] if state is not None and state.keys() == {"calls", "up"} else None
 

@@ -21,7 +21,7 @@ from v3d_torch.io.download import cache_dir, fetch
 from v3d_torch.io.files import atomic_write, file_lock
 
 _CONNECT_TIMEOUT = 3.0
-"""Timeout of a connection, seconds: short, so that each source fails soon if there is no network."""
+"""Timeout of a connection, seconds; short, so that each source fails soon without a network."""
 
 _RELEASES = "https://github.com/ultralytics/assets/releases/download"
 

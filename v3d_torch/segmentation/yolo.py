@@ -48,7 +48,7 @@ class YOLOSegmenter:
         self._iou_threshold = None if REGISTRY[config.model].one_to_one else config.iou_threshold
 
     def __reduce__(self) -> tuple[type[YOLOSegmenter], tuple[SegmentationConfig, Path | None]]:
-        """Pickle by configuration and path: sessions cannot be pickled, the other process opens the files again."""
+        """Pickle by configuration and path, because sessions cannot be pickled: the other process reopens the files."""
         return YOLOSegmenter, (self.config, self._weights)
 
     def __call__(self, frame: RGBDFrame) -> Instances:

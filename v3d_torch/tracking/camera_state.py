@@ -24,8 +24,8 @@ class CameraState:
         stamp: Time, seconds.
         T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`; the world frame is that of the first camera.
         status: Source of the pose.
-        covariance: Covariance of the pose: the true pose is ``T_wc @ se3_exp(xi)`` with an error xi of this covariance,
-            float64, shape :math:`(6, 6)`.
+        covariance: Covariance of the error xi of the pose, where ``T_wc @ se3_exp(xi)`` is the true pose, float64,
+            shape :math:`(6, 6)`.
         twist: Velocity of the camera: after dt seconds the pose is ``T_wc @ se3_exp(twist * dt)``; m/s and rad/s,
             float64, shape :math:`(6,)`.
         twist_covariance: Covariance of the twist, float64, shape :math:`(6, 6)`.
@@ -43,11 +43,11 @@ class CameraState:
     def predict(self, stamp: float) -> CameraState:
         """Predict the camera at a later time, with constant twist and growing covariance.
 
-        The camera is predicted to stop after `MAX_EXTRAPOLATION` seconds, because a hand changes its motion within that
-        time; the covariance includes the motion that may follow.
+        The predicted camera stops after `MAX_EXTRAPOLATION` seconds, because a handheld camera changes its motion
+        within that time; the covariance includes the unknown motion after it.
 
         Args:
-            stamp: Time, seconds.
+            stamp: Time, seconds, not before that of this state.
         """
         joint = join_covariances(self.covariance, self.cross_covariance, self.twist_covariance)
         moving = min(stamp - self.stamp, MAX_EXTRAPOLATION)

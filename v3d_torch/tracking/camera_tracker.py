@@ -1,4 +1,4 @@
-"""Pose of each frame: from the local map, else by relocalisation, else from the motion alone."""
+"""Tracking of the camera: pose of each frame from the local map, by relocalisation, or from the motion alone."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class _PlaceMatch(Protocol):
 
 
 class Relocaliser(Protocol):
-    """Finds the pose of a lost camera; `v3d_torch.backend.loop_closer.LoopCloser` is one."""
+    """Finds the pose of a lost camera; implemented by `v3d_torch.backend.loop_closer.LoopCloser`."""
 
     def relocalise(self, features: Features, sparse_map: SparseMap) -> _PlaceMatch | None:
-        """Find the place of the map that the features show; None if there is none."""
+        """Find the place in the map where the features were observed; None if there is none."""
 
 
 class CameraTracker:
@@ -33,7 +33,7 @@ class CameraTracker:
 
     Args:
         track_map: Tracks a frame against a local map.
-        relocaliser: Finds a lost camera in the map.
+        relocaliser: Finds the pose of a lost camera in the map.
         sparse_map: Map of the system.
         local_keyframes: Number of keyframes whose landmarks make up the local map.
     """
@@ -80,7 +80,10 @@ class CameraTracker:
         return FramePose(status, T_cw, torch.full((len(features),), -1, dtype=torch.int64))
 
     def reference_keyframe(self, pose: FramePose) -> Keyframe | None:
-        """Return the keyframe that shares most landmarks with a frame, else the last one; None if there are none."""
+        """Return the keyframe that shares most landmarks with a frame; None if there is no keyframe.
+
+        If the frame has no landmarks, this is the last keyframe.
+        """
         keyframes = self._map.keyframes
         best = self._map.covisible_keyframes(pose.observed_landmarks, 1)
         return keyframes[int(best[0])] if len(best) else (keyframes[-1] if keyframes else None)

@@ -1,9 +1,9 @@
-"""Noise of the map: errors of the poses of keyframes, which their landmarks pass on to frames and later keyframes.
+"""Noise of the map: pose errors of keyframes, which propagate through landmarks to frames and later keyframes.
 
 A landmark has the pose error of the keyframe that created it. A frame that is tracked with landmarks of several
-keyframes has the average of their errors, and adds its own when it becomes a keyframe. With the noise of one frame as
-the unit, numbers describe all errors: the covariance of the errors of any two keyframes. The error that a frame takes
-over from the map grows as the camera explores, and shrinks when it observes old landmarks again.
+keyframes has the average of their errors; if it becomes a keyframe, its own error is added. The covariance of the
+errors of any two keyframes is a number, in units of the noise of one frame. The error that a frame inherits from the
+map grows as the camera explores, and shrinks when it observes old landmarks again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class MapNoise:
         self._covariance = torch.zeros(0, 0, dtype=torch.float64)
 
     def __call__(self, owners: Tensor) -> float:
-        """Variance of the error that a frame takes over from the map, relative to the variance of a frame.
+        """Variance of the error that a frame inherits from the map, relative to the variance of a frame.
 
         Args:
             owners: Indices of the keyframes that created the landmarks of the frame, int64, shape :math:`(L,)`.
@@ -32,13 +32,13 @@ class MapNoise:
         return float(weights @ self._covariance @ weights)
 
     def add_keyframe(self, owners: Tensor, references: Tensor, variance: float = 1.0) -> None:
-        """Add the newest keyframe. Keyframes that were culled since the last call take the errors of their references.
+        """Add the newest keyframe. Keyframes culled since the last call get the errors of their reference keyframes.
 
         Args:
-            owners: Indices of the keyframes that created the landmarks with which it was tracked, int64, shape
-                :math:`(L,)`; empty for the first keyframe, and for one of unknown pose.
+            owners: Indices of the keyframes that created the landmarks with which the new keyframe was tracked, int64,
+                shape :math:`(L,)`; empty for the first keyframe, and for a keyframe of unknown pose.
             references: Reference keyframe of each keyframe of the map, see `Keyframe`, int64, shape :math:`(K,)`.
-            variance: Variance of its own error, relative to the variance of a frame.
+            variance: Variance of the new keyframe's own error, relative to the variance of a frame.
         """
         self._add_unrelated(len(references) - 1)
         weights = self._weights(owners)
@@ -60,7 +60,7 @@ class MapNoise:
         self._rows, self._covariance = state["rows"], state["covariance"]
 
     def _add_unrelated(self, count: int) -> None:
-        """Add keyframes with independent errors until there are ``count``: those of a loaded map."""
+        """Add the keyframes of a loaded map, with independent errors, until there are ``count`` keyframes."""
         missing, size = max(count - len(self._rows), 0), len(self._covariance)
         self._rows = torch.cat([self._rows, torch.arange(size, size + missing)])
         self._covariance = torch.block_diag(self._covariance, torch.eye(missing, dtype=torch.float64))

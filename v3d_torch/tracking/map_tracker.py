@@ -14,14 +14,14 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
 
 _SEARCH_RADIUS = 10.0
-"""Radius around the projection of a landmark in which it is matched, pixels at level 0; it grows with the level. The
-error of a predicted pose is some pixels."""
+"""Search radius around the projection of a landmark, pixels at level 0; it grows with the level. The error of a
+predicted pose is some pixels."""
 
 _REFINED_SEARCH_RATIO = 0.5
-"""The second search starts from a refined pose and uses this fraction of the radius."""
+"""Fraction of the search radius that the second search uses, which starts from a refined pose."""
 
 _OCCLUSION_SIGMAS = 2.0
-"""Landmarks farther behind the measured depth than this many standard deviations are occluded."""
+"""Minimum distance of an occluded landmark behind the measured depth, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class MapTracker:
             first = self.refine(T_cw, local_map.points[landmark], features[feature], rounds=2)
         if first is None:
             return None
-        # The refined pose brings the remaining landmarks into reach.
+        # With the refined pose, the projections of the remaining landmarks are close enough to their features.
         projected = self._match.project(first.T_cw, local_map)
         radius = _REFINED_SEARCH_RATIO * _SEARCH_RADIUS
         landmark, feature = self._match(features, projected, local_map, radius).unbind(dim=1)
@@ -126,7 +126,7 @@ class MapTracker:
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
     def _is_occluded(self, projected: ProjectedLandmarks, depth: Tensor) -> Tensor:
-        """Return which landmarks lie behind the measured depth at their projection, bool, shape (V,)."""
+        """Return the mask of the landmarks behind the measured depth at their projection, bool, shape (V,)."""
         pixels = self._camera.distort(projected.uv).round().to(torch.int64)
         z = sample_depth(pixels, depth, torch.inf)
         return (z > 0) & (1 / z - 1 / projected.depth > _OCCLUSION_SIGMAS * self._config.inverse_depth_sigma)

@@ -15,8 +15,8 @@ from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
 
 MAX_EXTRAPOLATION = 0.2
-"""Longest time over which a velocity is extrapolated, seconds: a hand changes its motion within that time. A camera
-that is lost for longer is predicted to stand still."""
+"""Maximum time over which a velocity is extrapolated, seconds: a handheld camera changes its motion within that time. A
+camera that is lost for longer is predicted to stand still."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class PosePrediction:
     """Prediction of the camera motion after a frame.
 
     Attributes:
-        stamp: Time of that frame, seconds.
-        T_cw: World-to-camera pose of that frame, float64, shape :math:`(4, 4)`.
-        velocity: Twist of the points in the camera frame, [translation, rotation] per second, float64, shape
+        stamp: Time of the frame, seconds.
+        T_cw: World-to-camera pose of the frame, float64, shape :math:`(4, 4)`.
+        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
             :math:`(6,)`.
     """
 
@@ -35,7 +35,7 @@ class PosePrediction:
     velocity: Tensor
 
     def motion_until(self, stamp: float) -> Tensor:
-        """Motion ``T_cp`` from the camera at that frame to the camera at ``stamp``, float64, shape :math:`(4, 4)`."""
+        """Motion ``T_cp`` from the camera at the frame to the camera at ``stamp``, float64, shape :math:`(4, 4)`."""
         return se3_exp(self.velocity * min(stamp - self.stamp, MAX_EXTRAPOLATION))
 
     def pose_at(self, stamp: float) -> Tensor:
@@ -48,8 +48,8 @@ class MotionModel:
 
     Attributes:
         velocity: Twist per second after the last frame, as in `PosePrediction`.
-        previous_velocity: Mean twist per second around the frame before the last one, which is known once both of its
-            neighbours are; None if it is not known.
+        previous_velocity: Mean twist per second around the frame before the last one, from the poses before and after
+            it; None if it is not known.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class MotionModel:
         self.previous_velocity: Tensor | None = None
 
     def predict(self, poses: PoseHistory) -> PosePrediction:
-        """Predict the motion after the last frame; before the first frame the camera stands at the origin."""
+        """Predict the motion after the last frame; before the first frame, a camera at rest in the origin."""
         stamp = poses.stamp if len(poses) else 0.0
         return PosePrediction(stamp, poses.T_cw, self.velocity)
 
@@ -80,7 +80,7 @@ class MotionModel:
             self.velocity = self.velocity * (stamp - poses.last_found < MAX_EXTRAPOLATION)
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:
             velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / elapsed
-            if motion.is_measured:  # without a measured motion the pose can jump to a place found by relocalisation
+            if motion.is_measured:  # otherwise the pose can have jumped, by relocalisation
                 self.previous_velocity = (self.velocity + velocity) / 2 if poses.has_motion else velocity
             self.velocity = velocity
 

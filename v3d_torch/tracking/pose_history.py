@@ -22,7 +22,7 @@ class PoseEntry:
     Attributes:
         stamp: Timestamp, seconds.
         status: Source of the pose.
-        keyframe: Keyframe that the pose is relative to; None for the world frame, before the first keyframe.
+        keyframe: Keyframe to which the pose is relative; None for the world frame, before the first keyframe.
         T_ck: Motion from the keyframe to the camera, float64, shape :math:`(4, 4)`.
         has_motion: True if the motion since the previous frame was measured.
     """
@@ -78,7 +78,7 @@ class PoseHistory:
 
     @property
     def keyframe(self) -> Keyframe | None:
-        """Keyframe that the pose of the last frame is relative to; None if there is none."""
+        """Keyframe to which the pose of the last frame is relative; None if there is none."""
         return self._entries[-1].keyframe if self._entries else None
 
     @property
@@ -96,19 +96,19 @@ class PoseHistory:
     ) -> Tensor | None:
         """Append the pose of a frame.
 
-        If the camera is found again, the lost frames before it get the poses that the measured motions imply. If it is
-        found for the first time, all frames before it are moved, because their world frame was a guess.
+        When the camera is found again, the lost frames before it get poses from the measured motions. When it is found
+        for the first time, all earlier frames are moved, because their world frame was a guess.
 
         Args:
             stamp: Timestamp, seconds.
             pose: Estimated pose.
             motion: Motion of the camera since the previous frame.
-            reference: Keyframe that the pose is stored relative to; None before the first keyframe.
-            new: Keyframe that this frame has become; None if it has not.
+            reference: Keyframe relative to which the pose is stored; None before the first keyframe.
+            new: Keyframe created from this frame; None if the frame is not a keyframe.
 
         Returns:
-            The correction from the guessed world frame to the map if the camera was found for the first time, new world
-            from old, float64, shape :math:`(4, 4)`; else None.
+            If the camera was found for the first time, the transform ``T_new_old`` from the guessed world frame to that
+            of the map, float64, shape :math:`(4, 4)`; else None.
         """
         status = pose.status
         if status is TrackingStatus.TRACKED and reference is not None and reference.disconnected:
@@ -136,7 +136,7 @@ class PoseHistory:
         return T_new_old
 
     def replace_last(self, T_cw: Tensor) -> None:
-        """Replace the pose of the last frame by a refined one, world to camera, float64, shape :math:`(4, 4)`."""
+        """Replace the pose of the last frame by a refined world-to-camera pose, float64, shape :math:`(4, 4)`."""
         last = self._entries[-1]
         self._entries[-1] = replace(last, T_ck=_relative(T_cw, last.keyframe))
 
@@ -155,7 +155,7 @@ class PoseHistory:
         return torch.cat([none, *T_ck]) @ torch.cat([none, *T_kw])
 
     def trajectory(self) -> Trajectory:
-        """Poses of all frames in the current map; lost frames are interpolated between the nearest found ones."""
+        """Poses of all frames in the current map; poses of lost frames are interpolated between found frames."""
         stamps = torch.tensor([entry.stamp for entry in self._entries], dtype=torch.float64)
         T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(entry.T_cw[None] for entry in self._entries)])
         found = torch.tensor([entry.status is not TrackingStatus.LOST for entry in self._entries])
@@ -175,7 +175,7 @@ class PoseHistory:
         self.observed_landmarks = state["observed_landmarks"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
-        """Move the lost frames at the end: those linked to the new frame by measured motions, or all of them."""
+        """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""
         disconnected = keyframe is not None and keyframe.disconnected
         found = TrackingStatus.DISCONNECTED if disconnected else TrackingStatus.ODOMETRY
         for index in reversed(range(len(self._entries))):
@@ -199,7 +199,7 @@ def _relative(T_cw: Tensor, keyframe: Keyframe | None) -> Tensor:
 
 
 def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:
-    """Interpolate lost poses along the geodesic between the nearest found ones; those at the ends stay."""
+    """Interpolate lost poses along the geodesic between the nearest found poses; lost poses at the ends stay."""
     known = torch.nonzero(found)[:, 0]
     if known.shape[0] == 0:
         return T

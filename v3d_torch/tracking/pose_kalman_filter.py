@@ -1,7 +1,7 @@
 """Kalman filter of pose and twist of a camera, with constant velocity on SE(3) and white acceleration noise.
 
-Errors are right perturbations in the camera frame, first that of the pose, then that of the twist (Sola, Deray and
-Atchuthan, A micro Lie theory for state estimation in robotics, 2018, Sec. V).
+Errors are right perturbations in the camera frame, in the order pose, twist (Sola, Deray and Atchuthan, A micro Lie
+theory for state estimation in robotics, 2018, Sec. V).
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from torch import Tensor
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
 
 _SPEED_SIGMA, _RATE_SIGMA = 1.0, 2.0
-"""Standard deviation of an unknown velocity, m/s and rad/s, and of the change of the velocity in one second: a hand
-stops or turns around within a second. A robot is slower, so that its states are better than their covariances say."""
+"""Standard deviation of an unknown velocity, m/s and rad/s, and of the change of the velocity in one second: a handheld
+camera can stop or reverse within a second. A robot is slower; its covariances are therefore too large."""
 
 _TWIST_COVARIANCE = torch.tensor([_SPEED_SIGMA] * 3 + [_RATE_SIGMA] * 3, dtype=torch.float64).square().diag()
 
 
 class PoseKalmanFilter:
-    """Pose and twist of the camera. `start` gives the first pose.
+    """Kalman filter of pose and twist of the camera. Call `start` before any other method.
 
     Attributes:
         stamp: Time of the state, seconds.
         T_wc: Filtered camera-to-world pose, float64, shape :math:`(4, 4)`.
         twist: Filtered twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
         covariance: Covariance of the errors of pose and twist, float64, shape :math:`(12, 12)`.
-        cross_covariance: Covariance of the error of the last measured pose (rows) and that of the twist (columns),
+        cross_covariance: Cross-covariance of the errors of the last measured pose (rows) and of the twist (columns),
             float64, shape :math:`(6, 6)`.
     """
 
@@ -37,7 +37,7 @@ class PoseKalmanFilter:
         self.start(0.0, torch.eye(4, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64))
 
     def start(self, stamp: float, T_wc: Tensor, covariance: Tensor, twist: Tensor | None = None) -> None:
-        """Forget the state and start with a measured pose.
+        """Reset the state to a measured pose.
 
         Args:
             stamp: Time, seconds.
@@ -52,7 +52,7 @@ class PoseKalmanFilter:
         self.cross_covariance = torch.zeros(6, 6, dtype=torch.float64)
 
     def predict(self, stamp: float) -> None:
-        """Move the state to a later time."""
+        """Predict the state at a later time, seconds."""
         elapsed = stamp - self.stamp
         self.covariance = predict_covariance(self.covariance, self.twist, elapsed)
         self.cross_covariance = self.covariance[:6, 6:]
@@ -70,13 +70,13 @@ class PoseKalmanFilter:
         correction = gain @ se3_log(invert(self.T_wc) @ T_wc)
         self.T_wc = orthonormalise(self.T_wc @ se3_exp(correction[:6]))
         self.twist = self.twist + correction[6:]
-        kept = torch.eye(12, dtype=torch.float64)  # Joseph's form stays symmetric and positive definite
+        kept = torch.eye(12, dtype=torch.float64)  # Joseph form, which stays symmetric and positive definite
         kept[:, :6] -= gain
         self.covariance = kept @ P @ kept.T + gain @ covariance @ gain.T
         self.cross_covariance = covariance @ gain[6:].T
 
     def stop(self) -> None:
-        """Set the twist to zero; its former value becomes uncertainty."""
+        """Set the twist to zero, and add its former value to the uncertainty."""
         self.covariance = self.covariance + torch.block_diag(torch.zeros(6, 6), self.twist.outer(self.twist))
         self.twist = torch.zeros_like(self.twist)
 

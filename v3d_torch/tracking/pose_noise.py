@@ -1,10 +1,10 @@
-"""Noise of the poses of single frames, measured from their sequence.
+"""Noise of the poses of single frames, estimated from the smoothness of their sequence.
 
 The information matrix of a pose assumes that the errors of its features are independent. They are not: motion blur, the
-rolling shutter and errors of depth move many features together, and no residual shows it, because the pose follows
-them. But the sequence of poses shows it, because a camera moves smoothly and errors do not. The difference between a
-pose and the cubic interpolation of the two poses before and the two after it is noise, or motion that changes within a
-few frames, which counts as noise, too (difference-based variance estimation; Hall, Kay and Titterington, Biometrika
+rolling shutter and errors of depth shift many features together. Residuals do not show such shifts, because the pose
+follows them, but the sequence of poses does, because a camera moves smoothly and errors do not. The difference between
+a pose and the cubic interpolation of the two poses before and the two after it is noise, or motion that changes within
+a few frames, which also counts as noise (difference-based variance estimation; Hall, Kay and Titterington, Biometrika
 1990).
 """
 
@@ -22,10 +22,10 @@ _WINDOW = 5
 """Number of consecutive poses, of which the middle one is compared with the interpolation of the others."""
 
 _MAX_DURATION = 0.3
-"""Longest duration of a window, seconds: within it, a cubic polynomial describes the motion of a hand."""
+"""Maximum duration of a window, seconds: within it, a cubic polynomial describes the motion of a handheld camera."""
 
 _PRIOR_RATIO = 9.0
-"""Ratio of variances that is assumed before a run shows its own: three times the nominal standard deviation."""
+"""Ratio of variances that is assumed at the start of a run: three times the nominal standard deviation."""
 
 _PRIOR_FRAMES = 5.0
 """Weight of the prior ratio, in frames."""
@@ -34,11 +34,11 @@ _MEMORY = 100.0
 """Time constant of the average, in frames: three seconds, over which blur and the number of features change."""
 
 _MIN_RATIO = 1.0
-"""Smallest ratio. The errors of a camera at rest are constant, so its poses would seem to have no noise."""
+"""Minimum ratio: the errors of a camera at rest are constant, so that its poses seem to have no noise."""
 
 
 class PoseNoise:
-    """Ratio between the covariance of poses and the nominal one, as a matrix in coordinates whitened by the latter."""
+    """Ratio of actual to nominal covariance of poses, as a matrix in coordinates whitened by the nominal covariance."""
 
     def __init__(self) -> None:
         self._window: list[tuple[float, Tensor, Tensor]] = []  # stamp, T_wc, nominal covariance
@@ -65,7 +65,7 @@ class PoseNoise:
         self._weight = self._weight * (1 - 1 / _MEMORY) + 1
 
     def interrupt(self) -> None:
-        """Start a new sequence of poses, because a frame has none, or because the pose jumped."""
+        """Start a new sequence of poses, after a frame without a pose or a jump of the pose."""
         self._window = []
 
     def scale(self, covariance: Tensor) -> Tensor:
@@ -84,7 +84,7 @@ class PoseNoise:
 
 
 def _interpolation_weights(stamps: Sequence[float]) -> Tensor:
-    """Weights of the poses in the residual: Lagrange's for the interpolation at the middle, and -1 for the middle."""
+    """Weights of the poses in the residual: Lagrange weights of the interpolation, and -1 for the middle pose."""
     t = torch.tensor(stamps, dtype=torch.float64)
     middle = len(stamps) // 2
     others = torch.cat([t[:middle], t[middle + 1 :]])

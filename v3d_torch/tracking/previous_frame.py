@@ -1,4 +1,4 @@
-"""Refinement of the previous frame, whose velocity is known from both sides once the next frame is tracked."""
+"""Refinement of the previous frame: its velocity is known better after the next frame is tracked."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from v3d_torch.tracking.pose_history import PoseHistory
 
 
 class PreviousFrameRefinement:
-    """Compensates the features of the previous frame again with its better velocity, and refines its pose.
+    """Compensates the features of the previous frame again with a better velocity, and refines its pose.
 
-    If the previous frame is the newest keyframe, its features in the map are updated instead, and the bundle adjustment
-    refines its pose.
+    If the previous frame is the newest keyframe, its features in the map are updated, and bundle adjustment refines its
+    pose.
 
     Args:
         compensate: Compensation of rolling shutter and depth delay.
@@ -36,8 +36,8 @@ class PreviousFrameRefinement:
         """Refine the last frame of the history.
 
         Args:
-            previous: That frame; None before the second frame.
-            velocity: Mean twist per second around that frame, float64, shape :math:`(6,)`; None if it is not known.
+            previous: Last frame of the history; None before the second frame.
+            velocity: Mean twist per second around this frame, float64, shape :math:`(6,)`; None if it is not known.
             poses: Poses of all frames so far.
         """
         if previous is None or previous.landmarks is None or velocity is None or not self._map.keyframes:

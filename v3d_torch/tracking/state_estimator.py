@@ -19,7 +19,8 @@ from v3d_torch.tracking.pose_noise import PoseNoise
 from v3d_torch.types import FramePose, TrackingStatus
 
 _MIN_INFORMATION = 1e-2
-"""Added to the diagonal of information matrices, 1/m^2 and 1/rad^2: a standard deviation of 10 m, more than a room."""
+"""Number added to the diagonal of information matrices, 1/m^2 and 1/rad^2: that of a standard deviation of 10 m, more
+than the size of a room."""
 
 
 def _covariance(position_sigma: float, rotation_sigma: float) -> Tensor:
@@ -28,18 +29,19 @@ def _covariance(position_sigma: float, rotation_sigma: float) -> Tensor:
 
 
 _UNKNOWN = _covariance(100.0, torch.pi)
-"""Covariance of a camera that was never found: somewhere in a building, with any orientation."""
+"""Covariance of a camera that was never found: it can be anywhere in a building, with any orientation."""
 
 _FIRST_FRAME_NOISE = _covariance(0.01, 0.01)
-"""Noise of frames before the first one that is tracked in the map: that of a motion between two frames at 1 to 2 m."""
+"""Noise of frames before any frame is tracked in the map: that of a frame-to-frame motion with a scene at 1 to 2 m."""
 
 
 class StateEstimator:
     """Estimates the state of the camera at each frame.
 
-    A pose that was tracked in the map has its own noise (`PoseNoise`) and that of the map (`MapNoise`). A measured
-    motion adds the noise of a frame to the covariance of the previous pose. Without a measured motion the covariance
-    grows with the uncertainty of the twist (`PoseKalmanFilter`).
+    The covariance of a pose that was tracked in the map is the sum of the noise of the frame (`PoseNoise`) and of the
+    map (`MapNoise`). If only the motion since the previous frame was measured, the noise of a frame is added to the
+    previous covariance. Without a measured motion, the covariance grows with the uncertainty of the twist
+    (`PoseKalmanFilter`).
     """
 
     def __init__(self) -> None:
@@ -97,17 +99,17 @@ class StateEstimator:
         )
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
-        """Transform the state into the corrected world.
+        """Transform the state into the corrected world frame.
 
         Args:
-            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+            T_new_old: Transform from the old to the corrected world frame, float64, shape :math:`(4, 4)`.
         """
         self._pose_noise.interrupt()
         self._filter.T_wc = T_new_old @ self._filter.T_wc
         self._part_covariance_w = _transform(self._part_covariance_w, T_new_old)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that changes from frame to frame."""
+        """Return the state that changes from frame to frame."""
         return {
             "pose_noise": self._pose_noise.state_dict(),
             "map_noise": self._map_noise.state_dict(),
@@ -137,7 +139,7 @@ class StateEstimator:
         return self._frame_noise * (1 + self._map_noise(owners))
 
     def _filter_measured(self, stamp: float, T_wc: Tensor, motion: CameraMotion) -> None:
-        """Update the filter with a pose; start it again if the motion was not measured before."""
+        """Update the filter with a pose; restart it if the previous motion was not measured."""
         if self._last_measured == self._filter.stamp:
             self._filter.predict(stamp)
             self._filter.update(T_wc, self._frame_noise)
@@ -146,7 +148,7 @@ class StateEstimator:
             self._filter.start(stamp, T_wc, self._frame_noise, twist)
 
     def _filter_predicted(self, stamp: float, T_wc: Tensor) -> None:
-        """Let the filter follow a predicted pose; the camera is predicted to stop after some time."""
+        """Set the filter to a predicted pose; the predicted camera stops after some time."""
         self._filter.predict(stamp)
         self._filter.T_wc = T_wc
         if stamp - self._last_measured >= MAX_EXTRAPOLATION:
@@ -166,6 +168,6 @@ class StateEstimator:
 
 
 def _transform(covariance: Tensor, T_ba: Tensor) -> Tensor:
-    """Covariance of an error in frame b, from that in frame a, float64, shape (6, 6)."""
+    """Transform the covariance of an error from frame a to frame b, float64, shape (6, 6)."""
     Ad = adjoint(T_ba)
     return Ad @ covariance @ Ad.T

@@ -1,4 +1,4 @@
-"""States of the last seconds, interpolated between frames and predicted after the last one."""
+"""History of camera states of the last seconds: interpolation between frames, prediction after the last one."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.camera_state import CameraState
 
 _DURATION = 10.0
-"""Time for which states are kept, seconds, as in the transform buffer of ROS."""
+"""Time for which states are stored, seconds, the same as in the transform buffer of ROS."""
 
 
 class StateHistory:
-    """States of the camera at the last frames. One thread appends them, others can read them at the same time."""
+    """States of the camera at the last frames. Other threads can read them while one thread appends states."""
 
     def __init__(self) -> None:
-        self._states: tuple[CameraState, ...] = ()  # replaced, never changed
+        self._states: tuple[CameraState, ...] = ()  # replaced and never changed, so that threads can read it
 
     def append(self, state: CameraState) -> None:
-        """Append the state at a frame, and forget those of more than 10 s before."""
+        """Append the state at a frame, and remove states that are more than 10 s older."""
         first = bisect_right(self._states, state.stamp - _DURATION, key=_stamp)
         end = bisect_left(self._states, state.stamp, key=_stamp)
         self._states = (*self._states[first:end], state)
@@ -55,15 +55,15 @@ class StateHistory:
             stamp: Time, seconds.
 
         Raises:
-            InputError: If the time is before the first state that is kept, or if there is none yet.
+            InputError: If the time is before the first stored state, or if no frame has been tracked.
         """
         states = self._states
         if not states:
-            raise InputError(f"there is no state at {stamp:.6f} s: no frame was tracked yet; ask after the first frame")
+            raise InputError(f"no state at {stamp:.6f} s: no frame has been tracked; track a frame first")
         if stamp < states[0].stamp:
             raise InputError(
-                f"there is no state at {stamp:.6f} s: those of the last {_DURATION:g} s are kept, the first is at"
-                f" {states[0].stamp:.6f} s; ask for a later time"
+                f"no state at {stamp:.6f} s: only states of the last {_DURATION:g} s are stored, since"
+                f" {states[0].stamp:.6f} s; give a later time"
             )
         index = bisect_right(states, stamp, key=_stamp) - 1
         if index == len(states) - 1:
@@ -71,10 +71,10 @@ class StateHistory:
         return _interpolate(states[index], states[index + 1], stamp)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
-        """Transform the states into the corrected world.
+        """Transform the states into the corrected world frame.
 
         Args:
-            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+            T_new_old: Transform from the old to the corrected world frame, float64, shape :math:`(4, 4)`.
         """
         self._states = tuple(replace(state, T_wc=orthonormalise(T_new_old @ state.T_wc)) for state in self._states)
 

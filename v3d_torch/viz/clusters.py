@@ -1,4 +1,4 @@
-"""Figure of outlier rejection: point clouds of objects before and after it (the paper's figure of the same)."""
+"""Figure of outlier rejection: point clouds of objects before and after it, like a figure of the paper."""
 
 from __future__ import annotations
 

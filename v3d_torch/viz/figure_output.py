@@ -18,7 +18,7 @@ _WEBP_QUALITY = 88
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure to a file, completely or not at all.
+    """Write a figure to a file, atomically.
 
     Args:
         figure: Figure to write.

@@ -7,7 +7,7 @@ from functools import cache
 from matplotlib import font_manager
 
 _REPLACEMENT = "?"
-"""Drawn for a character that no installed font has, in place of an empty box."""
+"""Replacement for characters that no installed font has, instead of an empty box."""
 
 _PLACEHOLDERS = "Last Resort"
 """Beginning of the names of fonts that have a box for every character."""

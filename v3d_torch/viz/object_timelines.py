@@ -47,7 +47,7 @@ class ObjectRow:
 def draw_object_timelines(
     stamps: Sequence[float], table: Sequence[ObjectRow], chamfer_threshold: float | None
 ) -> tuple[Figure, int]:
-    """Draw one row per object with its motion state; below, votes and Chamfer distances of the objects that have any.
+    """Draw the motion state of each object in a row; below, votes and Chamfer distances of the objects with any.
 
     If there are more objects than rows, objects that were dynamic or deforming are preferred, then the objects with the
     most frames.

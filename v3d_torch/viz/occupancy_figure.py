@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STATE_COLOURS = {VoxelState.UNKNOWN: "#bdbdbd", VoxelState.FREE: "#ffffff", VoxelState.OCCUPIED: "#202020"}
-"""Colour of each state in the 2D grid, as viewers of ROS maps show them."""
+"""Colour of each state in the 2D grid, as in viewers of ROS maps."""
 
 _MARGIN = 0.25
 """Unknown border around the known space, metres."""
 
 _MAX_PIXELS = 1000
-"""Largest number of rows or columns of the slice: a large building is drawn more coarsely."""
+"""Maximum number of rows or columns of the slice; large buildings are drawn more coarsely."""
 
 
 def draw_occupancy(

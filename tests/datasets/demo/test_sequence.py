@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.demo_frames import copy_frames
 from helpers.demo_views import world_points
 from scipy.spatial.transform import Rotation
 
@@ -41,6 +42,11 @@ def test_bytes_are_independent_of_threads_and_selected_frames(sequence: Path, tm
     image_names = [name for name in second if name.endswith((".png", ".jpg"))]
     assert len(image_names) == 3
     assert all(first[name] == second[name] for name in image_names)
+
+
+def test_frames_copied_from_the_cache_are_those_that_are_rendered(sequence: Path, tmp_path: Path) -> None:
+    copy_frames(tmp_path, range(0, 80, 40))
+    assert read_files(tmp_path) == read_files(sequence)
 
 
 def test_sequence_has_tum_layout_and_masks(sequence: Path) -> None:

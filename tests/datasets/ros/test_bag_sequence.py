@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.bags import DEPTH, INFO, KINDS, RGB, Kind, Message, MessageFactory
+from helpers.demo_frames import copy_frames
 from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of
 
 from v3d_torch.datasets import SourceOptions, load_sequence
-from v3d_torch.datasets.demo.sequence import write_sequence
 from v3d_torch.datasets.ros import BagSequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
@@ -230,7 +230,7 @@ def test_missing_rosbags_is_an_input_error(tmp_path: Path, monkeypatch: pytest.M
 
 def test_run_on_a_bag_of_the_demo_is_accurate(tmp_path: Path) -> None:
     """Run the command on ten frames of the demo as a ROS 1 bag."""
-    write_sequence(tmp_path / "folder", range(10))
+    copy_frames(tmp_path / "folder", range(10))
     folder = load_sequence(str(tmp_path / "folder"))
     make, camera = MessageFactory("bag"), folder.camera
     intrinsics = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]

@@ -242,7 +242,7 @@ def test_lost_camera_has_camera_info_only(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("run.bag", "choose a name that ends in .mcap"), ("taken.mcap", "exists already"), ("file/run.mcap", "file")],
+    [("run.bag", "choose a name that ends in .mcap"), ("taken.mcap", "already exists"), ("file/run.mcap", "file")],
 )
 def test_unsuitable_file_is_an_error_before_the_run(tmp_path: Path, name: str, words: str) -> None:
     (tmp_path / "taken.mcap").write_text("precious")
@@ -283,6 +283,6 @@ def test_frames_before_the_end_of_time_are_recorded_and_the_error_names_the_caus
 
     run = Recorded(tmp_path / "run.mcap", Future())
     failure = run.pipeline.record.failure
-    assert failure is not None and "messages of ROS hold 0 to 2^31 s" in failure
+    assert failure is not None and "ROS messages have times from 0 to 2^31 s" in failure
     assert len(run.pipeline.slam.poses) == FRAMES
     assert len(read_with_mcap(run.path)["/tf"]) == 5

@@ -50,7 +50,7 @@ def test_header_has_seconds_and_nanoseconds() -> None:
 
 @pytest.mark.parametrize("stamp", [-0.1, 2.0**31, np.nan, np.inf])
 def test_time_that_ros_cannot_hold_is_error(stamp: float) -> None:
-    with pytest.raises(OutputError, match="messages of ROS hold 0 to 2\\^31 s"):
+    with pytest.raises(OutputError, match="ROS messages have times from 0 to 2\\^31 s"):
         header(stamp, "map")
 
 

@@ -37,9 +37,9 @@ ROS = (
 )
 STATED = f"depth_scale: {SCALE}\n"
 QUESTION = Fails(
-    "{seq}: the unit of depth is not stated, and the images do not tell it (8 depth images with values from 5000 to"
-    " 5000, median 5000); write the line depth_scale: 1000 into camera.yaml if depth is in millimetres, or else its"
-    " units per metre (TUM: 5000)"
+    "{seq}: the unit of depth is not stated and cannot be estimated from the images (8 depth images with values from"
+    " 5000 to 5000, median 5000); write the line depth_scale: 1000 into camera.yaml if depth is in millimetres, or else"
+    " its units per metre (TUM: 5000)"
 )
 
 

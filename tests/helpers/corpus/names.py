@@ -43,7 +43,7 @@ CASES = [
         "empty folder",
         folder("none"),
         Fails(
-            "{root}/none: is not a sequence of a supported format; the README lists the formats, the simplest"
+            "{root}/none: is not a sequence of a supported format; the README lists the formats, of which the simplest"
             " is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
         ),
     ),
@@ -51,7 +51,7 @@ CASES = [
         "folder of text files",
         folder("none", "a.txt", "b.txt"),
         Fails(
-            "{root}/none: is not a sequence of a supported format; the README lists the formats, the simplest"
+            "{root}/none: is not a sequence of a supported format; the README lists the formats, of which the simplest"
             " is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
         ),
     ),
@@ -59,8 +59,8 @@ CASES = [
         "text file",
         set_sequence("{seq}/rgb.txt"),
         Fails(
-            "{seq}/rgb.txt: is not a sequence of a supported format; the README lists the formats, the simplest"
-            " is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
+            "{seq}/rgb.txt: is not a sequence of a supported format; the README lists the formats, of which the"
+            " simplest is a folder with colour images in a subfolder rgb and depth images in a subfolder depth"
         ),
     ),
     Case(

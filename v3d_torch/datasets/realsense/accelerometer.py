@@ -17,7 +17,7 @@ _DURATION = 0.3
 """Time for which accelerations are measured, seconds: longer than the vibration of a hand."""
 
 _TIMEOUT = 1.0
-"""Longest time until they are complete, seconds."""
+"""Timeout of the measurement, seconds."""
 
 
 def measure_accelerations(source: str, device: Any, colour: Any) -> NDArray[np.float64]:
@@ -29,8 +29,8 @@ def measure_accelerations(source: str, device: Any, colour: Any) -> NDArray[np.f
         colour: Profile of the colour stream.
 
     Returns:
-        Accelerations in the frame of the colour camera, m/s^2, shape :math:`(N, 3)`; N = 0 without accelerometer, or if
-        it cannot be read, which is logged.
+        Accelerations in the frame of the colour camera, m/s^2, shape :math:`(N, 3)`. N = 0 without accelerometer, or if
+        it cannot be read; this is logged.
     """
     rs = import_librealsense(source)
     for sensor in device.query_sensors():

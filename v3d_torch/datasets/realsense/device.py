@@ -15,7 +15,7 @@ from v3d_torch.datasets.realsense.camera import import_librealsense
 from v3d_torch.errors import InputError
 
 _SIZE = (640, 480)
-"""Width and height of the images of a live camera, pixels: the resolution that the defaults are tuned for."""
+"""Width and height of the images of a live camera, pixels: the resolution for which the defaults are tuned."""
 _FPS = 30
 """Default frame rate of a live camera, Hz: the highest that its depth and colour streams share."""
 
@@ -34,7 +34,7 @@ class Device(Protocol):
     serial: str
 
     def measure_accelerations(self) -> NDArray[np.float64]:
-        """Measure for a short time before `start`.
+        """Measure accelerations for a short time. Call this before `start`.
 
         Returns:
             Accelerations in the frame of the colour camera, m/s^2, shape :math:`(N, 3)`; N = 0 without accelerometer.
@@ -47,7 +47,7 @@ class Device(Protocol):
         """Wait for the next frame set; return None on timeout."""
 
     def is_over(self) -> bool:
-        """Check whether the source has ended for good."""
+        """Check whether the source has ended and will send no more frames."""
 
     def is_connected(self) -> bool:
         """Check whether the camera is connected; always True for a file."""
@@ -89,7 +89,7 @@ class PipelineDevice:
         self._stopped = rs.playback_status.stopped
 
     def measure_accelerations(self) -> NDArray[np.float64]:
-        """Measure for a short time, see `measure_accelerations`."""
+        """Measure accelerations for a short time, see `measure_accelerations`."""
         return measure_accelerations(self._source, self._device, self._colour)
 
     def start(self) -> None:
@@ -108,8 +108,8 @@ class PipelineDevice:
                 ) from error
             return
         self._playback.set_real_time(False)  # play as fast as the frames are consumed
-        # A file starts to play when its first sensor is opened, and the second sensor would miss the beginning: pause
-        # until both are open. resume() blocks until frames are consumed, so it needs its own thread.
+        # A file starts to play when its first sensor is opened, and the second sensor would miss the beginning, so
+        # pause until both are open. resume() blocks until frames are consumed, so it needs its own thread.
         self._playback.pause()
         self._pipeline.start(self._config)
         Thread(target=self._playback.resume, daemon=True).start()
@@ -129,7 +129,7 @@ class PipelineDevice:
 
     def stop(self) -> None:
         """Stop streaming and release the camera or file."""
-        with suppress(RuntimeError):  # a camera that was unplugged has stopped already
+        with suppress(RuntimeError):  # a camera that was unplugged has already stopped
             self._pipeline.stop()
 
 

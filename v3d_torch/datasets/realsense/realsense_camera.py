@@ -1,4 +1,4 @@
-"""Live RealSense cameras, which can be unplugged and plugged in again."""
+"""Live stream of a RealSense camera that can be unplugged and plugged in again."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ _RETRY_INTERVAL = 1.0
 """Time between two attempts to open a camera that was unplugged, seconds."""
 
 _MAX_CLOCK_JUMP = 0.5
-"""Largest difference between the elapsed time of the camera and that of the computer while the camera was unplugged,
-seconds; with a larger one, the clock of the camera has started again."""
+"""Maximum difference between the times that elapse in the clocks of camera and computer while the camera is unplugged,
+seconds. If it is larger, the clock of the camera was reset."""
 
 
 class RealSenseCamera(RealSenseStream):
     """`LiveStream` of a connected camera.
 
-    After an interruption, such as a cable that is pulled out, the iteration continues with the same camera as soon as
-    it is connected again; stamps then continue with the time that has passed. The first frame has the direction of
-    gravity if the camera has an accelerometer.
+    After an interruption, such as an unplugged cable, the iteration continues as soon as the same camera is connected
+    again; stamps include the time that has passed. The first frame has the direction of gravity if the camera has an
+    accelerometer.
 
     Args:
         name: Name of the stream, for tables and error messages.
-        open_device: Opens the camera without starting it.
+        open_device: Function that opens the camera without starting it.
         camera: Camera chosen by the user; None for the calibration of the device.
 
     Raises:
@@ -54,8 +54,8 @@ class RealSenseCamera(RealSenseStream):
         """Start the camera and yield its frames.
 
         Raises:
-            InputError: If the camera sends no frames from the start, sends an unsupported format, or is replaced by
-                another one.
+            InputError: If the camera sends no first frame, sends an unsupported format, or is replaced by another
+                camera.
         """
         self._stopped.clear()
         first = self._open_device()
@@ -80,12 +80,12 @@ class RealSenseCamera(RealSenseStream):
     def captured_at(self, frame: RGBDFrame) -> float:
         """Return the time of capture of the newest frame in the clock of the computer, seconds.
 
-        If the camera does not know this clock, this is the time of arrival.
+        If the stamps of the camera cannot be converted to this clock, it is the time of arrival.
         """
         return self._captured_at
 
     def stop(self) -> None:
-        """End the iteration within a fraction of a second; another thread calls this."""
+        """End the iteration within a fraction of a second; can be called from another thread."""
         self._stopped.set()
 
     def _is_stopped(self) -> bool:
@@ -122,8 +122,8 @@ def _clock_shift(previous: float, expected: float, stamp: float) -> float:
 
     Args:
         previous: Last stamp before the interruption.
-        expected: The same plus the time that has passed on the computer.
-        stamp: First stamp after it.
+        expected: Last stamp plus the time that has passed on the computer.
+        stamp: First stamp after the interruption.
     """
     continues = stamp > previous and abs(stamp - expected) <= _MAX_CLOCK_JUMP
     return 0.0 if continues else expected - stamp

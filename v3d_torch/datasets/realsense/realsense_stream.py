@@ -23,7 +23,7 @@ from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.types import RGBDFrame
 
 _WAIT_MS = 200
-"""Longest wait for one frame set, milliseconds: between waits, Ctrl-C and the end of the stream are noticed."""
+"""Maximum wait for one frame set, milliseconds: Ctrl-C and the end of the stream are handled between waits."""
 _SILENCE_TIMEOUT = 5.0
 """Time without frames after which a camera counts as unplugged, seconds."""
 
@@ -36,7 +36,7 @@ class RealSenseStream:
 
     Args:
         name: Name of the stream, for tables and error messages.
-        open_device: Opens the camera or file without starting it.
+        open_device: Function that opens the camera or file without starting it.
         camera: Camera chosen by the user; None for the calibration of the device.
 
     Raises:
@@ -75,7 +75,7 @@ class RealSenseStream:
                 aligned = align.process(frames)
                 colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
                 stamp = colour.get_timestamp() / 1000
-                if stamp > previous_stamp:  # else the same colour image, paired with a newer depth image
+                if stamp > previous_stamp:  # otherwise it is the same colour image, paired with a newer depth image
                     yield stamp, colour, depth
                     previous_stamp = stamp
         finally:

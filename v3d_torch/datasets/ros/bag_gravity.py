@@ -20,7 +20,7 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 _BEFORE, _AFTER = 0.5, 0.1
 """Time before and after the first frame in which accelerations are averaged, seconds: longer than the vibration of a
-hand, shorter than the time in which the camera turns far."""
+hand, but short enough that the camera turns little."""
 
 ReadMessages = Callable[[str], Iterator[tuple[str, int, Any]]]
 """Function that yields topic, arrival time (nanoseconds) and message of a topic, in order of arrival."""
@@ -34,7 +34,7 @@ def read_gravity(
     Args:
         path: Path of the bag, for the log.
         types: Message type of each topic.
-        read: Reads the messages of a topic.
+        read: Function that reads the messages of a topic.
         colour_frame: Name of the frame of the colour camera, without slashes.
         first_stamp: Stamp of the first frame, seconds.
 
@@ -74,9 +74,9 @@ def _read_accelerations(
 
 
 def _find_rotation(target: str, source: str, messages: list[Any]) -> NDArray[np.float64] | None:
-    """Rotation from one frame to another along static transforms, shape (3, 3); None if they are not connected.
+    """Rotation from frame ``source`` to ``target`` by static transforms, shape (3, 3); None if they are not connected.
 
-    The optical frames of a camera have the same axes, also if no transform says so.
+    The optical frames of a camera have the same axes, even if no transform connects them.
     """
     if target == source or (target.endswith("optical_frame") and source.endswith("optical_frame") and not messages):
         return np.eye(3)

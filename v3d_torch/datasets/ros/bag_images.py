@@ -60,8 +60,8 @@ def decode_depth_message(message: Any, source: str) -> NDArray[np.generic]:
         source: Bag and topic of the message, for error messages.
 
     Returns:
-        16-bit depth in its unit, or depth in metres in floating point, shape (H, W); 0 and values that are not positive
-        or not finite are no measurement.
+        16-bit depth in its unit, or depth in metres in floating point, shape (H, W). Values that are not positive or
+        not finite are not measurements.
 
     Raises:
         InputError: If the image is damaged or is not a depth image.

@@ -107,7 +107,7 @@ class BagSequence(ImageSequence):
         self._colour_messages, self._depth_messages = (
             Cursor(partial(_read_messages, path, topic)) for topic in (topics.rgb, topics.depth)
         )
-        self._read(0)  # raise errors that concern every frame now
+        self._read(0)  # raise errors that concern every frame here, and not later
         self.gravity = read_gravity(path, types, partial(_read_messages, path), colour_frame, float(self.stamps[0]))
 
     def _sources(self, index: int) -> tuple[str, str]:
@@ -149,11 +149,11 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
         raise InputError(f"{path}: reading a bag needs rosbags ({error}); run pip install rosbags") from error
-    # All versions of ROS 1, and all of ROS 2, define images and cameras alike. The definitions in the bag are not
-    # parsed, so that a malformed definition of an unrelated topic cannot fail.
+    # The definitions of images and cameras are the same in all versions of ROS 1, and in all of ROS 2. The definitions
+    # in the bag are not parsed, so that a malformed definition of an unrelated topic causes no error.
     is_ros1 = path.suffix == ".bag"
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
-    if is_ros1:  # the message of transforms is missing
+    if is_ros1:  # rosbags lacks the message of transforms
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     try:
         reader = Reader1(path) if is_ros1 else Reader2(path)

@@ -14,10 +14,10 @@ from v3d_torch.export.ros.run_messages import Message
 
 
 class BagFile:
-    """Writer of a bag. It is written while messages are added; a file without its end is repaired by ``mcap recover``.
+    """Writer of a bag. Messages are written immediately; ``mcap recover`` repairs a file that was not closed.
 
     Args:
-        path: File to write; it does not exist yet.
+        path: File to write; it must not exist.
 
     Raises:
         OutputError: If the file exists or cannot be written. Every method can raise it.

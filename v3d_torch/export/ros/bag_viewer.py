@@ -19,12 +19,12 @@ from v3d_torch.types import RGBDFrame
 
 
 class BagViewer:
-    """Viewer that writes the messages of `RunMessages` to a bag, which the first frame creates.
+    """Viewer that writes the messages of `RunMessages` to a bag; the first frame creates the bag.
 
-    If a message cannot be written, the run goes on without the bag, and `finish` raises the error.
+    If a message cannot be written, the run continues without the bag, and `finish` raises the error.
 
     Args:
-        path: File to write, ``.mcap``; it does not exist yet.
+        path: File to write, ``.mcap``; it must not exist.
         camera: Camera of all frames.
 
     Raises:
@@ -35,7 +35,7 @@ class BagViewer:
         if path.suffix != ".mcap":
             raise OutputError(f"{path}: is not the name of an MCAP file; choose a name that ends in .mcap")
         if path.exists():
-            raise OutputError(f"{path}: exists already; delete it, or choose another file for the bag")
+            raise OutputError(f"{path}: already exists; delete it, or choose another file for the bag")
         check_writable(path)
         self._path = path
         self._messages = RunMessages(camera)

@@ -1,4 +1,4 @@
-"""Coordinate frames of the messages, as REP 103 and REP 105 of ROS define them.
+"""Coordinate frames of the messages, according to REP 103 and REP 105 of ROS.
 
 ======================================  ============================================================================
 ``map``                                 Fixed frame of the map: the level frame (`level_frame`), with x forward from
@@ -70,7 +70,7 @@ def points_in_map(points: Tensor, T_mw: Tensor) -> Tensor:
 
 
 class OdometryFrame:
-    """Frame ``odom``: the sum of the camera's motions, each measured in the map as it was then.
+    """Frame ``odom``: the product of the camera's motions, each measured in the map at the time of the motion.
 
     It begins at the first camera, with its yaw, and with z up as in ``map`` at that time. When bundle adjustment or a
     loop moves the map, or when ``map`` is turned because up has become known, the camera stays where it is in ``odom``,

@@ -34,9 +34,9 @@ _ORIGIN, _UNIT = torch.zeros(3), torch.ones(3)
 def object_markers(
     stamp: float, objects: FrameObjects, velocities: Mapping[int, Tensor], T_mw: Tensor
 ) -> ros.visualization_msgs__msg__MarkerArray:
-    """Make the markers of a frame, in ``map``. The first one removes those of the frame before.
+    """Make the markers of a frame, in ``map``. The first marker removes the markers of the previous frame.
 
-    An arrow ends where the object will be a second later. Objects without a centroid or a cloud have none.
+    An arrow ends where the object will be one second later. Objects without a centroid or a cloud have no markers.
 
     Args:
         stamp: Timestamp, seconds.
@@ -79,7 +79,7 @@ def _arrow(stamp: float, each: TrackedObject, velocity: Tensor, T_mw: Tensor) ->
 def _bounds(each: TrackedObject, T_mw: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest and largest coordinates of an object in ``map``, shape (3,) each.
 
-    The cloud of a missed object is that of its last detection: it is moved to the predicted centroid.
+    The cloud of a missed object is that of its last detection, moved to the predicted centroid.
     """
     cloud = points_in_map(each.cloud, T_mw)
     motion = points_in_map(each.centroid, T_mw) - cloud.mean(dim=0) if each.missed else 0.0

@@ -23,7 +23,7 @@ from v3d_torch.occupancy.occupancy_map import VoxelState
 _NANOSECONDS = 10**9
 
 _MAX_SECONDS = 2**31
-"""Times of ROS count seconds in 32 bits, with sign."""
+"""Maximum time of ROS: seconds are signed 32-bit integers."""
 
 _OCCUPANCY = {VoxelState.UNKNOWN: -1, VoxelState.FREE: 0, VoxelState.OCCUPIED: 100}
 """Values of cells, as `nav_msgs/OccupancyGrid` defines them: the probability in per cent, or unknown."""
@@ -36,10 +36,10 @@ def nanoseconds(stamp: float) -> int:
         stamp: Timestamp, seconds.
 
     Raises:
-        OutputError: If messages of ROS cannot hold the time.
+        OutputError: If the time is out of the range of ROS messages.
     """
     if not 0 <= stamp < _MAX_SECONDS:
-        raise OutputError(f"timestamp {stamp:.6f} s: messages of ROS hold 0 to 2^31 s; shift the timestamps")
+        raise OutputError(f"timestamp {stamp:.6f} s: ROS messages have times from 0 to 2^31 s; shift the timestamps")
     return round(stamp * _NANOSECONDS)
 
 
@@ -69,7 +69,7 @@ def vector(components: Tensor) -> ros.geometry_msgs__msg__Vector3:
 
 
 def pose(T: Tensor) -> ros.geometry_msgs__msg__Pose:
-    """Make a pose from the transform from the posed frame to the frame of the header, shape :math:`(4, 4)`."""
+    """Make a pose from a transform, shape :math:`(4, 4)`, to the frame of the header."""
     return ros.geometry_msgs__msg__Pose(point(T[:3, 3]), _quaternion(T))
 
 
@@ -162,13 +162,13 @@ def camera_info(stamp: float, frame: str, camera: PinholeCamera) -> ros.sensor_m
 
 
 def occupancy_grid(stamp: float, frame: str, grid: OccupancyGrid, T_fw: Tensor) -> ros.nav_msgs__msg__OccupancyGrid:
-    """Make an occupancy grid. It is level, also if the frame is not: its origin is turned in the frame.
+    """Make an occupancy grid. It is level even if the frame is not: its origin is rotated in the frame.
 
     Args:
         stamp: Timestamp, seconds.
         frame: Name of the coordinate frame in which the pose of the grid is given.
         grid: Grid.
-        T_fw: Transform from the world frame to that frame, float64, shape :math:`(4, 4)`.
+        T_fw: Transform from the world frame to the coordinate frame, float64, shape :math:`(4, 4)`.
     """
     T_lg = torch.eye(4, dtype=torch.float64)
     T_lg[:3, 3] = torch.tensor([*grid.origin, grid.height], dtype=torch.float64)

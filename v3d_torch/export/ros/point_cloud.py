@@ -9,7 +9,7 @@ from torch import Tensor
 from v3d_torch.export.ros.messages import header
 
 _FIELDS = ("x", "y", "z", "rgb")
-"""Fields of a point, 32-bit floats. As in PCL, the bits of ``rgb`` are the bytes blue, green, red and 0."""
+"""Fields of a point, 32-bit floats. As in PCL, the four bytes of ``rgb`` are blue, green, red and 0."""
 
 _SIZE = 4
 """Bytes of a field."""

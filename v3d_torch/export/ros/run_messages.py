@@ -38,7 +38,7 @@ from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
 _CLOUD_STRIDE = 4
-"""Every n-th row and column of a keyframe is in its cloud: a bag stays small, and viewers show many clouds at once."""
+"""Every n-th row and column of a keyframe is in its cloud, so that a bag is small and viewers can show many clouds."""
 
 
 class Message(Protocol):
@@ -52,7 +52,7 @@ TopicMessage = tuple[str, Message]
 
 
 class RunMessages:
-    """Source of the messages of a run.
+    """Makes the ROS 2 messages of a run.
 
     Args:
         camera: Camera of all frames.
@@ -73,7 +73,7 @@ class RunMessages:
             slam: System after it tracked the frame.
 
         Raises:
-            OutputError: If messages of ROS cannot hold the timestamp.
+            OutputError: If the timestamp is out of the range of ROS messages.
         """
         stamp = frame.stamp
         yield "/camera/color/camera_info", camera_info(stamp, frames.OPTICAL, self._camera)
@@ -121,7 +121,7 @@ class RunMessages:
         tree = {
             (frames.MAP, frames.ODOM): odometry_frame.T_mo,
             (frames.ODOM, frames.CAMERA): odometry_frame.T_ol,
-            (frames.CAMERA, frames.OPTICAL): frames.T_LINK_OPTICAL,  # not static: it is there wherever a replay begins
+            (frames.CAMERA, frames.OPTICAL): frames.T_LINK_OPTICAL,  # in every frame, because a replay can start later
         }
         yield "/tf", transforms(stamp, tree)
         to_link = _rotate_both_halves(frames.T_LINK_OPTICAL)

@@ -1,4 +1,4 @@
-"""Up direction of the world, from an accelerometer, from people and objects, or from the first camera."""
+"""Up direction of the world, from measured gravity, from people and objects, or from the first camera."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-_ACCELEROMETER_TOLERANCE = math.radians(5)
+_GRAVITY_TOLERANCE = math.radians(5)
 """Error of an accelerometer's up direction: bias and acceleration of a camera that is moved by hand."""
 
 _IMAGE_TOLERANCE = math.radians(50)
-"""Error of an up direction that is known to a quarter turn of the image only, and not known across the image: a camera
-that looks up or down, or is rolled, by less. The normals of walls are then farther from it than that of the floor."""
+"""Error of an up direction that is known only to a quarter turn of the image: the camera can look up or down, or be
+rolled, by less than this. The normals of walls are then farther from the direction than the normal of the floor."""
 
 _MIN_VOTES = 3.0
-"""Length of the sum of votes from which on it is more reliable than the first camera, in detections of score 1."""
+"""Minimum length of the sum of votes to be more reliable than the first camera, in detections of score 1."""
 
 
 class UpDirection(NamedTuple):
@@ -32,17 +32,16 @@ class UpDirection(NamedTuple):
     tolerance: float
 
 
-def estimate_up(accelerometer: Tensor | None = None, votes: Tensor | None = None) -> UpDirection:
+def estimate_up(gravity: Tensor | None = None, votes: Tensor | None = None) -> UpDirection:
     """Choose the most accurate source of the up direction. The floor then refines it, see `find_floor`.
 
     Args:
-        accelerometer: Unit vector against gravity in the frame of the first camera, which is the world frame, as an
-            accelerometer at rest measures it, shape :math:`(3,)`; None without accelerometer.
+        gravity: Measured direction of gravity, world frame, shape :math:`(3,)`; None if it is not measured.
         votes: Sum of the votes of the segmentation for the up direction, world frame, shape :math:`(3,)`; see
             `UprightSegmenter`. None if there are none.
     """
-    if accelerometer is not None:
-        return UpDirection(normalize(accelerometer.to(torch.float64), dim=0), _ACCELEROMETER_TOLERANCE)
+    if gravity is not None:
+        return UpDirection(-normalize(gravity.to(torch.float64), dim=0), _GRAVITY_TOLERANCE)
     if votes is not None and float(votes.norm()) >= _MIN_VOTES:
         return UpDirection(normalize(votes.to(torch.float64), dim=0), _IMAGE_TOLERANCE)
     return UpDirection(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), _IMAGE_TOLERANCE)
