@@ -25,10 +25,13 @@ CONSISTENCY = {
     "sequence": "sequence",
     "poses": "poses",
     "nees": "NEES, expected 6",
+    "bounds": "95% bounds of NEES",
+    "first": "NEES of the first 40 poses",
     "median": "median, expected 5.3",
     "within": "below the 95% bound",
     "position": "position, expected 3",
     "rotation": "rotation, expected 3",
+    "groundtruth": "noise of the ground truth",
 }
 
 LOST = {

@@ -252,6 +252,7 @@ class V3DSLAM(ReplaceableStages):
             features = self._compensate(preprocessed.extraction.features, preprocessed, prediction.velocity)
             T_cp, current = prediction.motion_until(frame.stamp), TrackedFrame(frame, depth, features)
             motion = self.odometry(self._previous, current, T_cp, prediction.velocity)
+            self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
             view = self.free_space_check.make_view(frame.stamp, depth, self._compose_pose(motion))
             occupied = self.free_space_check(view, pose_known=motion.is_measured)

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from helpers.commands import assert_error_line, command, environment
 from helpers.demo_frames import copy_frames
+from helpers.walker_folder import write_walker
 from helpers.walls import Slide
 from typer.testing import CliRunner, Result
 
@@ -58,6 +59,16 @@ def test_run_reports_latency_dropped_frames_and_accuracy(sequence: Path, tmp_pat
     assert states["latency"].max() == pytest.approx(metrics["latency"]["max"])
     covariances = np.stack(states["covariance"].to_list()).reshape(-1, 6, 6)
     assert np.allclose(covariances, covariances.transpose(0, 2, 1))
+
+
+def test_masks_from_files_need_no_network(tmp_path: Path) -> None:
+    folder, out = write_walker(tmp_path / "walker", 8), tmp_path / "out"
+    masks = ["--segmenter", "masks", "--masks", folder / "ids"]
+    done = call("--seq", folder, *masks, "--realtime", "--config", "realtime", "--out", out)
+    assert done.exit_code == 0, done.output
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["failure"] is None and metrics["processed"] >= 1
+    assert pd.read_parquet(out / "dynamics.parquet")["class"].tolist()
 
 
 def test_stored_run_has_states_without_latency(sequence: Path, tmp_path: Path) -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import islice
 
 import pytest
-from helpers.wall_run import FRAMES, Wall
+from helpers.wall_run import CAMERA, FRAMES, Wall
 
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.errors import InputError
+from v3d_torch.types import RGBDFrame
 
 
 class SimulatedClock:
@@ -43,14 +45,33 @@ def test_frames_come_when_they_are_due() -> None:
     assert index == FRAMES - 1
 
 
-def test_frame_that_is_read_too_late_counts_as_captured_when_it_was_due() -> None:
+def test_frame_of_a_stream_that_is_read_too_late_counts_as_captured_when_it_was_due() -> None:
+    class Stream:
+        name, camera, groundtruth = "stream", CAMERA, None
+
+        def __iter__(self) -> Iterator[RGBDFrame]:
+            return iter(StoredWall())
+
     clock = SimulatedClock()
-    playback = RealtimePlayback(StoredWall(), clock)
+    playback = RealtimePlayback(Stream(), clock)
     frames = iter(playback)
     next(frames)
     clock.time += 5
     frame = next(frames)
-    assert clock.time == 55 and playback.captured_at(frame) == pytest.approx(50.1)
+    assert clock.time == 55 and playback.captured_at(frame) == pytest.approx(50.1) and playback.skipped == 0
+
+
+def test_frames_of_a_sequence_that_are_already_due_are_skipped() -> None:
+    clock = SimulatedClock()
+    playback = RealtimePlayback(StoredWall(), clock)
+    frames = iter(playback)
+    assert next(frames).index == 0
+    clock.time += 0.35  # frames 1 to 3 are due
+    assert next(frames).index == 4 and playback.skipped == 3
+    assert clock.time == pytest.approx(50.4)
+    clock.time += 100  # the last frame comes in any case
+    assert [frame.index for frame in frames] == [FRAMES - 1] and playback.skipped == FRAMES - 3
+    assert len(list(playback)) == FRAMES and playback.skipped == 0
 
 
 def test_stop_ends_the_iteration_and_the_next_one_starts_again() -> None:

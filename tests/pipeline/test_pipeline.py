@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 from helpers.wall_run import FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
 
+from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
 from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
 
@@ -86,3 +90,24 @@ def test_masks_that_cannot_be_written_end_the_run_with_a_message(tmp_path: Path)
     (tmp_path / "masks").write_text("")
     failure = make_pipeline(masks=tmp_path / "masks")().failure
     assert failure is not None and "masks" in failure and "cannot be written" in failure
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
+    live: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A check takes longer than a frame."""
+    checked: list[int] = []
+    wall = Wall()
+    pipeline = Pipeline(RealtimePlayback(wall) if live else wall, V3DSLAM(wall.camera, square, Config()))
+
+    def check(*_: object) -> list[str]:
+        checked.append(len(pipeline.slam.poses))
+        return []
+
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline.check_plausibility", check)
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline._CHECKED_KEYFRAMES", 1)
+    pipeline()
+    assert checked == ([] if live else [1])
+    pipeline.flush()
+    assert checked == ([len(pipeline.slam.poses)] if live else [1])

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import TrackingStatus
@@ -127,3 +128,30 @@ def test_correction_of_the_world_moves_all_states() -> None:
     restored = StateHistory()
     restored.load_state_dict(states.state_dict())
     assert torch.equal(restored.at(1.05).T_wc, states.at(1.05).T_wc)
+
+
+def measured_motion(is_measured: bool) -> CameraMotion:
+    """Motion of the camera in a tenth of a second, a little faster than predicted."""
+    T_cp = se3_exp(-0.11 * TWIST)
+    return CameraMotion(T_cp, -1.1 * TWIST, torch.zeros(0, 2, dtype=torch.int64), is_measured)
+
+
+def test_measured_motion_is_known_before_the_frame_is_tracked_in_the_map() -> None:
+    states = history(0.0, 0.1)
+    states.append_motion(0.2, measured_motion(is_measured=True))
+    early = states.at(0.2)
+    torch.testing.assert_close(early.T_wc, START @ se3_exp(0.21 * TWIST))
+    torch.testing.assert_close(early.twist, 1.1 * TWIST)
+    assert float(early.covariance.det()) > float(state(0.1).covariance.det())
+    torch.testing.assert_close(states.at(0.25).T_wc, early.T_wc @ se3_exp(0.055 * TWIST))
+    states.append(state(0.2))
+    torch.testing.assert_close(states.at(0.2).T_wc, state(0.2).T_wc)
+    assert len(states.state_dict()["states"]) == 3
+
+
+def test_motion_that_was_not_measured_changes_no_state() -> None:
+    states, empty = history(0.0, 0.1), StateHistory()
+    for each in (states, empty):
+        each.append_motion(0.2, measured_motion(is_measured=False))
+    empty.append_motion(0.2, measured_motion(is_measured=True))
+    assert len(states.state_dict()["states"]) == 2 and not empty.state_dict()["states"]

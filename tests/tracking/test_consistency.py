@@ -7,6 +7,7 @@ from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
+import pytest
 import torch
 from scipy.stats import chi2
 
@@ -22,8 +23,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import consistency
 
 
-def test_nees_of_simulated_errors_is_that_of_the_chi_square_distribution() -> None:
-    """World, mounting and clock of the ground truth are unknown, and do not count as errors."""
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+def test_nees_of_simulated_errors_is_that_of_the_chi_square_distribution(noise: float) -> None:
+    """World, mounting and clock of the ground truth are unknown, and do not count as errors, nor does its noise."""
     generator = torch.Generator().manual_seed(0)
 
     def swing(stamps: torch.Tensor) -> torch.Tensor:
@@ -36,7 +38,10 @@ def test_nees_of_simulated_errors_is_that_of_the_chi_square_distribution() -> No
         torch.arange(2000, dtype=torch.float64) / 100,
         0.2 + torch.arange(550, dtype=torch.float64) / 30,
     )
-    groundtruth = Trajectory(true_stamps + 0.03, T_gw @ swing(true_stamps) @ T_cb)
+    jitter = noise * torch.randn(2000, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    groundtruth = Trajectory(true_stamps + 0.03, T_gw @ swing(true_stamps) @ T_cb @ se3_exp(jitter))
+    sigmas = consistency.groundtruth_noise(groundtruth)
+    torch.testing.assert_close(sigmas, torch.full_like(sigmas, noise), rtol=0.2, atol=1e-5)
     roots = torch.tensor([0.01] * 3 + [0.005] * 3, dtype=torch.float64) * (
         torch.eye(6, dtype=torch.float64) + 0.3 * torch.randn(550, 6, 6, dtype=torch.float64, generator=generator)
     )
@@ -45,6 +50,25 @@ def test_nees_of_simulated_errors_is_that_of_the_chi_square_distribution() -> No
     nees = consistency.calibrated_errors(groundtruth, stamps, estimate, roots @ roots.mT).nees(slice(0, 6))
     assert abs(float(nees.mean()) - 6) < 3 * (12 / 550) ** 0.5
     assert 0.92 < float((nees < chi2.ppf(0.95, 6)).double().mean()) < 0.98
+    low, high = consistency.mean_bounds(nees)
+    assert low < float(nees.mean()) < high
+    for bound, probability in ((low, 0.025), (high, 0.975)):
+        assert abs(bound - chi2.ppf(probability, 6 * 550) / 550) < 0.2
+
+
+def test_bounds_of_the_mean_are_wider_if_errors_last_for_many_frames() -> None:
+    """Each error lasts for 20 poses: there are as many independent errors as in a run of a twentieth."""
+    generator = torch.Generator().manual_seed(0)
+    errors = torch.randn(300, 6, dtype=torch.float64, generator=generator)
+    low, high = consistency.mean_bounds(errors.square().sum(dim=1).repeat_interleave(20))
+    expected = [chi2.ppf(probability, 6 * 300) / 300 for probability in (0.025, 0.975)]
+    assert abs(low - expected[0]) < 0.2 and abs(high - expected[1]) < 0.2
+
+
+def test_noise_of_poses_at_the_rate_of_a_camera_is_not_measured() -> None:
+    stamps = torch.arange(100, dtype=torch.float64) / 30
+    poses = se3_exp(0.01 * torch.randn(100, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+    assert not consistency.groundtruth_noise(Trajectory(stamps, poses)).any()
 
 
 def test_covariance_on_recorded_images_is_consistent(real_sequence: Callable[[str], Path]) -> None:

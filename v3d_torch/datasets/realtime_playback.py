@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from threading import Event
 
-from v3d_torch.datasets.base import LiveStream, RGBDStream
+import torch
+
+from v3d_torch.datasets.base import LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
@@ -15,11 +17,16 @@ from v3d_torch.types import RGBDFrame, Trajectory
 class RealtimePlayback:
     """Live stream of the frames of a source: each frame arrives at the time of its stamp, relative to the first frame.
 
-    A frame counts as captured when it is due, even if reading it took longer.
+    Each frame is read before it is due. Frames of a sequence that are already due when the next one is read are
+    skipped, as a camera does not wait, so that a slow computer does not fall behind. A frame counts as captured when it
+    is due, even if reading it took longer.
 
     Args:
         source: Source of frames.
         clock: Clock of the computer.
+
+    Attributes:
+        skipped: Number of frames that were skipped so far.
 
     Raises:
         InputError: If the source is already live.
@@ -29,6 +36,7 @@ class RealtimePlayback:
         if isinstance(source, LiveStream):
             raise InputError(f"{source.name}: is a live camera, which always has its own rate; remove --realtime")
         self.source = source
+        self.skipped = 0
         self._clock = clock
         self._offset = 0.0  # clock of the computer minus clock of the source, seconds
         self._stopped = Event()
@@ -51,8 +59,9 @@ class RealtimePlayback:
     def __iter__(self) -> Iterator[RGBDFrame]:
         """Yield each frame when it is due."""
         self._stopped.clear()
-        is_first = True
-        for frame in self.source:
+        self.skipped = 0
+        source, is_first = self.source, True
+        for frame in self._newest_frames(source) if isinstance(source, RGBDSequence) else source:
             if is_first:
                 self._offset, is_first = self._clock.now() - frame.stamp, False
             self._clock.sleep(self.captured_at(frame) - self._clock.now())
@@ -67,3 +76,13 @@ class RealtimePlayback:
     def stop(self) -> None:
         """End the iteration before its next frame."""
         self._stopped.set()
+
+    def _newest_frames(self, sequence: RGBDSequence) -> Iterator[RGBDFrame]:
+        """Yield the first frame of a sequence, and after each frame the next one that is not due yet, or the last."""
+        stamps, index = sequence.stamps, 0
+        while index < len(stamps):
+            yield sequence[index]
+            due = int(torch.searchsorted(stamps, self._clock.now() - self._offset))
+            following = max(index + 1, min(due, len(stamps) - 1))
+            self.skipped += following - index - 1
+            index = following

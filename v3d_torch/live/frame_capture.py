@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from threading import Event, Thread
 
 from v3d_torch.datasets.base import LiveStream
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.errors import InputError
 from v3d_torch.live.latest_queue import LatestQueue
 from v3d_torch.runtime.clock import Clock
@@ -29,7 +30,7 @@ class CapturedFrame:
 
     Attributes:
         frame: Frame.
-        number: Number of frames captured so far, this one included.
+        number: Number of frames of the source so far, including this one and those that it skipped.
         captured_at: Time of capture in the clock of the computer, seconds.
     """
 
@@ -77,16 +78,17 @@ class FrameCapture:
 
     def _run(self) -> None:
         try:
-            number = 0
+            accepted = 0
             for frame in self._source:
                 now = self._clock.now()
                 if self._stop.is_set():
                     break
                 self._check(frame)
                 if self._is_in_order(frame):
-                    number += 1
+                    accepted += 1
+                    skipped = self._source.skipped if isinstance(self._source, RealtimePlayback) else 0
                     captured_at = self._source.captured_at(frame) if isinstance(self._source, LiveStream) else now
-                    self.frames.put(CapturedFrame(frame, number, captured_at))
+                    self.frames.put(CapturedFrame(frame, accepted + skipped, captured_at))
         except BaseException as error:
             self.frames.close(error)
         else:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass
 
+import torch
+
 from v3d_torch.errors import ConfigError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.frame_capture import FrameCapture
@@ -84,6 +86,7 @@ class LiveSLAM:
             InputError: If the source ends with an error, or a frame is not valid.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
+        _warm_up(self.slam)
         self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
         preprocessor = LivePreprocessor(capture.frames, self.slam)
         with closing(preprocessor), closing(capture):
@@ -124,3 +127,14 @@ class LiveSLAM:
     def pose_at(self, stamp: float) -> CameraState:
         """Return the state of the camera at a time, see `V3DSLAM.pose_at`; can be called from any thread."""
         return self.slam.pose_at(stamp)
+
+
+def _warm_up(slam: V3DSLAM) -> None:
+    """Call the stages without state on an empty image.
+
+    Libraries build tables at their first call, for a third of a second, in which ten frames would be dropped.
+    """
+    size = slam.camera.height, slam.camera.width
+    frame = RGBDFrame(0, 0.0, torch.zeros(3, *size, dtype=torch.uint8), torch.ones(1, *size))
+    slam.extract_features(frame)
+    slam.describe_appearance(frame.image, torch.zeros(0, *size, dtype=torch.bool))

@@ -41,7 +41,7 @@ _TRIM_INTERVAL = 200
 
 _CHECKED_KEYFRAMES = 15
 """Number of keyframes after which camera and depth are checked: some seconds of a moving camera. A shorter run is
-checked at its end. A check takes up to a second, so it is not repeated."""
+checked at its end, and so is a live run, because a check takes up to a second. It is not repeated."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
@@ -293,7 +293,8 @@ class Pipeline:
         if keyframes and keyframes[-1].frame == frame.index:
             static = result.static_without_people
             self.views.add(keyframes[-1], frame.image, frame.depth, static, frame.depth_delay)
-            if not self.record.was_checked and self._own_view_count() >= _CHECKED_KEYFRAMES:
+            is_due = self._live is None and not self.record.was_checked
+            if is_due and self._own_view_count() >= _CHECKED_KEYFRAMES:
                 with self.slam.timer("plausibility"):
                     self._check_plausibility()
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))

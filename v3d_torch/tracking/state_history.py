@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
+from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.camera_state import CameraState
 
 _DURATION = 10.0
@@ -26,7 +27,23 @@ class StateHistory:
     def append(self, state: CameraState) -> None:
         """Append the state at a frame, and remove states that are more than 10 s older."""
         first = bisect_right(self._states, state.stamp - _DURATION, key=_stamp)
-        self._states = (*self._states[first:], state)
+        end = bisect_left(self._states, state.stamp, key=_stamp)
+        self._states = (*self._states[first:end], state)
+
+    def append_motion(self, stamp: float, motion: CameraMotion) -> None:
+        """Append a state that is known early: the last one, moved by a measured motion.
+
+        `append` replaces it with the state at this frame. Its covariance is that of the prediction of the last state,
+        which is larger. A motion that was not measured adds nothing to the prediction.
+
+        Args:
+            stamp: Time of the new frame, seconds.
+            motion: Motion of the camera from the last state to this frame.
+        """
+        if self._states and motion.is_measured:
+            last = self._states[-1]
+            T_wc = orthonormalise(last.T_wc @ invert(motion.T_cp))
+            self.append(replace(last.predict(stamp), T_wc=T_wc, twist=-motion.velocity))
 
     def at(self, stamp: float) -> CameraState:
         """Return the state at a time.
