@@ -29,9 +29,9 @@ TRAJECTORY = CameraTrajectory((0.0, 0.0, 1.45), -9.0, start=23.0)
 """The camera is held by somebody who stands and looks at the floor as well."""
 PUT_DOWN = 1.9
 """Time at which the box stands on the bench, seconds."""
-TAKEN_AWAY = 0.8
+TAKEN_AWAY = 1.6
 """Time at which the plant is lifted from the bench, seconds."""
-_OUT = 2.6
+_OUT = 3.2
 """Time at which the person with the plant is out of the room, seconds."""
 _BENCH = Box((-1.9, 2.75, 0.0), (2.3, 3.15, 0.72))
 _CABINET = Box((-1.80, 3.75, 1.20), (-1.05, 4.20, 1.95))
@@ -138,11 +138,12 @@ def _build_people() -> list[Body]:
         ),
     )
     taker = Gestures(
-        torso=move([(TAKEN_AWAY, stand(1.0)), (_OUT, stand(3.1))]),
-        head=interpolate([(0.2, (0, 0, 0)), (TAKEN_AWAY, (12, -8, 0)), (_OUT, (0, 0, 0))]),
+        torso=move([(0.5, stand(1.6)), (1.4, stand(1.0)), (TAKEN_AWAY, stand(1.0)), (_OUT, stand(3.1))]),
+        head=interpolate([(0.5, (0, 0, 0)), (1.4, (12, -8, 0)), (_OUT, (0, 0, 0))]),
         hand=interpolate(
             [
-                (0.3, (0.80, 3.0, 1.0)),
+                (0.5, (1.35, 3.0, 0.95)),
+                (1.4, (0.66, 2.86, 0.86)),
                 (TAKEN_AWAY, (0.66, 2.86, 0.86)),
                 (_OUT, (2.76, 2.86, 1.06)),
             ]
