@@ -6,10 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets.demo.camera_trajectory import camera_pose
 from v3d_torch.datasets.demo.displacement import displacement_map
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.scene import Figure, Rectangle, Scene
+from v3d_torch.datasets.demo.scene import Body, Figure, Rectangle, Scene
 from v3d_torch.datasets.demo.sequence import CAMERA, FRAME_RATE
 from v3d_torch.types import RGBDFrame
 
@@ -19,8 +18,14 @@ STEP = 0.005
 
 def static_surfaces(scene: Scene) -> Tensor:
     """Points on all static surfaces, frame of the demo, metres, float64, shape (N, 3)."""
-    rectangles = [rectangle_points(rectangle) for rectangle in scene.rectangles]
-    return torch.cat([*rectangles, *(figure_points(f, 0.0) for f in scene.figures if f.mask_id == 0)])
+    return torch.cat([body_points(body, 0.0) for body in scene.bodies if not body.is_moving(0.0)])
+
+
+def body_points(body: Body, time: float) -> Tensor:
+    """Points on a body at a time, metres, (N, 3)."""
+    T_wb = body.motion(time)
+    rectangles = [rectangle_points(rectangle.transform(T_wb)) for rectangle in body.rectangles]
+    return torch.cat([*rectangles, *(figure_points(figure, T_wb, time) for figure in body.figures)])
 
 
 def rectangle_points(rectangle: Rectangle) -> Tensor:
@@ -31,20 +36,13 @@ def rectangle_points(rectangle: Rectangle) -> Tensor:
     return torch.from_numpy(corner + grid @ np.stack([across, down]))
 
 
-def figure_points(figure: Figure, time: float) -> Tensor:
+def figure_points(figure: Figure, T_wb: np.ndarray, time: float) -> Tensor:
     """Points on the relief of a figure at a time, metres, (N, 3); see `intersect_figure`."""
-    plane, pose = figure.plane_at(time)
+    plane = figure.plane_at(T_wb)
     relief, alpha = displacement_map(figure).numpy()
     s, t = np.meshgrid(fractions(figure.width), fractions(figure.height))
     texel = (t * relief.shape[0]).astype(int), (s * relief.shape[1]).astype(int)
-    offset = relief[texel] + pose.twist * figure.width * (s - figure.pivot[0])
-    across = s + pose.lean * figure.height / figure.width * (figure.pivot[1] - t)
-    points = (
-        np.asarray(plane.corner)
-        + across[..., None] * np.asarray(plane.across)
-        + t[..., None] * np.asarray(plane.down)
-        + offset[..., None] * plane.normal
-    )
+    points = figure.points_on(plane, s, t, time) + relief[texel][..., None] * plane.normal
     return torch.from_numpy(points[alpha[texel] > 0.5])
 
 
@@ -63,7 +61,7 @@ def seen_points(renderer: Renderer, frame: RGBDFrame, max_depth: float) -> Tenso
         max_depth: Maximum depth, metres.
     """
     time = frame.index / FRAME_RATE
-    T_wc = torch.from_numpy(camera_pose(time))
+    T_wc = torch.from_numpy(renderer.scene.trajectory.pose(time))
     exact = renderer(T_wc.numpy(), time)
     seen = (frame.depth[0] > 0) & (exact.motion_mask == 0) & (exact.depth <= max_depth)
     points = (CAMERA.rays * exact.depth[..., None])[seen].to(torch.float64)

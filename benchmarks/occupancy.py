@@ -17,7 +17,7 @@ from pathlib import Path
 import columns
 import torch
 from command import make_parser, publish
-from demo_surfaces import figure_points, seen_points, static_surfaces
+from demo_surfaces import body_points, seen_points, static_surfaces
 from heading import make_heading
 from sequences import locate_sequence
 from storage import Measurement, Row
@@ -28,7 +28,7 @@ from torch import Tensor
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.room import build_room
+from v3d_torch.datasets.demo.scenes import SCENES
 from v3d_torch.datasets.demo.sequence import CAMERA, FRAME_RATE, SEED
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.ate import align
@@ -63,7 +63,7 @@ def run(sequence: RGBDSequence) -> tuple[Pipeline, OccupancyMapper]:
 
 def compare_with_demo(sequence: RGBDSequence, pipeline: Pipeline, mapper: OccupancyMapper) -> list[Row]:
     """Compare the map of the demo with its geometry, voxel by voxel."""
-    occupancy, scene = mapper.map, build_room(SEED)
+    occupancy, scene = mapper.map, SCENES["demo"](SEED)
     size, trajectory, truth = occupancy.config.voxel_size, pipeline.slam.poses.trajectory(), sequence.groundtruth
     assert truth is not None  # noqa: S101
     T_eg = invert(align(truth.T_wc, trajectory.T_wc, oriented=True).T_ge)
@@ -93,10 +93,10 @@ def compare_with_demo(sequence: RGBDSequence, pipeline: Pipeline, mapper: Occupa
         "surface that was seen, by area, in voxels that are called occupied": f"{area_right:.2%}",
         "voxels of which at least a sample was seen that are called occupied": _share(right[known & sampled]),
     }
-    for mask_id, name in FIGURES.items():
+    for instance, name in FIGURES.items():
         times = [index / FRAME_RATE for index in range(len(sequence))]
-        figures = [figure for figure in scene.figures if figure.mask_id == mask_id]
-        swept = torch.cat([keys_of(figure_points(figure, t)).unique() for figure in figures for t in times]).unique()
+        bodies = [body for body in scene.bodies if body.instance == instance]
+        swept = torch.cat([keys_of(body_points(body, t)).unique() for body in bodies for t in times]).unique()
         left = torch.isin(cell_keys(occupied), swept) & ~near_surface
         rows[f"voxels that the {name} passed and that are called occupied"] = f"{int(left.sum())} of {len(swept)}"
     floor = mapper.find_floor()

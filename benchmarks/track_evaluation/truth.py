@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.base import HasMotionMasks
-from v3d_torch.datasets.demo.camera_trajectory import camera_pose
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.room import build_room
+from v3d_torch.datasets.demo.scenes import SCENES
 from v3d_torch.datasets.demo.sequence import CAMERA, FRAME_RATE, SEED
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.masks import STATIC, UNSURE, MaskEvaluation
@@ -30,9 +29,6 @@ have their own id in the masks."""
 
 _SECOND_PERSON = 1000
 """The second person of a split id gets the id plus this number."""
-
-_DEMO_PEOPLE = 3
-"""Number of people among the figures of the demo; they are the first ones."""
 
 CORRECTIONS: dict[str, dict[str, Any]] = yaml.safe_load(
     Path(__file__).with_name("true_ids.yaml").read_text(encoding="utf-8")
@@ -72,7 +68,9 @@ def true_people(sequence: RGBDSequence, frames: int | None = None, *, correct_id
     corrections = CORRECTIONS.get(sequence.name, {}) if correct_ids else {}
     masks, ids_of_values, in_view = [], [], []
     count = len(sequence) if frames is None else frames
-    for index, mask in enumerate(_demo_masks(count) if sequence.name == "demo" else _stored_masks(sequence, count)):
+    for index, mask in enumerate(
+        _rendered_masks(sequence.name, count) if sequence.name in SCENES else _stored_masks(sequence, count)
+    ):
         id_of_value = corrected_ids(index, corrections)
         measured = np.bincount(mask[sequence[index].depth[0].numpy() > 0], minlength=UNSURE + 1)
         pixels: Counter[int] = Counter()
@@ -101,15 +99,15 @@ def _stored_masks(sequence: RGBDSequence, count: int) -> Iterator[NDArray[np.uin
         yield mask.numpy()
 
 
-def _demo_masks(count: int) -> Iterator[NDArray[np.uint8]]:
-    """Render masks of the demo that also show the person who stands still."""
-    scene = build_room(SEED)
-    people = [replace(figure, mask_id=number) for number, figure in enumerate(scene.figures[:_DEMO_PEOPLE], start=1)]
-    figures = [*people, *(replace(figure, mask_id=0) for figure in scene.figures[_DEMO_PEOPLE:])]
-    renderer = Renderer(replace(scene, figures=figures), CAMERA)
+def _rendered_masks(name: str, count: int) -> Iterator[NDArray[np.uint8]]:
+    """Render masks of the people of a built-in sequence, those who are still as well."""
+    scene = SCENES[name](SEED)
+    renderer = Renderer(scene, CAMERA)
+    people = [instance for instance, label in scene.labels.items() if label == "person"]
     for index in range(count):
         time = index / FRAME_RATE
-        yield renderer(camera_pose(time), time).motion_mask.numpy()
+        mask = renderer(scene.trajectory.pose(time), time).instance_mask.numpy()
+        yield np.where(np.isin(mask, people), mask, 0).astype(np.uint8)
 
 
 def corrected_ids(index: int, corrections: dict[str, Any]) -> list[int]:

@@ -12,8 +12,9 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.demo import materials
 from v3d_torch.datasets.demo.camera_trajectory import R_WC_LEVEL
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.room import ROOM_MAX, ROOM_MIN, build_room
-from v3d_torch.datasets.demo.scene import Rectangle, Scene
+from v3d_torch.datasets.demo.room import ROOM_MAX, ROOM_MIN
+from v3d_torch.datasets.demo.scene import Body, Rectangle, Scene
+from v3d_torch.datasets.demo.scenes.walking import build_walking_scene
 from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
@@ -37,11 +38,12 @@ def true_pose(frame: int) -> np.ndarray:
 
 def empty_room() -> Scene:
     """The demo room without moving people, and with the wall behind the demo's camera."""
-    room = build_room(7)
+    scene = build_walking_scene(7)
     width, height = ROOM_MAX[0] - ROOM_MIN[0], ROOM_MAX[2] - ROOM_MIN[2]
     bricks = materials.bricks(np.random.default_rng(0), width, height, 330, (0.6, 0.5, 0.5))
     back_wall = Rectangle((ROOM_MAX[0], ROOM_MIN[1], ROOM_MAX[2]), (-width, 0, 0), (0, 0, -height), bricks)
-    return Scene([*room.rectangles, back_wall], [figure for figure in room.figures if figure.mask_id == 0])
+    still = [body for body in scene.bodies if not body.is_moving(0.0)]
+    return Scene([*still, Body([back_wall])], scene.trajectory)
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
-from v3d_torch.datasets.demo.people import WALK_SPEED, WALK_START
+from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 
@@ -35,7 +35,7 @@ OBJECT_FILES = {"figures/voting.png", "figures/clusters.png"}
 WALKER_START_X, WALKER_Y = -1.75, 2.0
 STANDER = (-0.91, 3.05)
 SWAYER = (1.02, 2.98)
-"""Positions of the demo's people on the floor, metres right and away (datasets/demo/room.py)."""
+"""Positions of the demo's people on the floor, metres right and away (datasets/demo/scenes/walking.py)."""
 
 
 def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:

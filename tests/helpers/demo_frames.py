@@ -11,7 +11,7 @@ from v3d_torch.datasets.demo import ensure_demo
 from v3d_torch.datasets.demo.sequence import FRAME_RATE, START_STAMP
 from v3d_torch.io.download import cache_dir
 
-_IMAGES = ("rgb", "depth", "masks")
+_IMAGES = ("rgb", "depth", "masks", "instances")
 _LISTS = ("rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")
 
 
@@ -36,4 +36,5 @@ def copy_frames(folder: Path, frames: range) -> None:
         rows = (demo / name).read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [row for row in rows if row.startswith("#") or row.split()[0] in stamps]
         (folder / name).write_text("".join(kept), encoding="utf-8")
-    shutil.copyfile(demo / "camera.yaml", folder / "camera.yaml")
+    for name in ("camera.yaml", "instances/labels.yaml"):
+        shutil.copyfile(demo / name, folder / name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-from v3d_torch.datasets.demo.camera_trajectory import camera_pose
 from v3d_torch.datasets.demo.renderer import Renderer, Rendering
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -14,8 +13,8 @@ SMALL = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=
 
 
 def render_at(renderer: Renderer, time: float) -> Rendering:
-    """Render the image that the camera of the demo takes at a time."""
-    return renderer(camera_pose(time), time)
+    """Render the image that the camera of the scene takes at a time."""
+    return renderer(renderer.scene.trajectory.pose(time), time)
 
 
 def world_points(depth: Tensor, T_wc: np.ndarray, camera: PinholeCamera = SMALL) -> np.ndarray:

@@ -153,10 +153,19 @@ def test_object_in_one_view_is_removed_if_another_view_observes_free_space() -> 
 
 
 def test_object_in_most_views_is_kept() -> None:
-    """For example a chair that is removed at the end, or a single wrong depth image."""
+    """For example with a single wrong depth image."""
     present, absent = (EYE, square_at(1.5)), (EYE, wall(2.5))
     assert count_in_front_of_the_wall(fuse_points(views_of(present, present, absent), config())) > 1000
     assert count_in_front_of_the_wall(fuse_points(views_of(present, absent, absent), config())) == 0
+
+
+def test_object_that_the_newest_views_do_not_observe_is_removed() -> None:
+    """For example a chair that is taken away at the end; if it is put back, it is in the map."""
+    present, absent = (EYE, square_at(1.5)), (EYE, wall(2.5))
+    taken_away = [*5 * [present], *3 * [absent]]
+    assert count_in_front_of_the_wall(fuse_points(views_of(*taken_away), config())) == 0
+    assert count_in_front_of_the_wall(fuse_points(views_of(*taken_away[:-1]), config())) > 1000
+    assert count_in_front_of_the_wall(fuse_points(views_of(*taken_away, present), config())) > 1000
 
 
 def test_occluded_or_unmeasured_object_is_kept() -> None:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from v3d_torch.errors import InputError
 from v3d_torch.segmentation import PERSON, MaskFolder
+from v3d_torch.segmentation.coco import COCO_NAMES
 from v3d_torch.types import RGBDFrame
 
 
@@ -38,6 +39,23 @@ def test_every_nonzero_value_is_an_instance(tmp_path: Path, dtype: type, values:
     assert instances.boxes.tolist() == [[5, 2, 8, 6], [1, 2, 4, 6]]  # edges: pixels 5, 6 and 7 lie between 5 and 8
     for mask, value in zip(instances.masks, sorted(values), strict=True):
         assert np.array_equal(mask.numpy(), ids(dtype, *values) == value)
+
+
+def test_labels_file_gives_the_classes_and_selects_the_ids(tmp_path: Path) -> None:
+    Image.fromarray(ids(np.uint8, 9, 4, 7)).save(tmp_path / "10.000000.png")
+    (tmp_path / "labels.yaml").write_text("7: person\n4: chair\n")
+    instances, read_ids = MaskFolder(tmp_path).read(frame(0, 10.0))
+    assert read_ids.tolist() == [4, 7]
+    assert [COCO_NAMES[label] for label in instances.labels] == ["chair", "person"]
+    assert np.array_equal(instances.masks[1].numpy(), ids(np.uint8, 9, 4, 7) == 7)
+
+
+@pytest.mark.parametrize("text", ["4: throne", "- chair", "four: chair", "4: [chair", "4: [chair]", ""])
+def test_invalid_labels_are_one_sentence(tmp_path: Path, text: str) -> None:
+    Image.fromarray(ids(np.uint8, 4)).save(tmp_path / "10.000000.png")
+    (tmp_path / "labels.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"labels\.yaml: .* line such as 4: chair for each id"):
+        MaskFolder(tmp_path)
 
 
 def test_ids_of_a_palette_image_are_its_palette_indices(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from v3d_torch.evaluation.ablation import (
 )
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
+from v3d_torch.io.paths import folder_name
 from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
@@ -97,7 +98,7 @@ def run_ablation_study(
             for (variant, seed), config in configs.items():
                 source = sources.setdefault(_network_config(config), CachedSegmenter(network(_network_config(config))))
                 segment = wrap_upright(source, config.segmentation)
-                run_folder = make_result_folder(folder / name.replace("/", "_") / variant / f"seed{seed}", name)
+                run_folder = make_result_folder(folder / folder_name(name) / variant / f"seed{seed}", name)
                 metrics, failure = _run(sequence, segment, config, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 console.print(str(outcomes[-1]), markup=False)

@@ -10,7 +10,7 @@ from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError
-from v3d_torch.io.paths import expand_user
+from v3d_torch.io.paths import expand_user, folder_name
 from v3d_torch.segmentation import make_instance_source
 
 
@@ -77,7 +77,7 @@ def plan_jobs(
             data_root=data_root.absolute() if data_root is not None else None,
             config_name=label,
             config=config.model_copy(update={"seed": seed}),
-            folder=folder.absolute() / name.replace("/", "_") / label / f"seed{seed}",
+            folder=folder.absolute() / folder_name(name) / label / f"seed{seed}",
             skip_broken=skip_broken,
         )
         for name, (source, sequence) in sequences.items()

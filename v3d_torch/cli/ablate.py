@@ -19,7 +19,10 @@ app = make_app()
 def main(
     seq: Annotated[
         list[str],
-        typer.Option(help="Sequence to run: demo, a TUM RGB-D sequence or a folder. Repeat the option for several."),
+        typer.Option(
+            help="Sequence to run: demo, demo:sitting, demo:things, a TUM RGB-D sequence or a folder."
+            " Repeat the option for several."
+        ),
     ],
     data_root: DataRoot = None,
     variants: Annotated[

@@ -21,8 +21,8 @@ def main(
     seq: Annotated[
         str | None,
         typer.Option(
-            help="demo, a TUM RGB-D sequence (fr3/w/xyz), a folder, bag or video of RGB-D images, or a live camera"
-            " (realsense:)."
+            help="demo, demo:sitting, demo:things, a TUM RGB-D sequence (fr3/w/xyz), a folder, bag or video of RGB-D"
+            " images, or a live camera (realsense:)."
         ),
     ] = None,
     data_root: DataRoot = None,

@@ -7,7 +7,13 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from v3d_torch.datasets.sequence_names import canonical_name, download_url, short_name, unknown_name_error
+from v3d_torch.datasets.sequence_names import (
+    BUILT_IN_SEQUENCES,
+    canonical_name,
+    download_url,
+    short_name,
+    unknown_name_error,
+)
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.io.download import Progress, cache_dir, fetch
 from v3d_torch.io.extract import extract_tar
@@ -71,7 +77,7 @@ def check_name(name: str, data_root: Path | None) -> None:
         InputError: If there is no such path and no such sequence.
     """
     with suppress(OSError):  # such as a name that is too long; `open_source` reports the error
-        is_special = name in ("", "demo") or name.partition(":")[0] == "realsense"
+        is_special = name in ("", *BUILT_IN_SEQUENCES) or name.partition(":")[0] == "realsense"
         if not is_special and canonical_name(name) is None and find_stored(name, data_root) is None:
             raise unknown_name_error(name)
 

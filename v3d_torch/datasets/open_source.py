@@ -11,6 +11,7 @@ from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.locate import find_or_download
 from v3d_torch.datasets.realsense import open_realsense_camera
+from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
@@ -37,7 +38,7 @@ def open_source(
     Args:
         name: One of
 
-            - ``demo``: the rendered demo sequence;
+            - ``demo``, ``demo:sitting``, ``demo:things``: a rendered sequence;
             - ``realsense:`` or ``realsense:SERIAL``: a connected camera;
             - the path of a folder or file of any kind in `v3d_torch.datasets.sources.SOURCES`;
             - the name of a sequence in ``data_root``;
@@ -46,7 +47,7 @@ def open_source(
         camera: A camera, the name of a preset or a camera file; None for the camera of the source.
         options: Options for sources that do not describe themselves completely; None for the defaults.
         download: True if a TUM sequence that is not on disk is downloaded.
-        progress: Callback for the number of downloaded bytes, or of rendered frames of the demo; None for no reports.
+        progress: Callback for the number of downloaded bytes, or of rendered frames; None for no reports.
         skip_broken: True to report missing image files and broken frames only when such a frame is read, and not when
             the sequence is opened; see `v3d_torch.datasets.readable_frames.ReadableFrames`.
 
@@ -131,12 +132,12 @@ def _open_by_name(
     progress: Progress | None,
     skip_broken: bool,
 ) -> RGBDStream:
-    if name == "demo":
-        # Imported here because rendering the demo needs libraries that other sources do not need.
+    if name in BUILT_IN_SEQUENCES:
+        # Imported here because rendering needs libraries that other sources do not need.
         from v3d_torch.datasets.demo import ensure_demo
 
-        reject_options(name, "the demo", options, frozenset())
-        return TUMSequence(ensure_demo(cache_dir(), progress), camera, name="demo")
+        reject_options(name, "a rendered sequence", options, frozenset())
+        return TUMSequence(ensure_demo(cache_dir(), progress, name), camera, name=name)
     if is_live(name):
         reject_options(name.removesuffix(":"), "a live camera", options, frozenset({"fps"}))
         return open_realsense_camera(name, camera, fps=options.fps)

@@ -7,6 +7,9 @@ import re
 
 from v3d_torch.errors import InputError
 
+BUILT_IN_SEQUENCES = ("demo", "demo:sitting", "demo:things")
+"""Names of the sequences that are rendered by the package; see `v3d_torch.datasets.demo`."""
+
 _PREFIX = "rgbd_dataset_"
 
 _SEQUENCES = {
@@ -120,7 +123,8 @@ def download_url(full_name: str) -> str:
 def unknown_name_error(name: str) -> InputError:
     """Create the error for a name that is not a path or a sequence; it suggests similar names."""
     choices = {short_name(full): full for full in SEQUENCES}
-    spellings = {spelling: short for short, full in choices.items() for spelling in (short, full)} | {"demo": "demo"}
+    spellings = {spelling: short for short, full in choices.items() for spelling in (short, full)}
+    spellings |= {name: name for name in BUILT_IN_SEQUENCES}
     similar = difflib.get_close_matches(name.strip().lower(), spellings, n=3, cutoff=0.5)
     suggestions = list(dict.fromkeys(spellings[spelling] for spelling in similar)) or ["demo", "fr3/w/xyz"]
     return InputError(

@@ -31,3 +31,8 @@ def expand_user_paths(command: Callable[..., None]) -> Callable[..., None]:
         command(**{name: expand_user(value) if isinstance(value, Path) else value for name, value in options.items()})
 
     return expanded
+
+
+def folder_name(name: str) -> str:
+    """Return the name of a sequence as the name of one folder: ``fr3/w/xyz`` and ``demo:sitting`` are no folders."""
+    return name.replace("/", "_").replace(":", "_")

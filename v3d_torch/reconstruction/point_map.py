@@ -16,6 +16,10 @@ from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.objects.free_space_check import DepthView, is_free_space
 
+_MIN_FREE_VIEWS = 3
+"""Number of newest views that observe free space from which a surface that was observed before has gone. Single views
+err at depth edges."""
+
 _BATCH = 200_000
 """Number of points that are fused at once. Batches bound the memory, and take no longer than a single fusion."""
 
@@ -45,7 +49,7 @@ def fuse_points(views: StaticViews, config: Config) -> PointMap:
     Pixels without a normal are excluded. They lie at the edge of a surface, where depth is a mean of foreground and
     background. A fused point is removed if the views that observe free space at its position are at least as many as
     the views that observe a surface there. This removes people that a mask missed, because they are at one position in
-    few views only.
+    few views only. It is also removed if the newest views observe free space: a thing that stood there was taken away.
 
     Args:
         views: Static views of the keyframes.
@@ -95,13 +99,13 @@ def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) 
 
 
 def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) -> Tensor:
-    """Check which points are observed as free, by at least as many views as observe a surface there.
+    """Check which points are observed as free, by at least as many views as observe a surface, or by the newest ones.
 
     Points closer together than the depth tolerance share one check, which is faster.
 
     Args:
         points: Positions, world frame, metres, float64, shape :math:`(P, 3)`.
-        views: Static views of the keyframes.
+        views: Static views of the keyframes, ordered by time.
         config: Tolerances of the free-space check.
 
     Returns:
@@ -109,10 +113,11 @@ def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfi
     """
     cells = voxel_pool(points[None], torch.ones(1, len(points), dtype=torch.bool), config.min_tolerance / 2)
     centres = cells.means[0]
-    free, occupied = torch.zeros(2, len(centres), dtype=torch.int32)
+    free, occupied, free_since = torch.zeros(3, len(centres), dtype=torch.int32)  # since the last observed surface
     for view in views:
         depth_view = DepthView(view.keyframe.stamp, view.depth[None], view.T_cw)
         state = is_free_space(centres, depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
         free += state == 1
         occupied += state == 0
-    return ((free > 0) & (free >= occupied))[cells.voxel_index[0]]
+        free_since = (free_since + (state == 1)) * (state != 0)
+    return ((free > 0) & ((free >= occupied) | (free_since >= _MIN_FREE_VIEWS)))[cells.voxel_index[0]]

@@ -15,6 +15,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.validation import first_error
 from v3d_torch.datasets import SourceOptions
 from v3d_torch.datasets.cameras import PRESETS
+from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import expand_user
@@ -78,7 +79,7 @@ class RunRequest:
         for name in _PATHS:
             if values[name] is not None:
                 values[name] = str(expand_user(values[name]).absolute())
-        for name, not_a_path in (("seq", ("demo",)), ("camera", (None, *PRESETS))):
+        for name, not_a_path in (("seq", BUILT_IN_SEQUENCES), ("camera", (None, *PRESETS))):
             if values[name] not in not_a_path:
                 values[name] = _absolute_if_exists(values[name])
         return RunRequest(config=self.config, **values)

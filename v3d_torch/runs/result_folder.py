@@ -8,6 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from v3d_torch.errors import OutputError
+from v3d_torch.io.paths import folder_name
 
 _LOG = "run.log"
 """Name of the log, which every run writes first: a folder with this file contains results of a run."""
@@ -36,7 +37,7 @@ def make_result_folder(out: Path | None, name: str) -> Path:
     Raises:
         OutputError: If the folder cannot be made.
     """
-    runs = Path("results") / name.replace("/", "_")
+    runs = Path("results") / folder_name(name)
     try:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,9 @@ from PIL import Image
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.io.safe_yaml import parse_yaml
+from v3d_torch.io.text import read_text
+from v3d_torch.segmentation.coco import COCO_NAMES, PERSON
 from v3d_torch.types import Instances, RGBDFrame
 
 _MAX_GAP = 0.02
@@ -33,11 +35,14 @@ class MaskFolder:
     Files named by timestamp (``1305031102.175304.png``) belong to the nearest frame in time, at most 0.02 s away. Files
     with other names belong to the frames in sorted order.
 
+    A file ``labels.yaml`` in the folder gives the COCO class of each id, a line ``4: chair`` for each; ids that it does
+    not list are no instances. Without this file, all instances are people.
+
     Args:
         folder: Folder of the id images.
 
     Raises:
-        InputError: If the folder is missing or contains no PNG file.
+        InputError: If the folder is missing or contains no PNG file, or ``labels.yaml`` is invalid.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,12 +52,14 @@ class MaskFolder:
             self._paths = sorted(folder.glob("*.png"))
         if not self._paths:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
+        labels = folder / "labels.yaml"
+        self._labels = _read_labels(labels) if labels.is_file() else None
         self._stamps: Tensor | None = None
         if all(_STAMP.fullmatch(path.stem) for path in self._paths):
             self._stamps = torch.tensor([float(path.stem) for path in self._paths], dtype=torch.float64)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
-        """Return the instances of a frame in the order of their ids; each gets the label person and the score 1.
+        """Return the instances of a frame in the order of their ids, each with the score 1.
 
         Raises:
             InputError: If the frame has no id image, or the image is unreadable or of another size.
@@ -78,10 +85,14 @@ class MaskFolder:
                 f"{path}: has {len(ids)} different ids, more than {_MAX_INSTANCES}; an id image has one value for each"
                 " instance and 0 for the background, name the folder of such images with --masks"
             )
+        labels = torch.full_like(ids, PERSON)
+        if self._labels is not None:
+            ids = torch.tensor([i for i in ids.tolist() if i in self._labels], dtype=torch.int64)
+            labels = torch.tensor([self._labels[i] for i in ids.tolist()], dtype=torch.int64)
         masks = torch.from_numpy(values == ids.numpy()[:, None, None].astype(values.dtype))
         instances = Instances(
             masks=masks,
-            labels=torch.full_like(ids, PERSON),
+            labels=labels,
             scores=torch.ones(len(ids)),
             boxes=_bounding_boxes(masks),
         )
@@ -114,6 +125,19 @@ def _read_ids(path: Path) -> NDArray[Any]:
             f"{path}: has {values.shape[2]} channels, expected one 8- or 16-bit channel; write it with one channel"
         )
     return values
+
+
+def _read_labels(path: Path) -> dict[int, int]:
+    """Class index of each id."""
+    try:
+        names = parse_yaml(read_text(path, "labels of an id image are a YAML file"))
+    except ValueError as error:
+        raise InputError(f"{path}: is not valid YAML ({error}); write a line such as 4: chair for each id") from error
+    if not isinstance(names, dict) or not all(isinstance(i, int) and name in COCO_NAMES for i, name in names.items()):
+        raise InputError(
+            f"{path}: expected a line such as 4: chair for each id, with classes of COCO; correct the file"
+        )
+    return {i: COCO_NAMES.index(name) for i, name in names.items()}
 
 
 def _bounding_boxes(masks: Tensor) -> Tensor:

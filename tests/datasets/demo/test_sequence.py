@@ -12,11 +12,16 @@ from helpers.demo_frames import copy_frames
 from helpers.demo_views import world_points
 from scipy.spatial.transform import Rotation
 
+from v3d_torch.config import Config
 from v3d_torch.datasets import demo
 from v3d_torch.datasets.cameras import load_camera
-from v3d_torch.datasets.demo.camera_trajectory import camera_pose
+from v3d_torch.datasets.demo.scenes import SCENES
+from v3d_torch.datasets.demo.scenes.walking import TRAJECTORY
 from v3d_torch.datasets.demo.sequence import CAMERA, write_sequence
-from v3d_torch.errors import OutputError
+from v3d_torch.datasets.locate import check_name
+from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
+from v3d_torch.errors import InputError, OutputError
+from v3d_torch.runs.request import RunRequest
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
@@ -40,7 +45,7 @@ def test_bytes_are_independent_of_threads_and_selected_frames(sequence: Path, tm
         torch.set_num_threads(threads)
     first, second = read_files(sequence), read_files(tmp_path)
     image_names = [name for name in second if name.endswith((".png", ".jpg"))]
-    assert len(image_names) == 3
+    assert len(image_names) == 4
     assert all(first[name] == second[name] for name in image_names)
 
 
@@ -72,15 +77,36 @@ def test_convention_ground_truth_is_camera_to_world(sequence: Path) -> None:
     T_wc[:3, 3] = poses[0, 1:4]
     points = world_points(torch.from_numpy(depth), T_wc, CAMERA)[440:, 250:350][depth[440:, 250:350] > 0]
     assert np.median(points[:, 2]) == pytest.approx(0.90, abs=0.003)
-    assert np.allclose(T_wc, camera_pose(0.0), atol=1e-8)
+    assert np.allclose(T_wc, TRAJECTORY.pose(0.0), atol=1e-8)
+
+
+def test_names_are_those_of_the_scenes() -> None:
+    assert tuple(SCENES) == BUILT_IN_SEQUENCES
+    for name in BUILT_IN_SEQUENCES:
+        check_name(name, None)
+        assert RunRequest(name, Config()).absolute().seq == name
+    with pytest.raises(InputError, match="did you mean demo:sitting"):
+        check_name("demo:siting", None)
+
+
+def test_sequences_have_instances_with_labels(sequence: Path) -> None:
+    """The person who stands still is an instance, but does not move."""
+    stamp = "2.333333"
+    paths = (sequence / folder / f"{stamp}.png" for folder in ("instances", "masks"))
+    instances, moving = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths)
+    assert set(np.unique(instances)) == {0, 1, 2, 3} and set(np.unique(moving)) == {0, 1, 2}
+    assert (instances[moving > 0] == moving[moving > 0]).all()
+    assert (sequence / "instances" / "labels.yaml").read_text() == "1: person\n2: person\n3: person\n"
 
 
 # --- cache
 
 
-def fake_sequence(folder: Path, frames: range = range(2), progress: demo.Progress | None = None) -> None:
+def fake_sequence(
+    folder: Path, frames: range = range(2), progress: demo.Progress | None = None, name: str = "demo"
+) -> None:
     folder.mkdir(parents=True)
-    (folder / "rgb.txt").write_text("rendered")
+    (folder / "rgb.txt").write_text(f"rendered {name}")
     if progress is not None:
         progress(2, 2)
 
@@ -89,14 +115,18 @@ def test_demo_is_rendered_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(demo, "write_sequence", fake_sequence)
     reports: list[tuple[int, int]] = []
     folder = demo.ensure_demo(tmp_path / "cache", lambda done, total: reports.append((done, total)))
-    assert folder.parent == tmp_path / "cache" and (folder / "rgb.txt").read_text() == "rendered"
+    assert folder.parent == tmp_path / "cache" and (folder / "rgb.txt").read_text() == "rendered demo"
     assert demo.ensure_demo(tmp_path / "cache", lambda done, total: reports.append((done, total))) == folder
     assert reports == [(2, 2)]
     assert [p.name for p in (tmp_path / "cache").iterdir()] == [folder.name]
+    other = demo.ensure_demo(tmp_path / "cache", name="demo:sitting")
+    assert other.name.startswith("demo-sitting-") and (other / "rgb.txt").read_text() == "rendered demo:sitting"
 
 
 def test_interrupted_rendering_leaves_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(folder: Path, frames: range = range(2), progress: demo.Progress | None = None) -> None:
+    def interrupted(
+        folder: Path, frames: range = range(2), progress: demo.Progress | None = None, name: str = "demo"
+    ) -> None:
         fake_sequence(folder)
         raise KeyboardInterrupt
 
@@ -108,5 +138,5 @@ def test_interrupted_rendering_leaves_no_files(tmp_path: Path, monkeypatch: pyte
 
 def test_unwritable_cache_is_an_output_error(tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file")
-    with pytest.raises(OutputError, match="cache: cannot store the demo sequence"):
+    with pytest.raises(OutputError, match="cache: cannot store demo "):
         demo.ensure_demo(tmp_path / "cache")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
-_REST_POSITION = (0.0, 0.0, 1.40)
-"""Mean position of the camera, world frame, metres: held at chest height behind the counter."""
-_REST_PITCH = -5.5
-"""Mean pitch of the camera, degrees: slightly downwards."""
 
 _OSCILLATIONS: dict[str, tuple[tuple[float, float, float], ...]] = {
     "x": ((0.17, 0.31, 0.3), (0.05, 0.83, 1.9), (0.0012, 7.3, 0.4)),
@@ -28,23 +25,38 @@ R_WC_LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Camera-to-world rotation of a level camera whose optical axis is +y of the world (x right, y forward, z up)."""
 
 
-def camera_pose(t: float) -> NDArray[np.float64]:
-    """Return the camera pose at a time.
+@dataclass(frozen=True)
+class CameraTrajectory:
+    """Trajectory of a hand-held camera about a rest pose that looks along +y of the world.
 
-    Args:
-        t: Time since the start of the sequence, seconds.
-
-    Returns:
-        ``T_wc``, camera-to-world pose, float64, shape :math:`(4, 4)`.
+    Attributes:
+        rest_position: Mean position of the camera, world frame, metres.
+        rest_pitch: Mean pitch of the camera, degrees; negative is downwards.
+        start: Time within the oscillations at which the sequence starts, seconds.
     """
-    value = {
-        name: sum(a * np.sin(2 * np.pi * f * t + phase) for a, f, phase in sines)
-        for name, sines in _OSCILLATIONS.items()
-    }
-    angles = (value["yaw"], value["pitch"] + _REST_PITCH, value["roll"])
-    # Intrinsic rotations: yaw about the vertical (positive to the left), then pitch (up), then roll (optical axis).
-    rotation = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
-    T_wc = np.eye(4)
-    T_wc[:3, :3] = rotation @ R_WC_LEVEL
-    T_wc[:3, 3] = np.add(_REST_POSITION, (value["x"], value["y"], value["z"]))
-    return T_wc
+
+    rest_position: tuple[float, float, float]
+    rest_pitch: float
+    start: float = 0.0
+
+    def pose(self, t: float) -> NDArray[np.float64]:
+        """Return the camera pose at a time.
+
+        Args:
+            t: Time since the start of the sequence, seconds.
+
+        Returns:
+            ``T_wc``, camera-to-world pose, float64, shape :math:`(4, 4)`.
+        """
+        t = t + self.start
+        value = {
+            name: sum(a * np.sin(2 * np.pi * f * t + phase) for a, f, phase in sines)
+            for name, sines in _OSCILLATIONS.items()
+        }
+        angles = (value["yaw"], value["pitch"] + self.rest_pitch, value["roll"])
+        # Intrinsic rotations: yaw about the vertical (positive to the left), then pitch (up), then roll (optical axis).
+        rotation = Rotation.from_euler("ZXY", angles, degrees=True).as_matrix()
+        T_wc = np.eye(4)
+        T_wc[:3, :3] = rotation @ R_WC_LEVEL
+        T_wc[:3, 3] = np.add(self.rest_position, (value["x"], value["y"], value["z"]))
+        return T_wc

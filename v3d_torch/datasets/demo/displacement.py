@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -51,7 +52,9 @@ def displacement_map(figure: Figure) -> Tensor:
     return torch.from_numpy(np.stack([relief, alpha]).astype(np.float32))
 
 
-def intersect_figure(figure: Figure, displacement: Tensor, view: View, time: float) -> RayHits | None:
+def intersect_figure(
+    figure: Figure, displacement: Tensor, view: View, T_wb: NDArray[np.float64], time: float
+) -> RayHits | None:
     """Intersect camera rays with a figure.
 
     Each iteration intersects the rays with the base plane shifted by the displacement that the last iteration found.
@@ -61,17 +64,18 @@ def intersect_figure(figure: Figure, displacement: Tensor, view: View, time: flo
         figure: Figure to intersect.
         displacement: Result of `displacement_map` for the figure.
         view: Camera rays.
-        time: Time, seconds.
+        T_wb: Body-to-world pose of the figure, float64, shape :math:`(4, 4)`.
+        time: Time, seconds, for the deformation.
 
     Returns:
         Intersections; None if the figure is out of view.
     """
-    plane, pose = figure.plane_at(time)
+    plane, deformation = figure.plane_at(T_wb), figure.deformation(time)
     corner, across, down = (np.asarray(v, float) for v in (plane.corner, plane.across, plane.down))
     normal = plane.normal
-    lean = pose.lean * figure.height / figure.width  # as a shift in widths per height
+    lean = deformation.lean * figure.height / figure.width  # as a shift in widths per height
     # Bounding volume: the rectangle, extended by the largest displacement, twist and lean.
-    forward = normal * (figure.thickness + abs(pose.twist) * figure.width)
+    forward = normal * (figure.thickness + abs(deformation.twist) * figure.width)
     sideways = across * (abs(lean) * max(figure.pivot[1], 1.0 - figure.pivot[1]))
     corners = [corner + i * across + j * down for i in (0, 1) for j in (0, 1)]
     bounds = [p + f + e for p in corners for f in (forward, -forward) for e in (sideways, -sideways)]
@@ -90,7 +94,7 @@ def intersect_figure(figure: Figure, displacement: Tensor, view: View, time: flo
         t = depth * ray_down - origin_down
         s = depth * ray_across - (origin_across + lean * figure.pivot[1]) + lean * t
         relief, alpha = _sample(displacement, s, t)
-        offset = relief + pose.twist * figure.width * (s - figure.pivot[0])
+        offset = relief + deformation.twist * figure.width * (s - figure.pivot[0])
     return RayHits(window, alpha > 0.5, depth, s, t)
 
 

@@ -115,3 +115,20 @@ def add_seams(image: Texture, step: int) -> Texture:
     image[::step] *= 0.5
     image[:, ::step] *= 0.5
     return image
+
+
+def cardboard(rng: np.random.Generator, width: float, height: float, density: float) -> Texture:
+    """Side of a cardboard box with a strip of tape, a printed arrow and lines of text."""
+    rows, columns = texels(height, density), texels(width, density)
+    image = tint((0.70, 0.53, 0.35), 1.0 + 0.12 * fractal_noise(rng, rows, columns, (rows / 3, 3), 4))
+    image[:, round(0.46 * columns) : round(0.54 * columns)] *= np.float32(1.18)
+    ink = (0.22, 0.15, 0.10)
+    arrow = np.asarray(
+        ((0.14, 0.45), (0.22, 0.2), (0.30, 0.45), (0.25, 0.45), (0.25, 0.75), (0.19, 0.75), (0.19, 0.45))
+    )
+    cv2.fillPoly(image, [(arrow * (columns, rows)).astype(np.int32)], ink, cv2.LINE_AA)
+    for line in np.arange(0.25, 0.8, 0.11):
+        start, end = (0.62, line), (rng.uniform(0.72, 0.93), line)
+        ends = [tuple((np.asarray(point) * (columns, rows)).astype(int).tolist()) for point in (start, end)]
+        cv2.line(image, ends[0], ends[1], ink, max(1, rows // 40), cv2.LINE_AA)
+    return np.clip(image, 0.0, 1.0)

@@ -184,3 +184,37 @@ def orange(rng: np.random.Generator, size: int = 128) -> NDArray[np.float32]:
     rgb = np.asarray((0.98, 0.56, 0.10)) * (light * pores)[..., None] + gloss[..., None]
     alpha = np.clip((1.0 - np.sqrt(r2)) * size / 4, 0.0, 1.0)
     return np.asarray(np.clip(np.dstack([rgb, alpha]), 0.0, 1.0), np.float32)
+
+
+def football(size: int = 160) -> NDArray[np.float32]:
+    """Football with twelve black patches, RGBA; lit from the viewer, so that it can turn in the picture."""
+    y, x = np.mgrid[0:size, 0:size].astype(np.float32) * (2.0 / (size - 1)) - 1.0
+    r2 = x**2 + y**2
+    z = np.sqrt(np.clip(1.0 - r2, 0.0, 1.0))
+    golden = (1.0 + 5.0**0.5) / 2.0
+    corner = np.asarray([(0.0, a, b) for a in (-1.0, 1.0) for b in (-golden, golden)])
+    corners = np.concatenate([np.roll(corner, shift, axis=1) for shift in range(3)])  # of an icosahedron
+    directions = corners / np.linalg.norm(corners[0])
+    turned = directions @ cv2.Rodrigues(np.asarray((0.35, 0.2, 0.1)))[0].T
+    nearest = (np.stack([x, y, z], axis=-1) @ turned.T.astype(np.float32)).max(axis=-1)
+    light = 0.35 + 0.6 * z
+    rgb = np.where(nearest > 0.93, np.float32(0.08), np.float32(0.95)) * light
+    alpha = np.clip((1.0 - np.sqrt(r2)) * size / 4, 0.0, 1.0)
+    return np.asarray(np.dstack([rgb, rgb, rgb, alpha]), np.float32)
+
+
+def balloon(size: int = 320) -> NDArray[np.float32]:
+    """Red balloon with a knot, RGBA."""
+    image = np.zeros((size, round(0.72 * size), 4), np.float32)
+    middle, (across, down) = (round(0.36 * size), round(0.43 * size)), (0.34 * size, 0.42 * size)
+    y, x = np.mgrid[0 : image.shape[0], 0 : image.shape[1]].astype(np.float32)
+    x, y = (x - middle[0]) / across, (y - middle[1]) / down
+    r2 = x**2 + y**2
+    z = np.sqrt(np.clip(1.0 - r2, 0.0, 1.0))
+    light = 0.35 + 0.65 * np.clip(-0.3 * x - 0.6 * y + 0.7 * z, 0.0, 1.0)
+    gloss = 0.7 * np.clip(1.0 - ((x + 0.35) ** 2 + (y + 0.45) ** 2) / 0.03, 0.0, 1.0)
+    image[..., :3] = np.clip(np.asarray((0.86, 0.10, 0.14)) * light[..., None] + gloss[..., None], 0.0, 1.0)
+    image[..., 3] = np.clip((1.0 - np.sqrt(r2)) * size / 6, 0.0, 1.0)
+    knot = np.asarray(((0.36, 0.83), (0.32, 0.92), (0.40, 0.92))) * size
+    cv2.fillPoly(image, [knot.astype(np.int32)], (0.55, 0.06, 0.09, 1.0), cv2.LINE_AA)
+    return image

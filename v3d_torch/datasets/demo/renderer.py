@@ -35,11 +35,13 @@ class Rendering:
     Attributes:
         colour: RGB in [0, 1], float32, shape :math:`(H, W, 3)`.
         depth: Depth, metres, float32, shape :math:`(H, W)`.
-        motion_mask: Id of the moving figure at each pixel, 0 = static, uint8, shape :math:`(H, W)`.
+        instance_mask: Id of the person or thing at each pixel, 0 = room, uint8, shape :math:`(H, W)`.
+        motion_mask: The same where it moves, 0 = static, uint8, shape :math:`(H, W)`.
     """
 
     colour: Tensor
     depth: Tensor
+    instance_mask: Tensor
     motion_mask: Tensor
 
 
@@ -53,13 +55,16 @@ class Renderer:
 
     def __init__(self, scene: Scene, camera: PinholeCamera) -> None:
         self.scene, self.camera = scene, camera
-        surfaces = [*scene.rectangles, *(figure.plane_at(0.0)[0] for figure in scene.figures)]
+        rectangles = [rectangle for body in scene.bodies for rectangle in body.rectangles]
+        figures = [figure for body in scene.bodies for figure in body.figures]
+        surfaces = [*rectangles, *(figure.plane_at(np.eye(4)) for figure in figures)]
         densities = [r.texture.shape[1] / float(np.linalg.norm(r.across)) for r in surfaces]
         self.textures = TextureAtlas([r.texture for r in surfaces], densities)
-        self.displacements = [displacement_map(figure) for figure in scene.figures]
-        self.mask_ids = torch.tensor(
-            [0] * len(scene.rectangles) + [f.mask_id for f in scene.figures], dtype=torch.uint8
-        )
+        self.displacements = [displacement_map(figure) for figure in figures]
+        # The body of each surface: all rectangles come before all figures.
+        body_of = [i for i, body in enumerate(scene.bodies) for _ in body.rectangles]
+        body_of += [i for i, body in enumerate(scene.bodies) for _ in body.figures]
+        self.body_of_surface = torch.tensor(body_of, dtype=torch.int64)
         self.rays = RayGrid.from_camera(camera)
 
     def __call__(self, T_wc: NDArray[np.float64], time: float) -> Rendering:
@@ -67,13 +72,14 @@ class Renderer:
 
         Args:
             T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
-            time: Time, seconds, for the motion of the figures.
+            time: Time, seconds, for the motion of the bodies.
 
         Returns:
-            Colour, depth and motion mask.
+            Colour, depth and masks.
         """
         view = View(self.rays, T_wc)
-        inverse_depth, surface, forms = self._draw_rectangles(view)
+        poses = [body.motion(time) for body in self.scene.bodies]
+        inverse_depth, surface, forms = self._draw_rectangles(view, poses)
         form = forms.index_select(0, surface.flatten()).reshape(*surface.shape, -1)  # (S, H, W, 10)
         x, y = self.rays.x, self.rays.y
         s = (form[..., 3] * x + form[..., 4] * y + form[..., 5]) / inverse_depth
@@ -81,8 +87,9 @@ class Renderer:
         # The cosine of incidence is plane distance * inverse depth. Its square root is a compromise between blur along
         # the surface and aliasing across the slant.
         footprint = (inverse_depth * form[..., 9]).clamp_(min=_MIN_COSINE).rsqrt_() / inverse_depth
-        for i, figure in enumerate(self.scene.figures):
-            hits = intersect_figure(figure, self.displacements[i], view, time)
+        figures = [(f, T_wb) for body, T_wb in zip(self.scene.bodies, poses, strict=True) for f in body.figures]
+        for i, (figure, T_wb) in enumerate(figures):
+            hits = intersect_figure(figure, self.displacements[i], view, T_wb, time)
             if hits is None:
                 continue
             figure_inverse_depth = 1.0 / hits.depth
@@ -94,13 +101,17 @@ class Renderer:
                 (footprint, hits.depth),
             ):
                 torch.where(visible, value, buffer[hits.window], out=buffer[hits.window])
-            surface[hits.window].masked_fill_(visible, len(self.scene.rectangles) + i)
+            surface[hits.window].masked_fill_(visible, len(forms) + i)
         footprint /= OVERSAMPLING * self.camera.fx
         colour = self.textures(surface.flatten(), s.flatten(), t.flatten(), footprint.flatten())
-        return self._resolve_samples(colour.reshape(*surface.shape, 3), inverse_depth, surface)
+        return self._resolve_samples(colour.reshape(*surface.shape, 3), inverse_depth, surface, time)
 
-    def _draw_rectangles(self, view: View) -> tuple[Tensor, Tensor, Tensor]:
+    def _draw_rectangles(self, view: View, poses: list[NDArray[np.float64]]) -> tuple[Tensor, Tensor, Tensor]:
         """Draw all rectangles to a z-buffer.
+
+        Args:
+            view: Camera rays.
+            poses: Body-to-world pose of each body.
 
         Returns:
             Inverse depth, float32, and index of the nearest rectangle, int32, both of shape :math:`(S, H, W)`; linear
@@ -108,10 +119,14 @@ class Renderer:
         """
         size = (OVERSAMPLING**2, self.camera.height, self.camera.width)
         inverse_depth, surface = torch.full(size, _FAR_INVERSE_DEPTH), torch.zeros(size, dtype=torch.int32)
-        forms = np.zeros((len(self.scene.rectangles), 10), np.float32)
-        for i, rectangle in enumerate(self.scene.rectangles):
-            corner, across, down = (np.asarray(v, float) for v in (rectangle.corner, rectangle.across, rectangle.down))
-            window = view.visible_window(np.stack([corner, corner + across, corner + down, corner + across + down]))
+        rectangles = [
+            rectangle.transform(T_wb)
+            for body, T_wb in zip(self.scene.bodies, poses, strict=True)
+            for rectangle in body.rectangles
+        ]
+        forms = np.zeros((len(rectangles), 10), np.float32)
+        for i, rectangle in enumerate(rectangles):
+            window = view.visible_window(rectangle.corners)
             form = _linear_forms(rectangle, view)
             if window is None or form is None:
                 continue
@@ -123,13 +138,17 @@ class Renderer:
             surface[window].masked_fill_(visible, i)
         return inverse_depth, surface, torch.from_numpy(forms)
 
-    def _resolve_samples(self, colour: Tensor, inverse_depth: Tensor, surface: Tensor) -> Rendering:
-        """Reduce samples to pixels: average the colours, and take depth and id from the nearest surface only."""
+    def _resolve_samples(self, colour: Tensor, inverse_depth: Tensor, surface: Tensor, time: float) -> Rendering:
+        """Reduce samples to pixels: average the colours, and take depth and ids from the nearest surface only."""
         nearest, nearest_sample = inverse_depth.max(dim=0, keepdim=True)
         # The samples of a plane are symmetric about the pixel centre and 1/z is linear, so their mean is exact.
         is_nearest = (inverse_depth > _LAYER_RATIO * nearest).to(torch.float32)
         depth = is_nearest.sum(0) / (inverse_depth * is_nearest).sum(0)
-        return Rendering(colour.mean(0), depth, self.mask_ids[surface.gather(0, nearest_sample)[0]])
+        body = self.body_of_surface[surface.gather(0, nearest_sample)[0]]
+        bodies = self.scene.bodies
+        instances = torch.tensor([body.instance for body in bodies], dtype=torch.uint8)
+        moving = torch.tensor([body.instance > 0 and body.is_moving(time) for body in bodies], dtype=torch.uint8)
+        return Rendering(colour.mean(0), depth, instances[body], (instances * moving)[body])
 
 
 def _linear_forms(rectangle: Rectangle, view: View) -> NDArray[np.float64] | None:

@@ -1,4 +1,4 @@
-"""Rendering of the demo as a sequence in the layout of the TUM RGB-D benchmark."""
+"""Rendering of a scene as a sequence in the layout of the TUM RGB-D benchmark."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from v3d_torch.datasets.demo.camera_trajectory import camera_pose
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.room import build_room
+from v3d_torch.datasets.demo.scene import Scene
+from v3d_torch.datasets.demo.scenes import SCENES
 from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -34,23 +34,27 @@ Progress = Callable[[int, int], None]
 """Called with the number of frames done and the number of all frames."""
 
 
-def write_sequence(folder: Path, frames: range = range(FRAME_COUNT), progress: Progress | None = None) -> None:
-    """Render frames of the demo into an empty folder.
+def write_sequence(
+    folder: Path, frames: range = range(FRAME_COUNT), progress: Progress | None = None, name: str = "demo"
+) -> None:
+    """Render frames of a built-in sequence into an empty folder.
 
     Args:
-        folder: Folder for ``rgb/``, ``depth/``, ``masks/`` and the lists; created if missing.
+        folder: Folder for ``rgb/``, ``depth/``, ``masks/``, ``instances/`` and the lists; created if missing.
         frames: Indices of the frames to render; the bytes of a frame do not depend on the others.
         progress: Called after every frame.
+        name: Name of the sequence.
     """
-    for name in ("rgb", "depth", "masks"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
+    for subfolder in ("rgb", "depth", "masks", "instances"):
+        (folder / subfolder).mkdir(parents=True, exist_ok=True)
+    scene = SCENES[name](SEED)
     with _single_thread():
-        renderer = Renderer(build_room(SEED), CAMERA)
+        renderer = Renderer(scene, CAMERA)
         for done, index in enumerate(frames, start=1):
             _write_frame(folder, renderer, index)
             if progress is not None:
                 progress(done, len(frames))
-    _write_lists(folder, frames)
+    _write_lists(folder, scene, frames)
 
 
 @contextmanager
@@ -70,7 +74,7 @@ def _stamp(index: int) -> str:
 
 def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:
     time = index / FRAME_RATE
-    rendering = renderer(camera_pose(time), time)
+    rendering = renderer(renderer.scene.trajectory.pose(time), time)
     generator = torch.Generator().manual_seed(SEED * 100_003 + index)  # a different seed for each frame
     colour = simulate_colour(rendering.colour, generator).numpy()
     depth = simulate_depth(rendering.depth, CAMERA, generator).numpy()
@@ -78,6 +82,7 @@ def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:
     _write_image(folder / "rgb" / f"{stamp}.jpg", np.ascontiguousarray(colour[..., ::-1]))
     _write_image(folder / "depth" / f"{stamp}.png", (depth * CAMERA.depth_scale).round().astype(np.uint16))
     _write_image(folder / "masks" / f"{stamp}.png", rendering.motion_mask.numpy())
+    _write_image(folder / "instances" / f"{stamp}.png", rendering.instance_mask.numpy())
 
 
 def _write_image(path: Path, image: Image) -> None:
@@ -86,10 +91,10 @@ def _write_image(path: Path, image: Image) -> None:
     path.write_bytes(encoded.tobytes())
 
 
-def _write_lists(folder: Path, frames: range) -> None:
-    """Write the image lists, the ground truth and the camera file."""
+def _write_lists(folder: Path, scene: Scene, frames: range) -> None:
+    """Write the image lists, the ground truth, the camera file and the classes of the instances."""
     stamps = [_stamp(index) for index in frames]
-    poses = np.stack([camera_pose(index / FRAME_RATE) for index in frames])
+    poses = np.stack([scene.trajectory.pose(index / FRAME_RATE) for index in frames])
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     groundtruth = [
         f"{stamp} " + " ".join(f"{value:.9f}" for value in (*T_wc[:3, 3], *q))
@@ -107,5 +112,7 @@ def _write_lists(folder: Path, frames: range) -> None:
             f"readout: {CAMERA.readout}  # seconds from the first row to the last",
         ],
     }
+    labels = [f"{instance}: {label}" for instance, label in sorted(scene.labels.items())]
+    (folder / "instances" / "labels.yaml").write_text("\n".join(labels) + "\n", encoding="utf-8")
     for name, lines in lists.items():
         (folder / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
