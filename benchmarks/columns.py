@@ -57,6 +57,14 @@ CALIBRATION = {
     "result": "result",
 }
 
+PLAUSIBILITY = {
+    "sequence": "sequence",
+    "frames": "frames",
+    "change": "wrong",
+    "result": "result",
+    "warnings": "warnings",
+}
+
 SEGMENTATION = {
     "network": "network",
     "ms": "ms",

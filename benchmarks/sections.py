@@ -120,6 +120,18 @@ def calibration_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     yield from part(text, flat(rows_of(measurements), columns.CALIBRATION), measurements, "sequence")
 
 
+def plausibility_section(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the section on the plausibility check."""
+    yield "## Plausibility of camera and depth"
+    text = (
+        "The camera file, the depth images or the colour images of each sequence are made wrong, and its first frames"
+        " are run. The check should name what is wrong, and nothing in a right sequence. A camera that stands still"
+        " tells neither its focal length nor a delay of depth."
+    )
+    table = pivot(rows_of(measurements), "change", "sequence", "result")
+    yield from part(text, table, measurements, "sequence")
+
+
 def consistency_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the covariance of poses."""
     yield "## Covariance of poses"
@@ -279,6 +291,7 @@ SECTIONS: Sequence[tuple[tuple[str, ...], Callable[..., Iterator[str]]]] = (
     (("growth", "keyframes"), growth_section),
     (("lost",), lost_section),
     (("calibration",), calibration_section),
+    (("plausibility",), plausibility_section),
     (("consistency",), consistency_section),
     (("ablation",), objects_section),
     (("tracks",), tracks_section),

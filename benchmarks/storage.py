@@ -32,6 +32,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "modules": ("function", "batch", "competitor"),
     "occupancy": ("quantity",),
     "occupancy_costs": ("sequence",),
+    "plausibility": ("sequence", "change"),
     "primitives": ("primitive", "size", "threads", "competitor"),
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "contender"),

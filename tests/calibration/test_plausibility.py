@@ -69,13 +69,19 @@ def test_warning_about_depth_that_is_not_registered() -> None:
     assert found is not None and int(found[1]) == pytest.approx(20, abs=1) and int(found[2]) == pytest.approx(10, abs=1)
 
 
+def test_warning_about_depth_that_is_not_registered_if_the_camera_stands_still() -> None:
+    """Its views tell no delay, but a shift alone explains them."""
+    warnings = check(*make_views(6, shift=(20, -10), moving=False))
+    assert any(warning.startswith("the depth images seem to be shifted by ") for warning in warnings)
+
+
 @pytest.mark.parametrize(("delay", "text"), [(0.1, "0.10 s after"), (-0.08, "0.08 s before")])
 def test_warning_about_depth_of_another_time(delay: float, text: str) -> None:
     (warning,) = check(*make_views(6, delay=delay))
     assert warning.startswith(f"the depth images seem to be taken {text} the time of their timestamps")
 
 
-@pytest.mark.parametrize("factors", [(2.0, 2.0), (0.5, 1.0)])
+@pytest.mark.parametrize("factors", [(2.0, 2.0), (0.5, 1.0), (0.5, 0.5)])
 def test_warning_about_a_wrong_focal_length(factors: tuple[float, float]) -> None:
     wrong = replace(
         TRUE, fx=factors[0] * TRUE.fx, fy=factors[1] * TRUE.fy, cx=factors[0] * TRUE.cx, cy=factors[1] * TRUE.cy

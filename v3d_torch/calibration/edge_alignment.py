@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 import torch
@@ -122,18 +122,40 @@ class EdgeAlignment:
         """Number of views with boundaries."""
         return len(self._edges)
 
-    def search(self) -> Tensor:
-        """Find the best shift and delay on a coarse grid, as in `Misalignment`."""
-        reach, shifts = _REACH // self._stride, torch.arange(-(_SHIFTS // self._stride), _SHIFTS // self._stride + 1)
+    def search(self, free: Sequence[int] = (0, 1, 2)) -> Tensor:
+        """Find the best shift and delay on a coarse grid, as in `Misalignment`.
+
+        Args:
+            free: Indices of the values that can differ from 0.
+        """
+        delays, shifts_v, shifts_u = (
+            axis if index in free else torch.zeros(1, dtype=axis.dtype)
+            for index, axis in zip((2, 1, 0), self._grid, strict=True)
+        )
+        total = self._grid_scores
+        for dimension, (axis, used) in enumerate(zip(self._grid, (delays, shifts_v, shifts_u), strict=True)):
+            if len(used) == 1:
+                total = total.narrow(dimension, int((axis == 0).nonzero()), 1)
+        t, v, u = np.unravel_index(int(total.argmax()), total.shape)
+        return torch.stack([shifts_u[u] * self._stride, shifts_v[v] * self._stride, delays[t]]).to(torch.float64)
+
+    @property
+    def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Delays, shifts along v and shifts along u of the coarse search; seconds and view pixels."""
+        shifts = torch.arange(-(_SHIFTS // self._stride), _SHIFTS // self._stride + 1)
+        return _DELAYS, shifts, shifts
+
+    @cached_property
+    def _grid_scores(self) -> Tensor:
+        """Approximate total score at each delay, shift along v and shift along u, (T, S, S)."""
+        reach, shifts = _REACH // self._stride, self._grid[1]
         maps = torch.stack([_correlation(edges, reach) for edges in self._edges])
         maps = pad(maps, (1, 1, 1, 1))  # beyond the maximum displacement, use the mean, 0
         motion = torch.stack([self._mean_motion(float(delay)) for delay in _DELAYS])  # (T, K, 2)
         index = (motion[..., None] + shifts).round().long().clamp(-reach - 1, reach + 1) + reach + 1
         column, row = index[:, :, 0, None, :], index[:, :, 1, :, None]
         view = torch.arange(len(maps))[None, :, None, None]
-        total = maps[view, row, column].sum(dim=1)  # (T, shift v, shift u)
-        t, v, u = np.unravel_index(int(total.argmax()), total.shape)
-        return torch.stack([shifts[u] * self._stride, shifts[v] * self._stride, _DELAYS[t]]).to(torch.float64)
+        return maps[view, row, column].sum(dim=1)
 
     def refine(self, start: Tensor, free: Sequence[int] = (0, 1, 2)) -> Misalignment:
         """Find the local maximum of the scores by Newton steps.

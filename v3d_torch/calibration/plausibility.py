@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.calibration.depth_steps import disparity_step
-from v3d_torch.calibration.edge_alignment import EdgeAlignment
+from v3d_torch.calibration.edge_alignment import EdgeAlignment, Misalignment
 from v3d_torch.calibration.problem import SelfCalibration
 from v3d_torch.calibration.selection import covariance
 from v3d_torch.config import Config
@@ -37,9 +37,16 @@ _MIN_DELAY = 0.05
 """Minimum delay of depth that is reported, seconds: more than half a frame period, the maximum delay of cameras without
 synchronisation."""
 
+_SHIFT, _DELAY = (0, 1), (2,)
+"""Indices of the shift and of the delay of depth in the values of a `Misalignment`."""
+
 _MIN_FOCAL_CHANGE = 0.1
 """Minimum relative error of the focal length that is reported: the focal lengths of cameras of one model differ by a
 fifth of it, and lens distortion that is not modelled changes the estimate by half of it."""
+
+_FOCAL_FACTORS = (0.6, 1.0, 1.7)
+"""Focal lengths relative to the given ones at which the cost is compared. If the given ones are half of the true ones,
+the cost can have another minimum near them: matches that do not fit them have been left out of the map."""
 
 _SIGNIFICANCE = 3.0
 """Number of standard deviations by which an estimate must exceed the limits above."""
@@ -143,25 +150,41 @@ def _check_registration(views: StaticViews, trajectory: Trajectory, camera: Pinh
     if float(first[:2].norm()) < _SUSPICION * _MIN_SHIFT * camera.width and abs(first[2]) < _SUSPICION * _MIN_DELAY:
         return []
     alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _MAX_VIEWS)
-    found = alignment.refine(alignment.search())
+    delayed, shifted = (alignment.refine(alignment.search(free), free) for free in (_DELAY, _SHIFT))
+    # The simplest explanation that is better than none, and of two the one that is better.
+    nothing = torch.zeros(3, dtype=torch.float64)
+    likelier = max((delayed, shifted), key=lambda each: alignment.total_score(each.values))
+    if alignment.is_better(likelier.values, nothing) and (warnings := _warn_of(likelier, camera)):
+        return warnings
+    both = alignment.refine(alignment.search())
+    for simpler, free in ((delayed, _SHIFT), (shifted, _DELAY)):
+        if alignment.is_better(both.values, simpler.values) and (warnings := _warn_of(both, camera, free)):
+            return warnings
+    return []
+
+
+def _warn_of(found: Misalignment, camera: PinholeCamera, free: tuple[int, ...] = (*_SHIFT, *_DELAY)) -> list[str]:
+    """Return a sentence on a shift or a delay that is significantly larger than what cameras have, or nothing.
+
+    Args:
+        found: Shift and delay.
+        camera: Camera of the frames.
+        free: Indices of the values that are judged.
+    """
     shift, delay = found.values[:2], float(found.values[2])
     margin = _SIGNIFICANCE * found.sigma
-    if float(shift.norm() - margin[:2].norm()) > _MIN_SHIFT * camera.width:
-        registered = alignment.refine(torch.tensor([0.0, 0.0, delay], dtype=torch.float64), free=(2,))
-        if alignment.is_better(found.values, registered.values):
-            u, v = (-shift).round().int().tolist()
-            return [
-                f"the depth images seem to be shifted by ({u}, {v}) pixels against the colour images; export depth that"
-                " is registered to the colour image"
-            ]
-    if abs(delay) - float(margin[2]) > _MIN_DELAY:
-        simultaneous = alignment.refine(torch.zeros(3, dtype=torch.float64), free=(0, 1))
-        if alignment.is_better(found.values, simultaneous.values):
-            side = "after" if delay > 0 else "before"
-            return [
-                f"the depth images seem to be taken {abs(delay):.2f} s {side} the time of their timestamps, relative to"
-                " the colour images; correct the timestamps, or state depth_delay in the camera file"
-            ]
+    if free != _DELAY and float(shift.norm() - margin[:2].norm()) > _MIN_SHIFT * camera.width:
+        u, v = (-shift).round().int().tolist()
+        return [
+            f"the depth images seem to be shifted by ({u}, {v}) pixels against the colour images; export depth that"
+            " is registered to the colour image"
+        ]
+    if free != _SHIFT and abs(delay) - float(margin[2]) > _MIN_DELAY:
+        side = "after" if delay > 0 else "before"
+        return [
+            f"the depth images seem to be taken {abs(delay):.2f} s {side} the time of their timestamps, relative to"
+            " the colour images; correct the timestamps, or state depth_delay in the camera file"
+        ]
     return []
 
 
@@ -172,11 +195,16 @@ def _check_focal_length(tables: MapTables, camera: PinholeCamera, config: Config
         return []
     names = ("fx", "fy", "cx", "cy")  # a wrong principal point would change the focal lengths
     given = problem.given_values(names)
-    _, at = problem.linearise(names, given, problem.T_cw, problem.points)
+    scales = torch.tensor([[factor, factor, 1.0, 1.0] for factor in _FOCAL_FACTORS], dtype=torch.float64)
+    tried = [problem.linearise(names, given * scale, problem.T_cw, problem.points) for scale in scales]
+    best = min(range(len(tried)), key=lambda index: float(tried[index][0]))
+    at = tried[best][1]
     step = torch.linalg.pinv(at.hessian.sum(dim=0), hermitian=True) @ at.gradient.sum(dim=0)
-    if not bool(((step / given).abs()[:2] > _SUSPICION * _MIN_FOCAL_CHANGE).any()):
+    if not bool(((scales[best] - step / given - 1).abs()[:2] > _SUSPICION * _MIN_FOCAL_CHANGE).any()):
         return []
-    values, at = problem.minimise(names)
+    starts = [given] if bool((scales[best] == 1).all()) else [given, given * scales[best]]
+    minima = [problem.minimise(names, start) for start in starts]
+    values, at = min(minima, key=lambda found: float(problem.linearise(names, found[0], *found[1][:2])[0]))
     sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
     change = (values / given).log().abs() - _SIGNIFICANCE * sigma / values
     if not bool((change[:2] > _MIN_FOCAL_CHANGE).any()):
