@@ -79,6 +79,18 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
         change(landmarks=lambda _: torch.zeros(9999).long()),
         r"landmarks is torch.int64 of shape \(9999",
     ),
+    (
+        "describe_appearance",
+        torch.Tensor.double,
+        r"describe_appearance is torch.float64 of shape \(2, \d+\), expected a",
+    ),
+    ("describe_appearance", lambda x: x[:1], r"describe_appearance is .* \(1, \d+\), expected .* of shape \(2, D\)$"),
+    ("estimate_state", lambda state: state.T_wc, "estimate_state returned a Tensor; it must return CameraState"),
+    (
+        "estimate_state",
+        change(covariance=lambda x: x[:3, :3]),
+        r"estimate_state\.covariance is .* \(3, 3\), .* \(6, 6\)$",
+    ),
     ("track_camera", change(status=str), r"track_camera\.status is a str, expected a TrackingStatus"),
 ]
 

@@ -16,6 +16,7 @@ from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
+from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
 
 _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
@@ -47,6 +48,13 @@ _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
         "static_without_people": (torch.bool, ("H", "W")),
         "vote_pairs": list,
     },
+    CameraState: {
+        "stamp": float,
+        "T_wc": (torch.float64, (4, 4)),
+        "status": TrackingStatus,
+        **dict.fromkeys(("covariance", "twist_covariance", "cross_covariance"), (torch.float64, (6, 6))),
+        "twist": (torch.float64, (6,)),
+    },
     FramePose: {"status": TrackingStatus, "T_cw": (torch.float64, (4, 4)), "landmarks": (torch.int64, ("N",))},
 }
 """Fields of each class that a stage returns: dtype and shape of tensors, else the type."""
@@ -64,8 +72,10 @@ _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] |
     "free_space_check": (NewlyOccupied, lambda *_: {}),
     "propose_unlabelled": (Instances, lambda occupied, instances, depth: _image_size(depth)),
     "back_project_instances": (InstanceClouds, lambda depth, instances: {"N": len(instances), **_image_size(depth)}),
+    "describe_appearance": ((torch.float32, ("N", "D")), lambda image, masks: {"N": len(masks)}),
     "classify_motion": (FrameObjects, lambda instances, clouds, view, *_: _image_size(view.depth)),
     "track_camera": (FramePose, lambda features, *_: {"N": len(features)}),
+    "estimate_state": (CameraState, lambda *_: {}),
     **dict.fromkeys(("motion_model", "refine_previous", "mapper", "back_end", "loop_closer")),
 }
 """Expected result of each stage, and a function that returns the sizes given by the stage's arguments; None if the

@@ -246,8 +246,6 @@ class DenseOdometryConfig(Section):
     halvings: tuple[int, ...] = (4, 2, 1)
     """Number of times that the image is halved for each pyramid level, coarse to fine. A shift of 60 pixels between
     frames is about 4 pixels at the coarsest level."""
-    max_points: int = Field(5000, gt=0)
-    """Approximate number of pixels used at a level, one per grid cell; it bounds the time."""
     iterations: int = Field(10, gt=0)
     """Maximum number of Levenberg-Marquardt steps at a level."""
     max_depth: float = Field(8.0, gt=0)
@@ -298,8 +296,6 @@ class RollingShutterConfig(Section):
     readout_sigma: float = Field(0.015, gt=0)
     """Standard deviation of the initial readout, seconds: a global shutter and the slowest rolling shutter are both
     within two standard deviations."""
-    calibration_keyframes: int = Field(20, ge=0)
-    """Number of keyframes at the start of which each updates the readout; later every tenth does."""
 
 
 class MappingConfig(Section):

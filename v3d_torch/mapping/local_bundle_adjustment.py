@@ -24,8 +24,9 @@ _COST_TOLERANCE = 1e-5
 """Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations, so
 a smaller change is a small fraction of one; the adjustment of the next keyframe continues from the result."""
 
-_LATE_CALIBRATION_INTERVAL = 10
-"""Interval of the readout calibration after the first keyframes, in keyframes; the camera can rotate more later."""
+_CALIBRATION_KEYFRAMES, _LATE_CALIBRATION_INTERVAL = 20, 10
+"""Number of keyframes at the start that each calibrate the readout, and interval of the keyframes that do so later: by
+then the readout is known well, but the camera can rotate more later."""
 
 
 @dataclass(frozen=True)
@@ -105,5 +106,5 @@ def local_bundle_adjust(
 
 def _is_calibration_due(sparse_map: SparseMap, keyframe: Keyframe, config: RollingShutterConfig) -> bool:
     """Check whether the adjustment of a new keyframe calibrates the readout."""
-    is_due = keyframe.index <= config.calibration_keyframes or keyframe.index % _LATE_CALIBRATION_INTERVAL == 0
+    is_due = keyframe.index <= _CALIBRATION_KEYFRAMES or keyframe.index % _LATE_CALIBRATION_INTERVAL == 0
     return is_due and config.enabled and not sparse_map.readout.is_certain

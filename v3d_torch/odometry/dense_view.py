@@ -18,6 +18,9 @@ from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian
 
+_MAX_POINTS = 5000
+"""Approximate number of reference points of a level, one per grid cell: more points take more time and add little."""
+
 
 @dataclass(frozen=True)
 class LevelCamera:
@@ -101,7 +104,7 @@ class Level:
         inverse_depth = self.channels[1]
         same_surface = (2 * gradient[1].abs() <= self.config.edge_ratio * inverse_depth).all(dim=0)
         strength = gradient[0].square().sum(dim=0).where(inverse_depth.isfinite(), torch.nan).nan_to_num(nan=-1.0)
-        cell = max(1, round((inverse_depth.numel() / self.config.max_points) ** 0.5))
+        cell = max(1, round((inverse_depth.numel() / _MAX_POINTS) ** 0.5))
         strongest, index = max_pool2d(strength[None], cell, ceil_mode=True, return_indices=True)
         index = index[strongest >= 0]
 
