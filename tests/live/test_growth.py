@@ -1,4 +1,4 @@
-"""Size of the state in a long live run in one place: only poses and culled keyframes are added."""
+"""Size of the state in a long live run in one place: only poses and culled keyframes are added, also with occupancy."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from helpers.paced_frames import paced
 from helpers.walk_run import CAMERA, CONFIG, FORWARD, Walk, segment_red
 
+from v3d_torch.config.loading import override_config
 from v3d_torch.live import LiveSLAM
 from v3d_torch.segmentation import UprightSegmenter
 from v3d_torch.slam import V3DSLAM
@@ -30,7 +31,8 @@ def back_and_forth() -> Iterator[RGBDFrame]:
 
 
 def test_state_of_a_long_run_in_one_place_stays_bounded() -> None:
-    slam = V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG)
+    config = override_config(CONFIG, ["occupancy.enabled=true", "occupancy.interval=1", "occupancy.max_views=20"])
+    slam = V3DSLAM(CAMERA, UprightSegmenter(segment_red), config)
     sizes: list[dict[str, int]] = []
     for result in LiveSLAM(paced(back_and_forth(), slam), slam):
         if (result.frame.index + 1) % TURN == 0:

@@ -34,6 +34,12 @@ def test_camera_at_rest_has_at_least_the_nominal_noise() -> None:
     for n in range(500):
         noise.update(n / 30, torch.eye(4, dtype=torch.float64), NOMINAL)
     torch.testing.assert_close(noise.scale(NOMINAL), NOMINAL)
+    torch.testing.assert_close(noise.scale(NOMINAL, variance=3.0), NOMINAL)  # the map has no more noise than its frames
+
+
+def test_noise_of_the_map_multiplies_that_of_a_frame() -> None:
+    noise = PoseNoise()  # the prior ratio is far above the minimum
+    torch.testing.assert_close(noise.scale(NOMINAL, variance=3.0), 3 * noise.scale(NOMINAL))
 
 
 def test_windows_over_interruptions_do_not_count() -> None:

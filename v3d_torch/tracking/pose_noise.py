@@ -68,10 +68,16 @@ class PoseNoise:
         """Start a new sequence of poses, after a frame without a pose or a jump of the pose."""
         self._window = []
 
-    def scale(self, covariance: Tensor) -> Tensor:
-        """Covariance of a pose, given its nominal covariance, both float64 of shape :math:`(6, 6)`."""
+    def scale(self, covariance: Tensor, variance: float = 1.0) -> Tensor:
+        """Covariance of a pose, given its nominal covariance, both float64 of shape :math:`(6, 6)`.
+
+        Args:
+            covariance: Nominal covariance.
+            variance: Variance of its error relative to the variance of a frame, see `MapNoise`. The minimum ratio is
+                that of the whole error.
+        """
         ratios, axes = torch.linalg.eigh(self._sum / self._weight)
-        root = torch.linalg.cholesky(covariance) @ axes * ratios.clamp(min=_MIN_RATIO).sqrt()
+        root = torch.linalg.cholesky(covariance) @ axes * (variance * ratios).clamp(min=_MIN_RATIO).sqrt()
         return root @ root.T
 
     def state_dict(self) -> dict[str, Any]:

@@ -136,7 +136,7 @@ class StateEstimator:
         nominal = torch.linalg.inv(information + _MIN_INFORMATION * torch.eye(6, dtype=torch.float64))
         self._pose_noise.update(stamp, T_wc, nominal)
         self._frame_noise, self._owners = self._pose_noise.scale(nominal), owners
-        return self._frame_noise * (1 + self._map_noise(owners))
+        return self._pose_noise.scale(nominal, 1 + self._map_noise(owners))
 
     def _filter_measured(self, stamp: float, T_wc: Tensor, motion: CameraMotion) -> None:
         """Update the filter with a pose; restart it if the previous motion was not measured."""
