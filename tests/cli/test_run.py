@@ -89,7 +89,9 @@ def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
     metrics = json.loads((first_out / "metrics.json").read_text())
     assert metrics["ate"]["rmse"] < 0.005
     assert metrics["tracked"] == metrics["frames"] == 30
+    assert metrics["readout"] == metrics["readout_sigma"] == 0.0  # as the camera file of the demo states
     log = (first_out / "run.log").read_text().splitlines()
+    assert any(line.endswith("readout: 0.0000 s, as the camera states") for line in log)
     assert sum("frame" in line and "tracked" in line for line in log) == 30
 
 

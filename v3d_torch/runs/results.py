@@ -193,6 +193,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
+        "readout_sigma": slam.map.readout.sigma,
         "warnings": run.warnings,
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "failure": failure,
