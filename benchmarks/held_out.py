@@ -1,7 +1,7 @@
 """ATE with calibrated cameras on frames that were not used to calibrate them, as Markdown.
 
-``python benchmarks/held_out.py --seqs demo`` makes the camera of each sequence wrong, calibrates it on the first half of
-the frames, and runs the second half with the right, the wrong and the calibrated camera.
+``python benchmarks/held_out.py --seqs demo`` makes the camera of each sequence wrong, calibrates it on the first half
+of the frames, and runs the second half with the right, the wrong and the calibrated camera.
 """
 
 from __future__ import annotations
