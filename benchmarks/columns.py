@@ -57,6 +57,15 @@ CALIBRATION = {
     "result": "result",
 }
 
+HELD_OUT = {
+    "sequence": "sequence",
+    "change": "wrong in the camera file",
+    "taken": "taken from the first half",
+    "right": "right camera, ATE, m",
+    "given": "wrong camera, ATE, m",
+    "calibrated": "calibrated camera, ATE, m",
+}
+
 PLAUSIBILITY = {
     "sequence": "sequence",
     "frames": "frames",

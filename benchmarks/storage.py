@@ -25,6 +25,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "consistency": ("sequence", "configuration"),
     "design_choices": ("choice", "sequence"),
     "growth": ("sequence", "frames"),
+    "held_out": ("sequence", "change"),
     "keyframes": ("keyframes",),
     "lost": ("sequence", "interruption"),
     "map_costs": ("sequence",),

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers.commands import assert_error_line
+from helpers.commands import assert_error_line, call_here
+from helpers.commands import call as run_command
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import ablation_study
@@ -29,17 +30,8 @@ FRAMES = 6
 
 
 def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, list(map(str, arguments)), env={"V3D_DATA": "", "NO_COLOR": "1"})
-
-
-def shell(module: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(  # noqa: S603
-        [sys.executable, "-m", "v3d_torch", module, *map(str, arguments)],
-        env=os.environ | {"NO_COLOR": "1"},
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
+    environment = {"V3D_DATA": "", "NO_COLOR": "1", "COLUMNS": "80"}
+    return CliRunner().invoke(app, list(map(str, arguments)), env=environment)
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -56,9 +48,9 @@ def sequence(moment: Path) -> Path:
 def done(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Folder and screen output of the whole study with one seed."""
     out = tmp_path_factory.mktemp("study") / "out [a]"
-    process = shell("ablate", "--seq", sequence, "--seeds", "1", "--out", out)
-    assert process.returncode == 0, process.stderr
-    return out, process.stdout
+    result = call("--seq", sequence, "--seeds", "1", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    return out, result.stdout
 
 
 # --- the study
@@ -103,14 +95,12 @@ def test_csv_matches_metrics_of_runs(done: tuple[Path, str]) -> None:
     assert moving["baseline"] == 0.0 and moving["full"] > 0.5
 
 
-@pytest.mark.parametrize("variant", ["paper", "no_prediction"])
+@pytest.mark.parametrize(("variant", "run"), [("paper", run_command), ("no_prediction", call_here)])
 def test_results_are_identical_to_run_command(
-    variant: str, done: tuple[Path, str], sequence: Path, tmp_path: Path
+    variant: str, run: Callable[..., object], done: tuple[Path, str], sequence: Path, tmp_path: Path
 ) -> None:
     """The instances of ``no_prediction`` come from the cache that ``no_voting`` filled."""
-    arguments = ("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path)
-    process = shell("run", *arguments)
-    assert process.returncode == 0, process.stderr
+    run("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path, cwd=tmp_path)
     ours = done[0] / "moment" / variant / "seed0"
     for name in ("trajectory.txt", "dynamics.parquet", "map.ply", "config.yaml"):
         assert (ours / name).read_bytes() == (tmp_path / name).read_bytes(), name

@@ -73,16 +73,10 @@ def work(moment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def done(work: Path) -> subprocess.CompletedProcess[str]:
+def done(work: Path) -> Result:
     """Batch of two sequences, matched by a pattern, and two configurations with two workers; results in ``out``."""
-    arguments = command("--seqs", "*", "--data-root", work / "data", "--configs", "baseline", work / "few.yaml")
-    return subprocess.run(  # noqa: S603
-        [*arguments, "--workers", "2", "--out", str(work / "out")],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
+    arguments = ("--seqs", "*", "--data-root", work / "data", "--configs", "baseline", work / "few.yaml")
+    return call(*arguments, "--workers", "2", "--out", work / "out")
 
 
 RUNS = [(sequence, config) for sequence in ("broken", "good") for config in ("baseline", "few")]
@@ -91,7 +85,7 @@ RUNS = [(sequence, config) for sequence in ("broken", "good") for config in ("ba
 # --- a batch
 
 
-def test_successful_runs_write_all_result_files(done: subprocess.CompletedProcess[str], work: Path) -> None:
+def test_successful_runs_write_all_result_files(done: Result, work: Path) -> None:
     for config, file in (("baseline", None), ("few", work / "few.yaml")):
         folder = work / "out" / "good" / config / "seed0"
         assert files_in(folder) == RUN_FILES
@@ -102,7 +96,7 @@ def test_successful_runs_write_all_result_files(done: subprocess.CompletedProces
     }
 
 
-def test_failed_run_is_reported_and_others_finish(done: subprocess.CompletedProcess[str], work: Path) -> None:
+def test_failed_run_is_reported_and_others_finish(done: Result, work: Path) -> None:
     assert_error_line(done, "2 of 4 runs failed", "--resume")
     image = sorted((work / "data" / "broken" / "rgb").iterdir())[BROKEN_AT]
     lines = done.stdout.splitlines()
@@ -119,12 +113,12 @@ def test_failed_run_is_reported_and_others_finish(done: subprocess.CompletedProc
         assert str(image) in metrics_of(folder)["failure"]
 
 
-def test_output_without_terminal_has_no_progress_bars(done: subprocess.CompletedProcess[str]) -> None:
+def test_output_without_terminal_has_no_progress_bars(done: Result) -> None:
     assert "\x1b" not in done.stdout and "all runs" not in done.stdout
     assert sum(line.startswith(("good, ", "broken, ")) for line in done.stdout.splitlines()) == 4 + 2
 
 
-def test_runs_table_matches_metrics_of_each_run(done: subprocess.CompletedProcess[str], work: Path) -> None:
+def test_runs_table_matches_metrics_of_each_run(done: Result, work: Path) -> None:
     table = pd.read_parquet(work / "out" / "runs.parquet")
     assert list(zip(table["sequence"], table["config"], strict=True)) == RUNS
     assert (table["seed"] == 0).all()
@@ -147,7 +141,7 @@ def test_runs_table_matches_metrics_of_each_run(done: subprocess.CompletedProces
     assert (good["masks_moving_masked"] == 0).all()  # true masks, but no segmentation
 
 
-def test_summaries_match_metrics_of_runs(done: subprocess.CompletedProcess[str], work: Path) -> None:
+def test_summaries_match_metrics_of_runs(done: Result, work: Path) -> None:
     ates = {c: metrics_of(work / "out" / "good" / c / "seed0")["ate"]["rmse"] for c in ("baseline", "few")}
     shown = {c: f"**{ate:.4f}**" if ate == min(ates.values()) else f"{ate:.4f}" for c, ate in ates.items()}
     document = (work / "out" / "summary.md").read_text()
@@ -163,7 +157,7 @@ def test_summaries_match_metrics_of_runs(done: subprocess.CompletedProcess[str],
 
 
 @pytest.fixture(scope="module")
-def repaired(done: subprocess.CompletedProcess[str], work: Path) -> tuple[Path, Result, dict[Path, int]]:
+def repaired(done: Result, work: Path) -> tuple[Path, Result, dict[Path, int]]:
     """Copy of the batch, resumed with one worker after the damaged image was restored.
 
     Returns:

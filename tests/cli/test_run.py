@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import chdir
 from pathlib import Path
 
 import cv2
@@ -20,11 +19,10 @@ import pandas as pd
 import plyfile
 import pytest
 from helpers.bag_messages import read_with_mcap
-from helpers.commands import RUN_FILES, assert_error_line, call, command, environment, files_in
+from helpers.commands import RUN_FILES, assert_error_line, call, call_here, command, environment, files_in
 from helpers.demo_frames import copy_frames
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from v3d_torch.cli import run
 from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
@@ -38,14 +36,6 @@ SWAYER = (1.02, 2.98)
 """Positions of the demo's people on the floor, metres right and away (datasets/demo/scenes/walking.py)."""
 
 
-def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:
-    """Call the command in this process, which has imported everything already."""
-    with chdir(cwd):
-        return CliRunner().invoke(
-            run.app, command(*arguments)[3:], env={"V3D_DATA": None, "COLUMNS": "120", "NO_COLOR": "1", **variables}
-        )
-
-
 @pytest.fixture(scope="session")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One second of the demo in TUM layout, in which the walker crosses the room."""
@@ -55,23 +45,21 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def first_run(
-    sequence: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, subprocess.CompletedProcess[str]]:
+def first_run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     """Results of that second with its own masks, and the output of the command."""
     out = tmp_path_factory.mktemp("first") / "out [b]"
-    done = with_masks(sequence, "--out", out, "--save-masks", "--profile", cwd=out.parent)
-    assert done.returncode == 0, done.stderr
+    done = call_here(*with_masks(sequence), "--out", out, "--save-masks", "--profile", cwd=out.parent)
+    assert done.exit_code == 0, done.stderr
     return out, done
 
 
 @pytest.fixture(scope="session")
-def first_out(first_run: tuple[Path, subprocess.CompletedProcess[str]]) -> Path:
+def first_out(first_run: tuple[Path, Result]) -> Path:
     return first_run[0]
 
 
-def with_masks(sequence: Path, *more: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return call("--seq", sequence, "--segmenter", "masks", "--masks", sequence / "masks", *more, cwd=cwd)
+def with_masks(sequence: Path) -> list[str | Path]:
+    return ["--seq", sequence, "--segmenter", "masks", "--masks", sequence / "masks"]
 
 
 @pytest.fixture
@@ -101,12 +89,14 @@ def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
     metrics = json.loads((first_out / "metrics.json").read_text())
     assert metrics["ate"]["rmse"] < 0.005
     assert metrics["tracked"] == metrics["frames"] == 30
+    assert metrics["readout"] == metrics["readout_sigma"] == 0.0  # as the camera file of the demo states
     log = (first_out / "run.log").read_text().splitlines()
+    assert any(line.endswith("readout: 0.0000 s, as the camera states") for line in log)
     assert sum("frame" in line and "tracked" in line for line in log) == 30
 
 
 def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Path, tmp_path: Path) -> None:
-    arguments = ("--seq", sequence, "--segmenter", "masks", "--masks", sequence / "masks", "--bag", "run.mcap")
+    arguments = (*with_masks(sequence), "--bag", "run.mcap")
     done = call_here(*arguments, "--out", "out", "--save-masks", cwd=tmp_path)
     assert (done.exit_code, done.stderr) == (0, "")
     messages = read_with_mcap(tmp_path / "run.mcap")
@@ -120,7 +110,7 @@ def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Pat
 
 
 def test_run_prints_scores_and_result_folder(
-    first_run: tuple[Path, subprocess.CompletedProcess[str]],
+    first_run: tuple[Path, Result],
 ) -> None:
     out, done = first_run
     assert done.stderr == ""
@@ -128,7 +118,7 @@ def test_run_prints_scores_and_result_folder(
         assert words in done.stdout
 
 
-def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, Result]) -> None:
     out, done = first_run
     frames = 1e3 * pd.read_parquet(out / "frames.parquet").filter(like="seconds_")
     wall, cpu = frames.filter(regex="^seconds_"), frames.filter(regex="^cpu_seconds_")
@@ -166,7 +156,7 @@ def test_saved_masks_are_binary_and_named_by_timestamp(first_out: Path, sequence
 
 def test_results_are_the_same_bytes_with_two_threads(first_out: Path, sequence: Path, tmp_path: Path) -> None:
     """The first run had one thread. This run has two, in another process."""
-    done = with_masks(sequence, "--out", tmp_path, "--set", "threads=2", cwd=tmp_path)
+    done = call(*with_masks(sequence), "--out", tmp_path, "--set", "threads=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
         assert (tmp_path / name).read_bytes() == (first_out / name).read_bytes(), name
@@ -210,7 +200,7 @@ def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: P
 
 
 def test_unknown_key_is_rejected_with_the_nearest_key(sequence: Path, tmp_path: Path) -> None:
-    done = call("--seq", sequence, "--set", "objects.voting.vote_treshold=3", cwd=tmp_path)
+    done = call_here("--seq", sequence, "--set", "objects.voting.vote_treshold=3", cwd=tmp_path)
     assert_error_line(done, "objects.voting.vote_treshold", "objects.voting.vote_threshold")
     assert list(tmp_path.iterdir()) == []
 

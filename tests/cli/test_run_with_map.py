@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 import pytest
 import torch
-from helpers.commands import assert_error_line, call, files_in
+from helpers.commands import assert_error_line, call_here, files_in
 from helpers.walls import CAMERA, Slide
 
 from v3d_torch.datasets.tum_trajectory import read_trajectory
@@ -48,8 +48,8 @@ def first(halves: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     """Results and map of the first recording, with a mesh."""
     out = tmp_path_factory.mktemp("first")
     room = out / "maps" / "room.map"
-    done = call("--seq", halves[0], *OPTIONS, "--mesh", "--save-map", room, "--out", out / "results", cwd=out)
-    assert done.returncode == 0, done.stderr
+    done = call_here("--seq", halves[0], *OPTIONS, "--mesh", "--save-map", room, "--out", out / "results", cwd=out)
+    assert done.exit_code == 0, done.stderr
     return out / "results", room
 
 
@@ -69,8 +69,8 @@ def test_second_recording_is_tracked_in_the_map_of_the_first(
     results, room = first
     before = room.read_bytes()
     more = ("--localise",) if localise else ("--save-map", tmp_path / "grown.map")
-    done = call("--seq", halves[1], *OPTIONS, "--load-map", room, *more, "--out", tmp_path / "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = call_here("--seq", halves[1], *OPTIONS, "--load-map", room, *more, "--out", tmp_path / "out", cwd=tmp_path)
+    assert done.exit_code == 0, done.stderr
     assert room.read_bytes() == before
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     known = json.loads((results / "metrics.json").read_text())["keyframes"]
@@ -91,13 +91,13 @@ def test_second_recording_is_tracked_in_the_map_of_the_first(
 
 
 def test_localise_without_map_is_rejected(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    assert_error_line(call("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
+    assert_error_line(call_here("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_damaged_map_file_is_rejected(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "half.map").write_bytes(first[1].read_bytes()[:5000])
-    done = call("--seq", halves[1], *OPTIONS, "--load-map", "half.map", cwd=tmp_path)
+    done = call_here("--seq", halves[1], *OPTIONS, "--load-map", "half.map", cwd=tmp_path)
     assert_error_line(done, "half.map", "--save-map")
     assert files_in(tmp_path) == {"half.map"}
 
@@ -105,12 +105,12 @@ def test_damaged_map_file_is_rejected(halves: tuple[Path, Path], first: tuple[Pa
 def test_map_of_another_room_is_reported_after_the_results(first: tuple[Path, Path], tmp_path: Path) -> None:
     """The results are still written, with every frame lost."""
     other = write_sequence(tmp_path / "other", Slide(0, 60, step=12, seed=3))
-    done = call("--seq", other, *OPTIONS, "--load-map", first[1], "--out", tmp_path / "out", cwd=tmp_path)
+    done = call_here("--seq", other, *OPTIONS, "--load-map", first[1], "--out", tmp_path / "out", cwd=tmp_path)
     assert_error_line(done, str(first[1]), str(tmp_path / "out"))
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["lost"] == 6
 
 
 def test_unwritable_map_file_is_rejected_before_the_run(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    done = call("--seq", halves[0], *OPTIONS, "--save-map", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
+    done = call_here("--seq", halves[0], *OPTIONS, "--save-map", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
     assert_error_line(done, f"{tmp_path}: cannot be written")
     assert list(tmp_path.iterdir()) == []

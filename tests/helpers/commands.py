@@ -1,13 +1,16 @@
-"""The run command in a subprocess, and assertions on the output of commands."""
+"""The run command in this process or in another one, and assertions on the output of commands."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
 
-from typer.testing import Result
+from typer.testing import CliRunner, Result
+
+from v3d_torch.cli import run
 
 RUN_FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json", "run.log"),
@@ -31,6 +34,14 @@ def call(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.Comp
     return subprocess.run(  # noqa: S603
         command(*arguments), cwd=cwd, env=environment(**variables), capture_output=True, text=True, timeout=500
     )
+
+
+def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:
+    """Call the command in this process, which has imported everything already."""
+    with chdir(cwd):
+        return CliRunner().invoke(
+            run.app, command(*arguments)[3:], env={"V3D_DATA": None, "COLUMNS": "120", "NO_COLOR": "1", **variables}
+        )
 
 
 def assert_error_line(done: subprocess.CompletedProcess[str] | Result, *words: str | Path) -> None:

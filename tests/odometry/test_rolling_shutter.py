@@ -71,6 +71,10 @@ def test_readout_of_a_camera_is_certain_if_given_else_the_prior() -> None:
     assert Readout.from_camera(replace(CAMERA, readout=0.025), prior) == Readout(0.025, math.inf)
 
 
+def test_standard_deviation_of_a_readout() -> None:
+    assert Readout(0.02, 1e4).sigma == pytest.approx(0.01) and GLOBAL_SHUTTER.sigma == 0
+
+
 @pytest.mark.parametrize(
     "attributes", [{"seconds": 0.1, "information": 1.0}, {"seconds": math.nan, "information": 1.0}]
 )

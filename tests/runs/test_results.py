@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,16 @@ import pytest
 import torch
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, run_along_wall
 
+from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.occupancy.occupancy_io import load_occupancy
+from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
+from v3d_torch.runs.run import describe_readout
 
 
 @pytest.fixture(scope="module")
@@ -197,3 +201,15 @@ def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> N
     write_results(tmp_path, again, again.flush())
     for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "dynamics.parquet"):
         assert (tmp_path / name).read_bytes() == (results / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("readout", "text"),
+    [
+        (Readout(0.0, math.inf), "0.0000 s, as the camera states"),
+        (Readout(0.024, 1e6), "0.0240 s, standard deviation 0.0010 s"),
+        (Readout(0.008, 1e4), "0.0080 s is assumed; the images tell it only to 0.0100 s"),
+    ],
+)
+def test_log_says_whether_the_images_tell_the_readout(readout: Readout, text: str) -> None:
+    assert describe_readout(readout, Config().rolling_shutter) == text

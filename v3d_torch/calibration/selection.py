@@ -24,10 +24,13 @@ from v3d_torch.calibration.parameters import (
 )
 from v3d_torch.calibration.problem import AdjustedMap, SelfCalibration
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.optim.jackknife import jackknife_covariance
+from v3d_torch.optim.jackknife import MAX_BLOCKS, jackknife_covariance
 
 MAX_P_VALUE = 1e-3
 """Significance level: maximum probability of a difference by chance with which an estimate is accepted."""
+
+_LONG_BLOCKS = MAX_BLOCKS // 2
+"""Number of the longer blocks with which standard deviations are compared."""
 
 _GRID = 9
 """Rows and columns of the pixels at which the effect of parameters is measured."""
@@ -190,8 +193,10 @@ class ParameterSelection:
 def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
     """Covariance of the free parameters at the minimum.
 
-    It is the jackknife covariance over keyframes, corrected for the degrees of freedom of poses and points. Its lower
-    bound is the inverse of the normal matrix after marginalisation of poses and points by the Schur complement.
+    It is the jackknife covariance over blocks of keyframes, corrected for the degrees of freedom of poses and points.
+    Variances are at least those of longer blocks, because errors can last longer than a block (cf. Flyvbjerg and
+    Petersen, Error estimates on averages of correlated data, 1989), and at least those of the inverse of the normal
+    matrix after marginalisation of poses and points by the Schur complement.
 
     Args:
         problem: Calibration problem.
@@ -201,11 +206,15 @@ def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
         Shape :math:`(C, C)`.
     """
     freedom = problem.residual_count / max(problem.residual_count - problem.unknown_count, 1)
-    jackknife = freedom * jackknife_covariance(at.gradient, at.hessian)
+    jackknife, longer = (
+        freedom * jackknife_covariance(at.gradient, at.hessian, blocks) for blocks in (MAX_BLOCKS, _LONG_BLOCKS)
+    )
     if not jackknife.isfinite().all():
         return jackknife
-    independent = torch.linalg.inv(at.hessian.sum(dim=0) / 2).diagonal()
-    growth = (independent / jackknife.diagonal()).clamp(min=1).sqrt()
+    variances = [torch.linalg.inv(at.hessian.sum(dim=0) / 2).diagonal(), jackknife.diagonal()]
+    if longer.isfinite().all():
+        variances.append(longer.diagonal())
+    growth = (torch.stack(variances).amax(dim=0) / jackknife.diagonal()).sqrt()
     return growth[:, None] * jackknife * growth
 
 

@@ -42,6 +42,11 @@ class Readout:
         """True if the readout is known exactly and needs no calibration."""
         return math.isinf(self.information)
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of ``seconds``, seconds; 0 if the readout is known exactly."""
+        return self.information**-0.5
+
     @classmethod
     def from_camera(cls, camera: PinholeCamera, prior: RollingShutterConfig) -> Readout:
         """The camera's readout if it is known, else the prior.
@@ -65,7 +70,7 @@ class Readout:
             ValueError: If the readout is out of range or not a number.
         """
         seconds, information = float(attributes["seconds"]), float(attributes["information"])
-        if not (abs(seconds) <= MAX_READOUT and information >= 0):
+        if not (abs(seconds) <= MAX_READOUT and information > 0):
             raise ValueError(f"the readout is {seconds} s; expected at most {MAX_READOUT} s")
         return cls(seconds, information)
 

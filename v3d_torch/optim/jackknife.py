@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_MAX_BLOCKS = 10
+MAX_BLOCKS = 10
 """Maximum number of blocks. With ten blocks, the standard deviation is accurate to a quarter of itself, and the blocks
 are long enough for their errors to be nearly uncorrelated."""
 
@@ -13,7 +13,7 @@ MIN_BLOCKS = 4
 """Minimum number of blocks: with fewer, the variance of the t-distribution is not finite."""
 
 
-def jackknife_covariance(gradient: Tensor, hessian: Tensor) -> Tensor:
+def jackknife_covariance(gradient: Tensor, hessian: Tensor, max_blocks: int = MAX_BLOCKS) -> Tensor:
     r"""Covariance of the minimum of a cost that is a sum over groups of observations.
 
     Observations of a group, such as those of one image, have common errors: motion blur, an inaccurate velocity.
@@ -27,6 +27,7 @@ def jackknife_covariance(gradient: Tensor, hessian: Tensor) -> Tensor:
         gradient: First derivatives of each group's cost, in the order of time, float64, shape :math:`(K, C)`. The point
             at which they are taken need not be the minimum: the second derivatives move them to it.
         hessian: Second derivatives of each group's cost, float64, shape :math:`(K, C, C)`.
+        max_blocks: Maximum number of blocks; fewer are longer, so that errors that last longer count.
 
     Returns:
         Covariance of the minimum, shape :math:`(C, C)`. It includes the factor :math:`\nu / (\nu - 2)` of a
@@ -34,7 +35,7 @@ def jackknife_covariance(gradient: Tensor, hessian: Tensor) -> Tensor:
         with information, or if one block has all of the information on a parameter.
     """
     informative = (hessian.diagonal(dim1=1, dim2=2) > 0).any(dim=1)
-    gradient, hessian = (_sum_blocks(each[informative]) for each in (gradient, hessian))
+    gradient, hessian = (_sum_blocks(each[informative], max_blocks) for each in (gradient, hessian))
     total, blocks = hessian.sum(dim=0), len(hessian)
     rest = total - hessian
     if blocks < MIN_BLOCKS or not bool((torch.linalg.eigvalsh(rest)[:, 0] > 0).all()):
@@ -44,8 +45,8 @@ def jackknife_covariance(gradient: Tensor, hessian: Tensor) -> Tensor:
     return (blocks - 1) / blocks * (blocks - 1) / (blocks - 3) * (change.T @ change)
 
 
-def _sum_blocks(values: Tensor) -> Tensor:
+def _sum_blocks(values: Tensor, max_blocks: int) -> Tensor:
     """Sums over blocks of successive rows."""
-    blocks = min(len(values), _MAX_BLOCKS)
+    blocks = min(len(values), max_blocks)
     block = torch.arange(len(values)) * blocks // max(len(values), 1)
     return values.new_zeros(blocks, *values.shape[1:]).index_add_(0, block, values)

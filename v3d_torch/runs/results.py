@@ -202,6 +202,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
+        "readout_sigma": slam.map.readout.sigma,
         "warnings": run.warnings,
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "T_lw": None if (T_lw := slam.T_lw) is None else T_lw.tolist(),

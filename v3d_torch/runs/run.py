@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from v3d_torch.config import RollingShutterConfig
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.datasets.image_sequence import ImageSequence
@@ -17,6 +18,7 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_text
 from v3d_torch.mapping.map_io import StoredMap
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
+from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
@@ -112,6 +114,8 @@ class Run:
         record = self.pipeline(log_and_save)
         self._autosave.end()
         point_map = self.pipeline.flush()
+        slam = self.pipeline.slam
+        _LOG.info("readout: %s", describe_readout(slam.map.readout, slam.config.rolling_shutter))
         from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
 
         evaluation = write_results(self._folder, self.pipeline, point_map)
@@ -119,6 +123,15 @@ class Run:
         if record.failure:
             _LOG.error(record.failure)
         return evaluation
+
+
+def describe_readout(readout: Readout, expected: RollingShutterConfig) -> str:
+    """Return the readout in words, and whether the images tell it."""
+    if readout.is_certain:
+        return f"{readout.seconds:.4f} s, as the camera states"
+    if readout.sigma > expected.readout_sigma / 2:
+        return f"{readout.seconds:.4f} s is assumed; the images tell it only to {readout.sigma:.4f} s"
+    return f"{readout.seconds:.4f} s, standard deviation {readout.sigma:.4f} s"
 
 
 def describe_motion(objects: FrameObjects) -> str:

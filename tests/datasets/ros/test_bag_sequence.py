@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.bags import DEPTH, INFO, KINDS, RGB, Kind, Message, MessageFactory
+from helpers.commands import call_here
 from helpers.demo_frames import copy_frames
 from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of
 
@@ -241,14 +240,8 @@ def test_run_on_a_bag_of_the_demo_is_accurate(tmp_path: Path) -> None:
             messages.append((f"/kinect/{kind}/image", frame.stamp, make.image(frame.stamp, encoding, pixels)))
     bag = make.write(tmp_path / "demo", messages)
     arguments = ["--seq", bag, "--info-topic", "/kinect/rgb/info", "--segmenter", "none", "--out", tmp_path / "out"]
-    done = subprocess.run(  # noqa: S603
-        [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        env={**os.environ, "NO_COLOR": "1"},
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    done = call_here(*arguments, cwd=tmp_path)
+    assert (done.exit_code, done.stderr) == (0, "")
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert (metrics["sequence"], metrics["frames"], metrics["tracked"]) == ("demo", 10, 10)
     trajectory = read_trajectory(tmp_path / "out" / "trajectory.txt")

@@ -1,0 +1,87 @@
+"""Calibration of a camera from views and measured poses: delay and depth scale; `test_selection` has the intrinsics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from helpers.board_room import CAMERA, make_views
+
+from v3d_torch.calibration import camera_calibration
+from v3d_torch.calibration.camera_calibration import Calibration, calibrate_camera
+from v3d_torch.calibration.selection import AGREES, NOT_TOLD, Estimate
+from v3d_torch.config import Config
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.types import Trajectory
+
+COUNT = 12
+
+
+@pytest.fixture(autouse=True)
+def no_intrinsics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the calibration by the map."""
+    monkeypatch.setattr(camera_calibration, "SelfCalibration", lambda *_: None)
+    monkeypatch.setattr(camera_calibration, "ParameterSelection", lambda _: SimpleNamespace(estimates=()))
+
+
+def calibrate(scale: float | None = None, delay: float = 0.0, given: PinholeCamera = CAMERA) -> Calibration:
+    """Calibrate from views with a delay of depth.
+
+    Args:
+        scale: Size of the measured trajectory relative to the estimated one; None without measured poses.
+        delay: Time of the depth image minus time of the colour image, seconds.
+        given: Given camera.
+    """
+    views, _ = make_views(COUNT, delay=delay)
+    _, trajectory = make_views(COUNT)
+    groundtruth = None
+    if scale is not None:
+        T_wc = trajectory.T_wc.clone()
+        noise = torch.randn(len(T_wc), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        T_wc[:, :3, 3] = scale * (T_wc[:, :3, 3] + 0.0001 * noise)
+        groundtruth = Trajectory(trajectory.stamps, T_wc)
+    return calibrate_camera(MapTables(), views, trajectory, groundtruth, given, given, Config())
+
+
+def estimate_of(calibration: Calibration, name: str) -> Estimate:
+    return next(each for each in calibration.estimates if each.name == name)
+
+
+def test_delay_of_depth_is_taken() -> None:
+    calibration = calibrate(delay=0.04)
+    estimate = estimate_of(calibration, "depth_delay")
+    assert estimate.taken and estimate.value == pytest.approx(0.04, abs=4 * estimate.sigma)
+    assert calibration.camera.depth_delay == estimate.value
+
+
+def test_depth_scale_is_told_by_measured_poses_only() -> None:
+    """A room of twice the size in metres means half the units per metre."""
+    calibration = calibrate(scale=2.0)
+    estimate = estimate_of(calibration, "depth_scale")
+    assert estimate.taken and estimate.value == pytest.approx(2500.0, rel=1e-3)
+    assert calibration.camera.depth_scale == estimate.value
+    untold = calibrate()
+    estimate = estimate_of(untold, "depth_scale")
+    assert not estimate.taken and estimate.reason == NOT_TOLD and untold.camera.depth_scale == 5000.0
+
+
+def test_right_delay_and_scale_are_left() -> None:
+    calibration = calibrate(scale=1.0)
+    for name in ("depth_delay", "depth_scale"):
+        estimate = estimate_of(calibration, name)
+        assert not estimate.taken and estimate.reason == AGREES
+
+
+def test_depth_in_floating_point_has_no_scale() -> None:
+    calibration = calibrate(scale=2.0, given=replace(CAMERA, depth_scale=None))
+    assert all(each.name != "depth_scale" for each in calibration.estimates)
+    assert calibration.camera.depth_scale is None
+
+
+def test_camera_at_rest_tells_no_delay() -> None:
+    views, trajectory = make_views(COUNT, moving=False)
+    calibration = calibrate_camera(MapTables(), views, trajectory, None, CAMERA, CAMERA, Config())
+    assert estimate_of(calibration, "depth_delay").reason == NOT_TOLD

@@ -1,0 +1,88 @@
+"""Which camera parameters are taken: those that a map tells, and that differ from the given ones."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.calibration_map import TRUE, make_map
+
+from v3d_torch.calibration.problem import SelfCalibration
+from v3d_torch.calibration.selection import (
+    AGREES,
+    NOT_TOLD,
+    Estimate,
+    ParameterSelection,
+    covariance,
+    decide,
+    pixel_effect,
+)
+from v3d_torch.config import Config
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.optim.jackknife import jackknife_covariance
+
+KNOWN = replace(TRUE, readout=0.0)
+
+
+def select(given: PinholeCamera, **settings: float) -> dict[str, Estimate]:
+    """Estimates by name for a map that was built with a camera."""
+    problem = SelfCalibration(make_map(given, KNOWN, **settings), given, Config())
+    return {each.name: each for each in ParameterSelection(problem).estimates}
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "taken", "reason"),
+    [
+        (5.0, 0.1, True, ""),
+        (5.0, 1.1, False, NOT_TOLD),
+        (5.0, math.inf, False, NOT_TOLD),
+        (math.nan, math.nan, False, NOT_TOLD),
+        (2.0, 1.0, False, AGREES),
+    ],
+)
+def test_estimate_is_taken_if_it_is_accurate_and_differs(value: float, sigma: float, taken: bool, reason: str) -> None:
+    estimate = decide("x", 0.0, value, sigma, tolerance=1.0)
+    assert (estimate.taken, estimate.reason) == (taken, reason)
+
+
+def test_nothing_is_taken_if_the_given_camera_is_right() -> None:
+    estimates = select(KNOWN)
+    assert not any(each.taken for each in estimates.values())
+    assert len(estimates) == 11  # focal lengths, centre, five coefficients, inverse-depth offset, readout
+
+
+def test_only_the_group_that_is_wrong_is_taken() -> None:
+    estimates = select(replace(KNOWN, fx=1.08 * TRUE.fx, fy=1.08 * TRUE.fy))
+    assert {name for name, each in estimates.items() if each.taken} == {"fx", "fy"}
+    for name in ("fx", "fy"):
+        each = estimates[name]
+        assert each.given == pytest.approx(1.08 * getattr(TRUE, name))
+        assert abs(each.value - getattr(TRUE, name)) < 4 * each.sigma
+    assert {each.reason for each in estimates.values() if not each.taken} <= {AGREES, NOT_TOLD}
+
+
+def test_camera_at_rest_tells_nothing() -> None:
+    estimates = select(replace(KNOWN, fx=1.08 * TRUE.fx, fy=1.08 * TRUE.fy), swing=torch.zeros(6).double())
+    assert not any(each.taken for each in estimates.values() if each.name in ("fx", "fy", "cx", "cy"))
+
+
+def test_unknown_readout_has_no_given_value() -> None:
+    estimate = select(TRUE)["readout"]
+    assert estimate.given is None
+
+
+def test_errors_that_last_longer_than_a_block_make_the_variance_larger() -> None:
+    """Errors that change their sign only once: blocks of two keyframes take them as independent."""
+    problem = SelfCalibration(make_map(KNOWN, KNOWN, keyframes=20, points=60), KNOWN, Config())
+    _, at = problem.minimise(("fx",))
+    drifting = at._replace(gradient=at.hessian[:, :, 0] * torch.linspace(-1, 1, len(at.hessian))[:, None].double())
+    freedom = problem.residual_count / (problem.residual_count - problem.unknown_count)
+    short = freedom * jackknife_covariance(drifting.gradient, drifting.hessian)
+    assert float(covariance(problem, drifting)) > 1.2 * float(short)
+
+
+def test_effect_of_a_shift_of_the_centre_is_the_shift() -> None:
+    variances = torch.diag(torch.tensor([4.0, 9.0], dtype=torch.float64))
+    assert pixel_effect(replace(TRUE, distortion=(0.0,) * 5), ("cx", "cy"), variances) == pytest.approx(math.sqrt(13))
