@@ -8,12 +8,14 @@ from typing import Any
 
 import yaml
 
+from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
+
 PEERS: Mapping[str, Any] = yaml.safe_load(Path(__file__).with_name("peers.yaml").read_text(encoding="utf-8"))
 
 
 def kind(sequence: str) -> str:
     """Return the kind of a sequence: real, composed, simulated or not described."""
-    if sequence == "demo":
+    if sequence in BUILT_IN_SEQUENCES:
         return "simulated"
     return PEERS["sequences"].get(sequence, {}).get("kind", "not described")
 
