@@ -21,11 +21,11 @@ from typing import Any
 
 import descriptions
 from command import add_vocabulary_option, make_parser, publish
-from contenders import PEERS
-from contenders.process import ContenderError, failure, measure
 from heading import make_heading
 from sequences import list_sequences, locate_sequence, trained_vocabulary
 from storage import Measurement, Row
+from systems import PEERS
+from systems.process import SystemRunError, failure, measure
 from tables import unique
 
 from v3d_torch.datasets import load_sequence
@@ -97,7 +97,7 @@ def run_peer(sequence: str, peer: str, turn: int, data_root: Path, vocabulary: P
     try:
         measured = measure(peer, locate_sequence(sequence, data_root), data_root, vocabulary=vocabulary)
         truth = load_sequence(locate_sequence(sequence, data_root), data_root=data_root).groundtruth
-    except (ContenderError, V3DError) as error:
+    except (SystemRunError, V3DError) as error:
         return Outcome(sequence, peer, turn, None, str(error))
     poses = 0 if measured.trajectory is None else len(measured.trajectory)
     metrics: dict[str, Any] = {

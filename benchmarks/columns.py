@@ -120,7 +120,7 @@ PRIMITIVES = {
     "primitive": "primitive",
     "size": "size",
     "threads": "threads",
-    "competitor": "competitor",
+    "implementation": "implementation",
     "ms": "ms",
     "ratio": "ratio",
 }
@@ -128,7 +128,7 @@ PRIMITIVES = {
 MODULES = {
     "function": "function",
     "batch": "batch",
-    "competitor": "competitor",
+    "implementation": "implementation",
     "ms": "ms",
     "ratio": "ratio",
     "error": "error",

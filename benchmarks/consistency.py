@@ -15,12 +15,12 @@ import columns
 import numpy as np
 import torch
 from command import make_parser, publish
-from contenders.ours import OPTIONS, Ours
 from heading import make_heading
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2, norm
 from sequences import locate_sequence
 from storage import Measurement, Row
+from systems.ours import OPTIONS, Ours
 from tables import flat
 from torch import Tensor
 
@@ -200,9 +200,9 @@ def run(sequence: str, configuration: str, options: argparse.Namespace) -> Row:
     source = load_sequence(locate_sequence(sequence, options.data_root), data_root=options.data_root)
     if source.groundtruth is None:
         raise InputError(f"{sequence}: has no ground truth; choose another sequence")
-    contender = Ours(source, configuration, seed=0)
-    contender()
-    states = contender.pipeline.record.states
+    system = Ours(source, configuration, seed=0)
+    system()
+    states = system.pipeline.record.states
     T_wc = torch.eye(4, dtype=torch.float64).repeat(len(states), 1, 1)
     T_wc[:, :3] = states["T_wc"]
     errors = calibrated_errors(source.groundtruth, states["stamp"], T_wc, states["covariance"].to(torch.float64))

@@ -17,11 +17,11 @@ import columns
 import psutil
 import torch
 from command import make_parser, publish
-from contenders.ours import Ours
 from heading import make_heading
 from replay import Replay, back_and_forth
 from sequences import locate_sequence
 from storage import Measurement, Row
+from systems.ours import Ours
 from tables import flat
 from timing import timed
 from torch import Tensor

@@ -1,8 +1,8 @@
 """Times and errors of the camera modules beside theseus, PyPose, GTSAM, OpenCV, Kornia, kornia-rs, Open3D and evo.
 
-``python benchmarks/modules.py`` prints a table for batches of 1, 8 and 64 problems, with one thread. All competitors
-get the same problems and take turns in random order, so that a busy machine slows all of them. A time is the median
-over the turns; ``ratio`` is the median of the peer's time divided by ours in the same turn: above 1 ours is faster.
+``python benchmarks/modules.py`` prints a table for batches of 1, 8 and 64 problems, with one thread. All
+implementations get the same problems and take turns in random order, so that a busy machine slows all of them. A time
+is the median over the turns; ``ratio`` is the median of the peer's time divided by ours in the same turn: above 1 ours is faster.
 Peers without batches solve the problems one after the other. Factor graphs of GTSAM and theseus are built beforehand.
 """
 
@@ -18,7 +18,7 @@ import cv2
 import torch
 import typer
 from heading import make_heading
-from module_contests import CONTESTS
+from module_problems import PROBLEMS
 from rich.console import Console
 from rich.table import Table
 from storage import Measurement, Row
@@ -36,13 +36,13 @@ NOT_INSTALLED = (
 )
 
 
-def contests(functions: list[str], batches: list[int]) -> Iterator[Row]:
+def problems(functions: list[str], batches: list[int]) -> Iterator[Row]:
     """Measure all functions with all batch sizes, and yield the rows."""
     for name in functions:
         slow: set[str] = set()
         for batch in batches:
-            competitors, error = CONTESTS[name](batch)
-            chosen = {key: solve for key, solve in competitors.items() if key not in slow}
+            implementations, error = PROBLEMS[name](batch)
+            chosen = {key: solve for key, solve in implementations.items() if key not in slow}
             errors = {key: error(solve()) for key, solve in chosen.items()}
             times = take_turns(chosen, turns=3)
             for key, values in times.items():
@@ -50,11 +50,11 @@ def contests(functions: list[str], batches: list[int]) -> Iterator[Row]:
                 if median(values) * batches[-1] / batch > 1e3 * MAX_SECONDS:
                     slow.add(key)
                 cells = {"ms": f"{median(values):.2f}", "ratio": f"{ratio:.2f}", "error": f"{errors[key]:.3g}"}
-                yield {"function": name, "batch": str(batch), "competitor": key} | cells
+                yield {"function": name, "batch": str(batch), "implementation": key} | cells
 
 
 def main(
-    functions: list[str] = typer.Option(list(CONTESTS), "--function", help="Function to measure, repeatable."),  # noqa: B008
+    functions: list[str] = typer.Option(list(PROBLEMS), "--function", help="Function to measure, repeatable."),  # noqa: B008
     batches: list[int] = typer.Option(list(BATCHES), "--batch", help="Batch size, repeatable."),  # noqa: B008
     save: bool = typer.Option(False, "--save", help="Store the rows in benchmarks/results."),
 ) -> None:
@@ -62,8 +62,8 @@ def main(
     heading = make_heading(("theseus-ai", "pypose", "gtsam", "opencv-python-headless", "kornia_rs", "open3d", "evo"))
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    rows = list(contests(functions, batches))
-    table = Table("function", "batch", "competitor", "ms", "ratio", "error", title="threads: 1")
+    rows = list(problems(functions, batches))
+    table = Table("function", "batch", "implementation", "ms", "ratio", "error", title="threads: 1")
     for row in rows:
         table.add_row(*row.values(), end_section=False)
     Console().print(table)

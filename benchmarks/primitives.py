@@ -1,8 +1,8 @@
 """Times of the primitives of the object stage beside scikit-learn, Open3D, SciPy, Kornia and torch.cdist.
 
-``python benchmarks/primitives.py`` prints a table for one thread and one for two. All competitors get the same clouds
-and take turns in random order, so that a busy machine slows all of them. A time is the median over the turns; ``ratio``
-is the median of the peer's time divided by ours in the same turn: above 1 ours is faster. It needs open3d and
+``python benchmarks/primitives.py`` prints a table for one thread and one for two. All implementations get the same
+clouds and take turns in random order, so that a busy machine slows all of them. A time is the median over the turns;
+``ratio`` is the median of the peer's time divided by ours in the same turn: above 1 ours is faster. It needs open3d and
 scikit-learn.
 """
 
@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from storage import Measurement, Row
 from storage import save as store
-from timing import OURS, Competitors, take_turns
+from timing import OURS, Implementations, take_turns
 
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.voxel import voxel_pool
@@ -60,7 +60,7 @@ def open3d_cloud(points: np.ndarray) -> o3d.geometry.PointCloud:
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
 
 
-def smoothing() -> Competitors:
+def smoothing() -> Implementations:
     """Depth smoothing, on an image with a fifth of its depth missing."""
     generator = torch.Generator().manual_seed(0)
     depth = 2 + 0.2 * torch.rand(1, 1, 480, 640, generator=generator)
@@ -72,7 +72,7 @@ def smoothing() -> Competitors:
     }
 
 
-def pooling(batch: int, count: int) -> Competitors:
+def pooling(batch: int, count: int) -> Implementations:
     """Voxel pooling to about ``count`` points: nine per cell of the surface, spread over two voxels."""
     clouds = surfaces(batch, count * 9 // 2, VOXEL / 3)
     points, valid = tensors(clouds)
@@ -82,7 +82,7 @@ def pooling(batch: int, count: int) -> Competitors:
     }
 
 
-def clustering(batch: int, count: int) -> Competitors:
+def clustering(batch: int, count: int) -> Implementations:
     """DBSCAN, on pooled clouds."""
     clouds = surfaces(batch, count, VOXEL)
     points, valid = tensors(clouds)
@@ -94,7 +94,7 @@ def clustering(batch: int, count: int) -> Competitors:
     }
 
 
-def selecting(batch: int, count: int) -> Competitors:
+def selecting(batch: int, count: int) -> Implementations:
     """Selection of the largest cluster, among six clusters and noise."""
     labels = torch.from_numpy(np.random.default_rng(0).integers(-1, 6, (batch, count)))
     valid = torch.ones_like(labels, dtype=torch.bool)
@@ -104,7 +104,7 @@ def selecting(batch: int, count: int) -> Competitors:
     }
 
 
-def comparing(batch: int, count: int) -> Competitors:
+def comparing(batch: int, count: int) -> Implementations:
     """Chamfer distance between two samplings of the same surface."""
     previous, current = surfaces(batch, count, VOXEL, seed=1), surfaces(batch, count, VOXEL, seed=2)
     p, q = tensors(previous)[0], tensors(current)[0]
@@ -121,17 +121,17 @@ def comparing(batch: int, count: int) -> Competitors:
         squares = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist").square()
         return squares.amin(dim=1).mean() + squares.amin(dim=0).mean()
 
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: chamfer_distance(p, q),
         "SciPy": lambda: [scipy_chamfer(*pair) for pair in zip(previous, current, strict=True)],
         "Open3D": lambda: [open3d_chamfer(*pair) for pair in zip(previous, current, strict=True)],
     }
     if batch * count**2 < 1e9:  # larger inputs take seconds per turn
-        competitors["torch.cdist"] = lambda: [cdist_chamfer(*pair) for pair in zip(p, q, strict=True)]
-    return competitors
+        implementations["torch.cdist"] = lambda: [cdist_chamfer(*pair) for pair in zip(p, q, strict=True)]
+    return implementations
 
 
-def voting() -> Competitors:
+def voting() -> Implementations:
     """Hough voting, with ten objects."""
     points_a, points_b = np.random.default_rng(0).random((2, 10, 3))
     previous, current = torch.from_numpy(points_a), torch.from_numpy(points_b)
@@ -142,8 +142,8 @@ def voting() -> Competitors:
     }
 
 
-def contests() -> Iterator[tuple[str, str, Competitors]]:
-    """Yield primitive, size and competitors, ours first."""
+def problems() -> Iterator[tuple[str, str, Implementations]]:
+    """Yield primitive, size and implementations, ours first."""
     yield "smooth_depth", "640 x 480", smoothing()
     for batch, count in SIZES:
         size = f"{batch} x {count}"
@@ -155,7 +155,7 @@ def contests() -> Iterator[tuple[str, str, Competitors]]:
 
 
 def main(
-    threads: int = typer.Option(0, min=0, help="Threads of every competitor; 0 runs with one, then with two."),
+    threads: int = typer.Option(0, min=0, help="Threads of every implementation; 0 runs with one, then with two."),
     turns: int = typer.Option(11, min=1, help="Minimum number of turns."),
     save: bool = typer.Option(False, "--save", help="Store the rows in benchmarks/results."),
 ) -> None:
@@ -163,7 +163,7 @@ def main(
     if threads == 0:
         for number in (1, 2):
             # A new process, because OpenMP reads its settings once. PASSIVE: each library has its own OpenMP, whose
-            # idle threads would otherwise spin on the core that the next competitor needs.
+            # idle threads would otherwise spin on the core that the next implementation needs.
             settings = {"OMP_NUM_THREADS": str(number), "OMP_WAIT_POLICY": "PASSIVE"}
             command = [sys.executable, __file__, "--threads", str(number), "--turns", str(turns)]
             command += ["--save"] if save else []
@@ -173,13 +173,13 @@ def main(
     heading = make_heading()
     rows: list[Row] = []
     torch.set_num_threads(threads)
-    table = Table("primitive", "size", "competitor", "ms", "ratio", title=f"threads: {threads}")
-    for name, size, competitors in contests():
-        times = take_turns(competitors, turns)
-        for competitor, values in times.items():
-            head = (name, size) if competitor == OURS else ("", "")
+    table = Table("primitive", "size", "implementation", "ms", "ratio", title=f"threads: {threads}")
+    for name, size, implementations in problems():
+        times = take_turns(implementations, turns)
+        for implementation, values in times.items():
+            head = (name, size) if implementation == OURS else ("", "")
             ratio = median(theirs / ours for theirs, ours in zip(values, times[OURS], strict=True))
-            cells = {"competitor": competitor, "ms": f"{median(values):.2f}", "ratio": f"{ratio:.2f}"}
+            cells = {"implementation": implementation, "ms": f"{median(values):.2f}", "ratio": f"{ratio:.2f}"}
             rows.append({"primitive": name, "size": size, "threads": str(threads)} | cells)
             table.add_row(*head, *cells.values())
         table.add_section()

@@ -68,9 +68,9 @@ def speed_section(measurements: Sequence[Measurement], stages: Sequence[Measurem
     text = (
         "Frames per second, higher is better, and in parentheses CPU ms per frame: user and system time of all"
         " threads and processes, lower is better. The last columns compare frames per second with ORB-SLAM3 in the"
-        " same turn. Images of 640x480 pixels are read and decoded within the time; contenders take turns."
+        " same turn. Images of 640x480 pixels are read and decoded within the time; systems take turns."
     )
-    yield from part(text, speed_table(measurements), measurements, "contender")
+    yield from part(text, speed_table(measurements), measurements, "system")
     if stages:
         text = (
             "Time of each stage, ms per frame. Stages run in parallel with those of the next frame, so that the sum"
@@ -263,7 +263,7 @@ def occupancy_section(measurements: Sequence[Measurement], costs: Sequence[Measu
 def primitives_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the primitives of the object stage."""
     yield "## Primitives of the object stage"
-    text = "Median time; ratio: time of the competitor divided by ours in the same turn, above 1 if ours is faster."
+    text = "Median time; ratio: time of the implementation divided by ours in the same turn, above 1 if ours is faster."
     yield from part(text, flat(rows_of(measurements), columns.PRIMITIVES), measurements)
 
 
@@ -271,9 +271,9 @@ def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the camera modules."""
     yield "## Camera modules"
     text = (
-        "Median time of a batch with one thread; ratio: time of the competitor divided by ours in the same turn, above"
-        " 1 if ours is faster. Competitors without batches solve the problems one after the other; factor graphs of"
-        " GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
+        "Median time of a batch with one thread; ratio: time of the implementation divided by ours in the same turn,"
+        " above 1 if ours is faster. Implementations without batches solve the problems one after the other; factor"
+        " graphs of GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of poses,"
         " millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
         " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to evo,"
         " thousandths."

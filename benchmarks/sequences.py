@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from contenders.vocabulary import vocabulary
+from systems.vocabulary import vocabulary
 
 from v3d_torch.datasets import load_sequence
 

@@ -1,6 +1,6 @@
 """Speed of the whole system beside other systems on the same frames, as Markdown.
 
-``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` runs all contenders in turn, in random order, each in
+``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` runs all systems in turn, in random order, each in
 its own process. `ABOUT` defines the times.
 """
 
@@ -14,18 +14,18 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from command import add_vocabulary_option, make_parser, publish
-from contenders import OURS, PEERS
-from contenders.process import ContenderError, Measured, measure
 from heading import make_heading
 from sequences import locate_sequence, trained_vocabulary
 from storage import Measurement, Row
+from systems import OURS, PEERS
+from systems.process import Measured, SystemRunError, measure
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 
 REFERENCE = "pyorbslam3"
-CONTENDERS = (*OURS, *PEERS)
+SYSTEMS = (*OURS, *PEERS)
 ABOUT = (
     "Each run is a process of its own. Times run from before the first frame is read until the last frame has a pose."
     " They include reading and decoding of the images. They exclude imports, loading of the network or vocabulary,"
@@ -36,19 +36,19 @@ ABOUT = (
 )
 
 Turn = dict[str, Measured | str]
-"""Measurement of each contender, or its error message."""
+"""Measurement of each system, or its error message."""
 
 
 def take_turn(sequence: str, options: argparse.Namespace, vocabulary: Path, order: random.Random) -> Turn:
-    """Run every contender once, in random order."""
+    """Run every system once, in random order."""
     turn: Turn = {}
-    for name in order.sample(CONTENDERS, len(CONTENDERS)):
+    for name in order.sample(SYSTEMS, len(SYSTEMS)):
         load = os.getloadavg()[0]
         try:
             source = locate_sequence(sequence, options.data_root)
             turn[name] = run = measure(name, source, options.data_root, frames=options.frames, vocabulary=vocabulary)
             result = f"{rate(run):.1f} frames per second, {cpu(run):.1f} CPU ms per frame"
-        except ContenderError as error:
+        except SystemRunError as error:
             turn[name] = str(error)
             result = f"failed: {error}"
         print(f"{sequence}, {name}: {result} (load before it {load:.1f})", file=sys.stderr)
@@ -65,9 +65,9 @@ def cpu(run: Measured) -> float:
     return 1e3 * run.cpu_seconds / run.frames
 
 
-def contender_rows(turns: Sequence[Turn]) -> Iterator[Row]:
-    """Yield a row per contender."""
-    for name in CONTENDERS:
+def system_rows(turns: Sequence[Turn]) -> Iterator[Row]:
+    """Yield a row per system."""
+    for name in SYSTEMS:
         runs = [run for turn in turns if isinstance(run := turn[name], Measured)]
         pairs = [
             (run, reference)
@@ -75,7 +75,7 @@ def contender_rows(turns: Sequence[Turn]) -> Iterator[Row]:
             if isinstance(run := turn[name], Measured) and isinstance(reference := turn[REFERENCE], Measured)
         ]
         yield {
-            "contender": name,
+            "system": name,
             "frames": str(runs[0].frames) if runs else "-",
             "fps": format_median_and_range([rate(run) for run in runs], ".1f"),
             "fps_ratio": format_median_and_range([rate(run) / rate(reference) for run, reference in pairs], ".2f"),
@@ -87,12 +87,12 @@ def contender_rows(turns: Sequence[Turn]) -> Iterator[Row]:
 
 
 def speed_table(turns: Sequence[Turn]) -> Iterator[str]:
-    """Yield a line per contender."""
-    columns = ["contender", "frames per second", "ratio", "CPU ms per frame", "ratio", "coverage", "runs failed"]
+    """Yield a line per system."""
+    columns = ["system", "frames per second", "ratio", "CPU ms per frame", "ratio", "coverage", "runs failed"]
     yield markdown_row(columns)
     yield markdown_row(["---"] + ["---:"] * (len(columns) - 1))
-    shown = ("contender", "fps", "fps_ratio", "cpu_ms", "cpu_ratio", "coverage", "failed")
-    yield from (markdown_row([cells[name] for name in shown]) for cells in contender_rows(turns))
+    shown = ("system", "fps", "fps_ratio", "cpu_ms", "cpu_ratio", "coverage", "failed")
+    yield from (markdown_row([cells[name] for name in shown]) for cells in system_rows(turns))
 
 
 def poses(run: Measured) -> int:
@@ -101,19 +101,19 @@ def poses(run: Measured) -> int:
 
 
 def stage_times(turns: Sequence[Turn]) -> Iterator[Row]:
-    """Yield a row per contender of ours and stage: milliseconds per frame."""
+    """Yield a row per system of ours and stage: milliseconds per frame."""
     for name in OURS:
         runs = [run for turn in turns if isinstance(run := turn[name], Measured)]
         for stage in dict.fromkeys(stage for run in runs for stage in run.stages):
             times = [1e3 * run.stages[stage] / run.frames for run in runs if stage in run.stages]
-            yield {"contender": name, "stage": stage, "ms": format_median_and_range(times, ".1f")}
+            yield {"system": name, "stage": stage, "ms": format_median_and_range(times, ".1f")}
 
 
 def stage_table(turns: Sequence[Turn]) -> Iterator[str]:
-    """Yield a line per stage: milliseconds per frame of each of our contenders."""
+    """Yield a line per stage: milliseconds per frame of each of our systems."""
     yield markdown_row(["stage, ms per frame", *OURS])
     yield markdown_row(["---"] + ["---:"] * len(OURS))
-    times = {(cells["contender"], cells["stage"]): cells["ms"] for cells in stage_times(turns)}
+    times = {(cells["system"], cells["stage"]): cells["ms"] for cells in stage_times(turns)}
     for stage in dict.fromkeys(stage for _, stage in times):
         yield markdown_row([stage, *(times.get((name, stage), "-") for name in OURS)])
 
@@ -128,14 +128,14 @@ def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = make_parser("Speed of the whole system beside other systems, as Markdown.")
     parser.add_argument("--seqs", nargs="+", required=True, help="names of sequences")
-    parser.add_argument("--runs", type=int, default=5, help="number of turns of all contenders on each sequence [5]")
+    parser.add_argument("--runs", type=int, default=5, help="number of turns of all systems on each sequence [5]")
     parser.add_argument("--frames", type=int, help="number of frames of each sequence, from the first [all]")
     add_vocabulary_option(parser)
     return parser
 
 
 def main() -> None:
-    """Run all contenders and print the tables."""
+    """Run all systems and print the tables."""
     parser = arguments()
     options = parser.parse_args()
     if options.runs < 1 or (options.frames is not None and options.frames < 2):
@@ -143,7 +143,7 @@ def main() -> None:
     heading = make_heading(PEERS)
     lines = [*heading.lines(), "", ABOUT]
     try:
-        for name in options.seqs:  # a missing sequence is one error, not a failure of every contender
+        for name in options.seqs:  # a missing sequence is one error, not a failure of every system
             load_sequence(locate_sequence(name, options.data_root), data_root=options.data_root)
         vocabulary = options.vocabulary or trained_vocabulary(options.seqs, options.data_root)
     except V3DError as error:
@@ -155,8 +155,8 @@ def main() -> None:
         turns = [take_turn(sequence, options, vocabulary, order) for _ in range(options.runs)]
         lines += ["", f"## {sequence}", "", *speed_table(turns), "", *stage_table(turns), "", *failures(turns)]
         cells = {"sequence": Path(sequence).name}
-        speed_rows += [cells | measured for measured in contender_rows(turns)]
-        stage_rows += [cells | measured for measured in stage_times(turns) if measured["contender"] == OURS[0]]
+        speed_rows += [cells | measured for measured in system_rows(turns)]
+        stage_rows += [cells | measured for measured in stage_times(turns) if measured["system"] == OURS[0]]
     measurements = {"speed": Measurement(heading, speed_rows), "stages": Measurement(heading, stage_rows)}
     publish(lines, options, parser, measurements)
 

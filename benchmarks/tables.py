@@ -16,14 +16,14 @@ T = TypeVar("T")
 SYSTEMS = {"full": "full", "baseline": "baseline", "pyorbslam3": "ORB-SLAM3 (PyPI)", "open3d": "Open3D odometry"}
 """Names of systems in tables; other systems keep their own names."""
 
-CONTENDERS = {
+COMMANDS = {
     "v3d_torch": "v3d_torch",
     "v3d_torch --serial": "v3d_torch `--serial`",
     "v3d_torch --segmenter none": "v3d_torch `--segmenter none`",
     "open3d": "Open3D odometry (no segmentation)",
     "pyorbslam3": "ORB-SLAM3 (PyPI; no segmentation)",
 }
-"""Names of contenders in tables, in the order of their rows."""
+"""Names of systems in tables, in the order of their rows."""
 
 
 def accuracy_table(measurements: Sequence[Measurement]) -> Iterator[str]:
@@ -49,20 +49,18 @@ def accuracy_cell(cells: Row) -> str:
 
 
 def speed_table(measurements: Sequence[Measurement]) -> Iterator[str]:
-    """Yield a line per contender: speed on each sequence, then its ratio to ORB-SLAM3."""
-    rows = {(cells["contender"], cells["sequence"]): cells for cells in rows_of(measurements)}
+    """Yield a line per system: speed on each sequence, then its ratio to ORB-SLAM3."""
+    rows = {(cells["system"], cells["sequence"]): cells for cells in rows_of(measurements)}
     sequences = unique(sequence for _, sequence in rows)
     frames = {sequence: cells["frames"] for (_, sequence), cells in rows.items() if cells["frames"] != "-"}
     headings = [f"{sequence} ({kind(sequence)}), {frames.get(sequence, '-')} frames" for sequence in sequences]
     ratios = [f"relative to ORB-SLAM3, {sequence}" for sequence in sequences]
     yield markdown_row(["frames per second (CPU ms per frame)", *headings, *ratios])
     yield markdown_row(["---", *["---:"] * (2 * len(sequences))])
-    for contender in [name for name in CONTENDERS if any(name == measured for measured, _ in rows)]:
-        measured = [rows.get((contender, sequence)) for sequence in sequences]
+    for system in [name for name in COMMANDS if any(name == measured for measured, _ in rows)]:
+        measured = [rows.get((system, sequence)) for sequence in sequences]
         speeds = [f"{cells['fps']} ({cells['cpu_ms']})" if cells else "-" for cells in measured]
-        yield markdown_row(
-            [CONTENDERS[contender], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)]
-        )
+        yield markdown_row([COMMANDS[system], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)])
 
 
 def pivot(

@@ -1,4 +1,4 @@
-"""Time of a call, and of competitors that take turns."""
+"""Time of a call, and of implementations that take turns."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 OURS = "v3d_torch"
-"""Name of this package among competitors."""
+"""Name of this package among implementations."""
 
-Competitors = dict[str, Callable[[], Any]]
+Implementations = dict[str, Callable[[], Any]]
 
 Result = TypeVar("Result")
 
@@ -28,14 +28,14 @@ def timed(call: Callable[[], Result], clock: Callable[[], float] = time.perf_cou
     return clock() - start, result
 
 
-def take_turns(competitors: Competitors, turns: int) -> dict[str, list[float]]:
-    """Measure the milliseconds of each competitor in each turn; turns are added until one second has passed."""
-    times: dict[str, list[float]] = {name: [] for name in competitors}
-    shuffler = np.random.default_rng(0)  # random order, because the competitor after the slowest has a cold cache
+def take_turns(implementations: Implementations, turns: int) -> dict[str, list[float]]:
+    """Measure the milliseconds of each implementation in each turn; turns are added until one second has passed."""
+    times: dict[str, list[float]] = {name: [] for name in implementations}
+    shuffler = np.random.default_rng(0)  # random order, because the implementation after the slowest has a cold cache
     end = time.perf_counter() + 1
     while len(times[OURS]) <= turns or time.perf_counter() < end:
-        for name in shuffler.permutation(list(competitors)):
+        for name in shuffler.permutation(list(implementations)):
             start = time.perf_counter()
-            competitors[name]()
+            implementations[name]()
             times[name].append(1e3 * (time.perf_counter() - start))
     return {name: values[1:] for name, values in times.items()}  # without the first, which warms up

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import columns
 import torch
 from command import make_parser, publish
-from contenders.box_trackers import PEERS, SETTINGS, BoxTracker
 from heading import make_heading
 from sequences import locate_sequence
 from storage import Measurement, Row
+from systems.box_trackers import PEERS, SETTINGS, BoxTracker
 from tables import flat
 from track_evaluation.scores import FrameOverlap, TrackScores, frame_overlap, mask_overlap, score
 from track_evaluation.truth import TruePeople, true_people

@@ -26,10 +26,10 @@ import speed
 import storage
 import tables
 import write_page
-from contenders import OURS, vocabulary
-from contenders.process import ContenderError, Measured, measure
 from heading import Heading
 from replay import Replay, back_and_forth
+from systems import OURS, vocabulary
+from systems.process import Measured, SystemRunError, measure
 
 
 def measured(rate: float, cpu: float, **stages: float) -> Measured:
@@ -141,7 +141,7 @@ class TestVocabulary:
 
 
 class TestProcess:
-    def test_our_contender_tracks_first_frames(self, moment: Path) -> None:
+    def test_our_system_tracks_first_frames(self, moment: Path) -> None:
         run = measure("v3d_torch --segmenter none", str(moment), moment.parent, frames=2)
         assert run.frames == 2 and run.trajectory is not None and len(run.trajectory) == 2
         assert run.seconds > 0 and run.cpu_seconds > 0
@@ -149,7 +149,7 @@ class TestProcess:
         assert torch.allclose(run.trajectory.T_wc[0], torch.eye(4, dtype=torch.float64))
 
     def test_failure_is_one_line(self, tmp_path: Path) -> None:
-        with pytest.raises(ContenderError, match=r"^\S*nowhere: "):
+        with pytest.raises(SystemRunError, match=r"^\S*nowhere: "):
             measure("v3d_torch --segmenter none", str(tmp_path / "nowhere"), tmp_path)
 
     def test_missing_peer_fails_with_its_name(
@@ -157,13 +157,13 @@ class TestProcess:
     ) -> None:
         (tmp_path / "pyorbslam3.py").write_text("raise ImportError('no pyorbslam3 here')\n")
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
-        with pytest.raises(ContenderError, match=r"^no pyorbslam3 here$"):
+        with pytest.raises(SystemRunError, match=r"^no pyorbslam3 here$"):
             measure("pyorbslam3", str(moment), moment.parent)
 
 
 def test_orbslam3_settings_contain_camera() -> None:
     pytest.importorskip("pyorbslam3", reason="ORB-SLAM3 is not installed")
-    from contenders.orbslam3 import settings
+    from systems.orbslam3 import settings
 
     camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
     in_memory = cv2.FileStorage_READ | cv2.FileStorage_MEMORY
@@ -178,7 +178,7 @@ def test_orbslam3_settings_contain_camera() -> None:
 class TestTables:
     def test_ratios_compare_within_a_turn(self) -> None:
         """Ours is half as fast as the reference in both turns; the second turn is twice as slow for both."""
-        turns: list[speed.Turn] = [dict.fromkeys(speed.CONTENDERS, "broke") for _ in range(2)]
+        turns: list[speed.Turn] = [dict.fromkeys(speed.SYSTEMS, "broke") for _ in range(2)]
         for turn, slow in zip(turns, (1, 2), strict=True):
             turn["pyorbslam3"] = measured(40 / slow, 30 * slow)
             turn["v3d_torch"] = measured(20 / slow, 90 * slow, read=0.5 * slow)
@@ -209,8 +209,8 @@ def test_pose_graph_closes_drifting_ring() -> None:
     assert int(cells["iterations"]) > 0 and float(cells["error_after"]) < float(cells["error_before"])
 
 
-def test_our_contenders_have_options() -> None:
-    from contenders.ours import OPTIONS
+def test_our_systems_have_options() -> None:
+    from systems.ours import OPTIONS
 
     assert tuple(OPTIONS) == OURS
 
@@ -272,10 +272,10 @@ class TestPage:
         figures = {"frames": 9, "ate": {"rmse": 0.25}, "fps": 3.0, "coverage": 0.5}
         outcomes = [accuracy.Outcome("walkers_desk", name, 0, figures) for name in ("full", "pyorbslam3")]
         storage.save("accuracy", storage.Measurement(self.HEADING, list(accuracy.accuracy_rows(outcomes))), tmp_path)
-        turn: speed.Turn = dict.fromkeys(speed.CONTENDERS, "broke")
+        turn: speed.Turn = dict.fromkeys(speed.SYSTEMS, "broke")
         turn |= {"pyorbslam3": measured(40, 30), "v3d_torch": measured(20, 90, read=0.5)}
         cells = {"sequence": "walkers_desk"}
-        rows = [cells | row for row in speed.contender_rows([turn])]
+        rows = [cells | row for row in speed.system_rows([turn])]
         storage.save("speed", storage.Measurement(self.HEADING, rows), tmp_path)
         page = write_page.page(tmp_path)
         assert "| walkers_desk (composed; people in fr1_rpy) | 9 | 0.2500 (50% of the frames) |" in page

@@ -1,4 +1,4 @@
-"""Benchmark problems of the camera modules, each with its competitors: this package first, then other libraries."""
+"""Benchmark problems of the camera modules, each with its implementations: this package first, then other libraries."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch
 from evo.core.geometry import umeyama_alignment
 from kornia.feature import match_smnn
 from kornia.geometry import RANSAC
-from timing import OURS, Competitors
+from timing import OURS, Implementations
 from torch import Tensor
 
 import v3d_torch as v3d
@@ -56,7 +56,7 @@ def pose_error(true: Tensor) -> Error:
     return lambda found: 1e3 * float(se3_log(found @ invert(true)).norm(dim=-1).median())
 
 
-def matching(batch: int) -> tuple[Competitors, Error]:
+def matching(batch: int) -> tuple[Implementations, Error]:
     """Matching of 500 descriptors with a permutation of them, 30 of 256 bits different. Error: missed matches, %."""
     problems = Problems(batch)
     a = (256 * problems.uniform(500, 32)).to(torch.uint8)
@@ -76,7 +76,7 @@ def matching(batch: int) -> tuple[Competitors, Error]:
         return rows
 
     limits = {"max_distance": 64, "max_ratio": 0.8, "cross_check": True}
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: v3d.match_descriptors(a, b, max_hamming=64, max_ratio=0.8),
         "kornia-rs": lambda: to_rows([kornia_rs.features.match_descriptors(x, y, **limits) for x, y in pairs]),
         "OpenCV (no ratio)": lambda: to_rows(
@@ -84,10 +84,10 @@ def matching(batch: int) -> tuple[Competitors, Error]:
         ),
         "Kornia (of float bits)": lambda: to_rows([match_smnn(x, y, 0.9)[1] for x, y in zip(*bits, strict=True)]),
     }
-    return competitors, lambda found: 100 * float((found != expected).double().mean())
+    return implementations, lambda found: 100 * float((found != expected).double().mean())
 
 
-def essential(batch: int) -> tuple[Competitors, Error]:
+def essential(batch: int) -> tuple[Implementations, Error]:
     """Essential matrix of 500 pairs, 0.5 pixels of noise, 30 % outliers. Error: norm of the difference, thousandths."""
     problems = Problems(batch)
     points = problems.points(500)
@@ -112,7 +112,7 @@ def essential(batch: int) -> tuple[Competitors, Error]:
         ransac = RANSAC("essential", inl_th=threshold, max_iter=10, seed=0)
         return [ransac(x, y)[0] for x, y in zip(*xy, strict=True)]
 
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: v3d.essential_ransac(uv_a, uv_b, K, threshold=1.5).E,
         "OpenCV": lambda: [cv2.findEssentialMat(x, y, K.numpy(), cv2.RANSAC, 0.999, 1.5)[0] for x, y in arrays],
         "kornia-rs (no refinement)": lambda: [
@@ -120,10 +120,10 @@ def essential(batch: int) -> tuple[Competitors, Error]:
         ],
         "Kornia": kornia_ransac,
     }
-    return competitors, error
+    return implementations, error
 
 
-def pnp(batch: int) -> tuple[Competitors, Error]:
+def pnp(batch: int) -> tuple[Implementations, Error]:
     """PnP-RANSAC of 500 points with 1 pixel of noise and 30 % outliers. Error: pose, thousandths."""
     problems = Problems(batch)
     T_cw, in_camera = se3_exp(problems.normal(6)), problems.points(500)
@@ -141,14 +141,14 @@ def pnp(batch: int) -> tuple[Competitors, Error]:
         return T
 
     options = {"reprojectionError": 4.0, "confidence": 0.999, "iterationsCount": 300}
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: v3d.pnp_ransac(points, uv, K, threshold=4.0).T_cw,
         "OpenCV": lambda: peers.to_poses(
             [cv2.solvePnPRansac(X, u, K.numpy(), None, **options)[1:3] for X, u in arrays]
         ),
         "kornia-rs": from_kornia_rs,
     }
-    return competitors, pose_error(T_cw)
+    return implementations, pose_error(T_cw)
 
 
 def refinement_problem(problems: Problems) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -158,22 +158,22 @@ def refinement_problem(problems: Problems) -> tuple[Tensor, Tensor, Tensor, Tens
     return T_cw, transform(invert(T_cw), in_camera), uv, se3_exp(0.02 * problems.normal(6)) @ T_cw
 
 
-def refinement(batch: int) -> tuple[Competitors, Error]:
+def refinement(batch: int) -> tuple[Implementations, Error]:
     """Refinement of a pose with 100 points, least squares of pixels. Error: pose, thousandths."""
     problems = Problems(batch)
     T_cw, points, uv, start = refinement_problem(problems)
     unit = torch.ones(batch, 100, dtype=torch.float64)
     by_theseus = peers.theseus_poses(start, points, uv, K, unit)
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: v3d.refine_pose(start, points, uv, K, pixel_sigma=100.0, rounds=1, iterations=10).T_cw,
         "GTSAM": peers.gtsam_poses(start, points, uv, K),
         "OpenCV": peers.opencv_poses(start, points, uv, K),
         "theseus": torch.no_grad()(by_theseus),
     }
-    return competitors, pose_error(T_cw)
+    return implementations, pose_error(T_cw)
 
 
-def refinement_gradient(batch: int) -> tuple[Competitors, Error]:
+def refinement_gradient(batch: int) -> tuple[Implementations, Error]:
     """Refinement of a pose, and its gradient by the weights. Error: relative difference to our gradient, %."""
     problems = Problems(batch)
     T_cw, points, uv, start = refinement_problem(problems)
@@ -188,11 +188,11 @@ def refinement_gradient(batch: int) -> tuple[Competitors, Error]:
         return gradient(v3d.refine_pose(start, points, uv, K, weights=weights, **settings).T_cw)
 
     expected = ours()
-    competitors: Competitors = {OURS: ours, "theseus (implicit)": lambda: gradient(by_theseus())}
-    return competitors, lambda found: 100 * float((found - expected).norm() / expected.norm())
+    implementations: Implementations = {OURS: ours, "theseus (implicit)": lambda: gradient(by_theseus())}
+    return implementations, lambda found: 100 * float((found - expected).norm() / expected.norm())
 
 
-def bundle(batch: int) -> tuple[Competitors, Error]:
+def bundle(batch: int) -> tuple[Implementations, Error]:
     """Bundle adjustment of 5 poses, 60 points, 240 pixels with 1 pixel of noise, Huber. Error: poses, thousandths."""
     problems = Problems(batch)
     T_cw, points = se3_exp(0.2 * problems.normal(5, 6)), problems.points(60)
@@ -222,15 +222,15 @@ def bundle(batch: int) -> tuple[Competitors, Error]:
         T = v3d.umeyama(centres, true, with_scale=True)
         return 1e3 * float((transform(T, centres) - true).norm(dim=-1).median())
 
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: v3d.bundle_adjust(start, first_points, uv, pose, point, K, iterations=20).T_cw,
         "GTSAM": peers.gtsam_bundles(start, first_points, uv, pose, point, K, 5.991**0.5),
         "kornia-rs": from_kornia_rs,
     }
-    return competitors, error
+    return implementations, error
 
 
-def graphs(batch: int) -> tuple[Competitors, Error]:
+def graphs(batch: int) -> tuple[Implementations, Error]:
     """Pose graphs of 30 poses and 45 edges. Error: poses, thousandths."""
     problems = Problems(batch)
     T_wc = se3_exp(problems.normal(30, 6))
@@ -242,16 +242,16 @@ def graphs(batch: int) -> tuple[Competitors, Error]:
     error[:, 0] = 0
     start, information = T_wc @ se3_exp(error), 1e4 * torch.eye(6, dtype=torch.float64)
     given = start, edges, T_ij, information
-    competitors: Competitors = {
+    implementations: Implementations = {
         OURS: lambda: v3d.optimise_pose_graph(start, edges, T_ij, information).T_wc,
         "GTSAM": peers.gtsam_graphs(*given),
         "theseus": peers.theseus_graphs(*given),
         "PyPose": peers.pypose_graphs(*given),
     }
-    return competitors, pose_error(T_wc)
+    return implementations, pose_error(T_wc)
 
 
-def dense(batch: int) -> tuple[Competitors, Error]:
+def dense(batch: int) -> tuple[Implementations, Error]:
     """Motion between two images of 320x240 pixels of a wavy, textured wall. Error: pose, thousandths."""
     camera = v3d.PinholeCamera(262.5, 262.5, 159.5, 119.5, width=320, height=240)
     T_ba = se3_exp(torch.tensor([0.02, -0.01, 0.015, 0.01, -0.015, 0.02], dtype=torch.float64))
@@ -288,7 +288,7 @@ def dense(batch: int) -> tuple[Competitors, Error]:
     return {OURS: lambda: align(*stacked).T_ba, "Open3D": open3d}, pose_error(T_ba)
 
 
-def alignment(batch: int) -> tuple[Competitors, Error]:
+def alignment(batch: int) -> tuple[Implementations, Error]:
     """Umeyama alignment of 1000 points. Error: largest difference to evo, thousandths."""
     problems = Problems(batch)
     p = problems.normal(1000, 3)
@@ -306,7 +306,7 @@ def alignment(batch: int) -> tuple[Competitors, Error]:
     return {OURS: lambda: v3d.umeyama(p, q), "evo": evo}, lambda found: 1e3 * float((found - expected).abs().max())
 
 
-CONTESTS: dict[str, Callable[[int], tuple[Competitors, Error]]] = {
+PROBLEMS: dict[str, Callable[[int], tuple[Implementations, Error]]] = {
     "match_descriptors": matching,
     "essential_ransac": essential,
     "pnp_ransac": pnp,

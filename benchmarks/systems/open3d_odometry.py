@@ -19,7 +19,7 @@ from v3d_torch.types import RGBDFrame, Trajectory
 
 
 class Open3DOdometry:
-    """Contender with the RGB-D odometry of Open3D.
+    """System with the RGB-D odometry of Open3D.
 
     Args:
         sequence: Sequence to run on.

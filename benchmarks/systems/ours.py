@@ -1,4 +1,4 @@
-"""Contender with this package: the same as ``python -m v3d_torch.run``, without writing results."""
+"""System with this package: the same as ``python -m v3d_torch.run``, without writing results."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ OPTIONS = {
     "v3d_torch --serial": ("full", ["prefetch=false"]),  # as in v3d_torch/cli/run.py
     "v3d_torch --segmenter none": ("full", ["segmentation.source=none"]),
 }
-"""Configuration and overrides of each contender."""
+"""Configuration and overrides of each system."""
 
 
 class Ours:
-    """Contender with this package.
+    """System with this package.
 
     Args:
         sequence: Sequence to run on.

@@ -1,4 +1,4 @@
-"""Interface of a contender."""
+"""Interface of a system."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol
 from v3d_torch.types import Trajectory
 
 
-class Contender(Protocol):
+class System(Protocol):
     """System that is ready to run: everything that is loaded once per process is loaded."""
 
     @property

@@ -29,7 +29,7 @@ VIEWER = (
 
 
 class OrbSlam3:
-    """Contender with ORB-SLAM3.
+    """System with ORB-SLAM3.
 
     Args:
         sequence: Sequence to run on.
@@ -90,7 +90,7 @@ def settings(camera: PinholeCamera, fps: int) -> str:
     The depth factor is 1 because depth is passed in metres.
     """
     if camera.distortion_model != "plumb_bob":
-        raise InputError(f"the contender ORB-SLAM3 is not set up for the lens model {camera.distortion_model}")
+        raise InputError(f"the system ORB-SLAM3 is not set up for the lens model {camera.distortion_model}")
     lens = dict(zip(COEFFICIENTS["plumb_bob"], camera.distortion, strict=True)) if camera.is_distorted else {}
     intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, **lens}
     return f"""%YAML:1.0

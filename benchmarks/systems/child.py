@@ -1,4 +1,4 @@
-"""Process of a contender: ``python -m contenders.child pyorbslam3 --seq ... --out FOLDER``; see `process`."""
+"""Process of a system: ``python -m systems.child pyorbslam3 --seq ... --out FOLDER``; see `process`."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from pathlib import Path
 import psutil
 from replay import Replay
 
-from contenders import OURS, PEERS
-from contenders.base import Contender
+from systems import OURS, PEERS
+from systems.base import System
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import V3DError
 
 
-def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> Contender:
-    """Load a contender and only its own libraries."""
+def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> System:
+    """Load a system and only its own libraries."""
     if name in OURS:
-        from contenders.ours import Ours
+        from systems.ours import Ours
 
         return Ours(sequence, name, seed)
     if name == "pyorbslam3":
-        from contenders.orbslam3 import OrbSlam3
+        from systems.orbslam3 import OrbSlam3
 
         return OrbSlam3(sequence, vocabulary)
-    from contenders.open3d_odometry import Open3DOdometry
+    from systems.open3d_odometry import Open3DOdometry
 
     return Open3DOdometry(sequence)
 
@@ -43,9 +43,9 @@ def cpu_time() -> float:
 
 
 def main() -> None:
-    """Run the contender; write its trajectory and times."""
+    """Run the system; write its trajectory and times."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("contender", choices=[*OURS, *PEERS])
+    parser.add_argument("system", choices=[*OURS, *PEERS])
     parser.add_argument("--seq", required=True)
     parser.add_argument("--data-root", type=Path)
     parser.add_argument("--frames", type=int)
@@ -57,16 +57,16 @@ def main() -> None:
     sequence = load_sequence(options.seq, data_root=options.data_root)
     if options.frames is not None and options.frames < len(sequence):
         sequence = Replay(sequence, range(options.frames))
-    contender = prepare(options.contender, sequence, options.seed, options.vocabulary)
+    system = prepare(options.system, sequence, options.seed, options.vocabulary)
     start, cpu_start = time.perf_counter(), cpu_time()
-    contender()
+    system()
     seconds, cpu_seconds = time.perf_counter() - start, cpu_time() - cpu_start
-    write_trajectory(options.out / "trajectory.txt", contender.trajectory())
+    write_trajectory(options.out / "trajectory.txt", system.trajectory())
     figures = {
         "frames": len(sequence),
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
-        "stages": dict(contender.stages),
+        "stages": dict(system.stages),
     }
     (options.out / "measured.json").write_text(json.dumps(figures), encoding="utf-8")
     os._exit(0)  # without destructors, because those of ORB-SLAM3 can crash

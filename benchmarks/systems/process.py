@@ -1,4 +1,4 @@
-"""Runs of contenders, each in a new process, so that threads, memory, output and crashes do not affect other runs."""
+"""Runs of systems, each in a new process, so that threads, memory, output and crashes do not affect other runs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ TIMEOUT = 3600
 """Timeout of a process, seconds; a process that takes longer is considered to hang."""
 
 
-class ContenderError(Exception):
-    """Failure of a contender; the message is its last line of error output."""
+class SystemRunError(Exception):
+    """Failure of a system; the message is its last line of error output."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Measured:
 
     Attributes:
         trajectory: Poses; None if there is no pose.
-        frames: Number of frames that the contender tracked or tried to track.
+        frames: Number of frames that the system tracked or tried to track.
         seconds: Wall time from before the first frame is read until the last one has a pose.
         cpu_seconds: User and system time of all threads of its processes in that time.
-        stages: Seconds by stage; empty if the contender does not measure them.
+        stages: Seconds by stage; empty if the system does not measure them.
     """
 
     trajectory: Trajectory | None
@@ -42,7 +42,7 @@ class Measured:
 
 
 def measure(
-    contender: str,
+    system: str,
     sequence: str,
     data_root: Path,
     *,
@@ -50,18 +50,18 @@ def measure(
     seed: int = 0,
     vocabulary: Path | None = None,
 ) -> Measured:
-    """Run a contender on the first frames of a sequence.
+    """Run a system on the first frames of a sequence.
 
     Args:
-        contender: One of `contenders.OURS` and `contenders.PEERS`.
+        system: One of `systems.OURS` and `systems.PEERS`.
         sequence: Sequence, as `load_sequence` takes it.
         data_root: Folder of sequences.
         frames: Number of frames; None for all.
-        seed: Seed, for contenders that have one.
+        seed: Seed, for systems that have one.
         vocabulary: Vocabulary of ORB-SLAM3.
 
     Raises:
-        ContenderError: If the contender failed, crashed or hung.
+        SystemRunError: If the system failed, crashed or hung.
     """
     options = {"--frames": frames, "--vocabulary": vocabulary, "--seed": seed, "--data-root": data_root}
     given = [word for name, value in options.items() if value is not None for word in (name, str(value))]
@@ -69,15 +69,15 @@ def measure(
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
     with TemporaryDirectory() as out:
         # -P: the installed package, not one in the working folder.
-        command = [sys.executable, "-P", "-m", "contenders.child", contender, "--seq", sequence, "--out", out, *given]
+        command = [sys.executable, "-P", "-m", "systems.child", system, "--seq", sequence, "--out", out, *given]
         try:
             done = subprocess.run(  # noqa: S603
                 command, capture_output=True, text=True, errors="replace", env=environment, timeout=TIMEOUT
             )
         except subprocess.TimeoutExpired as error:
-            raise ContenderError(f"not finished after {TIMEOUT} s") from error
+            raise SystemRunError(f"not finished after {TIMEOUT} s") from error
         if done.returncode:
-            raise ContenderError(failure(done).replace(out, "its temporary folder"))
+            raise SystemRunError(failure(done).replace(out, "its temporary folder"))
         figures = json.loads((Path(out) / "measured.json").read_text(encoding="utf-8"))
         path = Path(out) / "trajectory.txt"
         return Measured(read_trajectory(path) if path.stat().st_size else None, **figures)
