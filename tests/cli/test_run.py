@@ -27,7 +27,7 @@ from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 
-OBJECT_FILES = {"figures/voting.png", "figures/clusters.png"}
+OBJECT_FILES = {"figures/voting.png", "figures/clusters.png", "figures/objects.png"}
 """Files that are written if objects were detected and voted on."""
 
 WALKER_START_X, WALKER_Y = -1.75, 2.0

@@ -45,7 +45,12 @@ def test_all_documented_files_are_written(results: Path) -> None:
     assert names == {
         *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json"),
         *("frames.parquet", "states.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
-        *("figures/trajectory.png", "figures/masks.png", "figures/clusters.png"),  # a single object has no votes
+        *(
+            "figures/trajectory.png",
+            "figures/masks.png",
+            "figures/objects.png",
+            "figures/clusters.png",
+        ),  # a single object has no votes
     }
 
 
@@ -108,8 +113,11 @@ def test_ground_truth_is_written_and_gives_the_same_scores(results: Path, run: P
 def test_object_table_has_a_row_per_frame_and_object(results: Path, run: Pipeline) -> None:
     table = pq.read_table(results / "dynamics.parquet").to_pandas()
     assert list(table.columns) == [
-        *("frame", "stamp", "id", "class", "x", "y", "z", "votes", "chamfer", "motion_state", "missed")
+        *("frame", "stamp", "id", "class", "x", "y", "z", "vx", "vy", "vz", "position_sigma", "velocity_sigma"),
+        *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
+        *("votes", "chamfer", "motion_state", "missed"),
     ]
+    assert (table[["position_sigma", "velocity_sigma", "box_height"]] > 0).all(axis=None)
     assert len(table) == len(run.record.dynamics) == FRAMES
     assert table["frame"].tolist() == list(range(FRAMES))
     assert np.allclose(table["stamp"], run.sequence.stamps.numpy())
