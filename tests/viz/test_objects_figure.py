@@ -1,0 +1,58 @@
+"""Figure of the objects from above: paths, boxes and names, and an arrow for what moves."""
+
+from __future__ import annotations
+
+import torch
+
+from v3d_torch.geometry.level_frame import level_frame
+from v3d_torch.objects.frame_objects import MotionState, TrackedObject
+from v3d_torch.objects.object_state import ObjectState
+from v3d_torch.pipeline.run_record import ObjectTable
+from v3d_torch.types import RGBDFrame, Trajectory
+from v3d_torch.viz.objects_figure import box_outline, draw_objects
+
+UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+CUBE = torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 3)
+
+
+def object_at(stamp: float, number: int, x: float, state: MotionState) -> TrackedObject:
+    position = torch.tensor([x, 0.0, 3.0], dtype=torch.float64)
+    velocity = torch.tensor([1.0 if state is MotionState.DYNAMIC else 0.0, 0.0, 0.0], dtype=torch.float64)
+    motion = ObjectState(stamp, position, velocity, (0.01, 0.0, 0.1), 2.0)
+    mask = torch.zeros(2, 2, dtype=torch.bool)
+    return TrackedObject(number, 0, mask, motion, (), 0, torch.nan, state, False, CUBE + position.float())
+
+
+def table_of(*objects: tuple[int, MotionState], frames: int = 8) -> ObjectTable:
+    """Return a table in which each object stands at its number, or moves to the right with 1 m/s."""
+    table, image = ObjectTable(), torch.zeros(3, 2, 2, dtype=torch.uint8)
+    for index in range(frames):
+        stamp = index / 10
+        shown = [object_at(stamp, n, n + (stamp if state is MotionState.DYNAMIC else 0), state) for n, state in objects]
+        table.append_objects(RGBDFrame(index, stamp, image, torch.ones(1, 2, 2)), shown, UP)
+    return table
+
+
+def draw(table: ObjectTable) -> list[str]:
+    """Return the texts of the figure, with an empty one for each arrow."""
+    trajectory = Trajectory(torch.arange(2.0), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+    (axes,) = draw_objects(table, trajectory, torch.rand(5, 3), UP, "room $1").axes
+    assert axes.get_title() == "room $1"
+    return [text.get_text() for text in axes.texts]
+
+
+def test_objects_have_names_and_dynamic_ones_an_arrow() -> None:
+    table = table_of((1, MotionState.STATIC), (2, MotionState.DYNAMIC))
+    assert draw(table) == ["person 1", "person 2", ""]
+
+
+def test_objects_of_few_frames_are_not_drawn() -> None:
+    assert draw(table_of((1, MotionState.STATIC), frames=4)) == []
+
+
+def test_outline_encloses_the_cube_from_above() -> None:
+    """Level frame: x is forward (world z), y is left (minus world x)."""
+    outline = box_outline(table_of((2, MotionState.STATIC))["box"][0], level_frame(UP)[:3, :3])
+    assert outline.shape == (5, 2)
+    torch.testing.assert_close(torch.from_numpy(outline.min(axis=0)), torch.tensor([2.75, -2.25]).double())
+    torch.testing.assert_close(torch.from_numpy(outline.max(axis=0)), torch.tensor([3.25, -1.75]).double())
