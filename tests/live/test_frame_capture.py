@@ -122,11 +122,13 @@ def test_closing_stops_source_and_thread() -> None:
         def stop(self) -> None:
             stopped.set()
 
+    before = set(threading.enumerate())
     captured = FrameCapture(Endless(), accept, MONOTONIC_CLOCK)
     captured.start()
     assert taken.wait(5)
+    assert [thread.name for thread in set(threading.enumerate()) - before] == ["capture"]
     captured.close()
-    assert not any(thread.name == "capture" for thread in threading.enumerate())
+    assert set(threading.enumerate()) <= before
 
 
 def test_hour_without_a_consumer_keeps_only_the_newest_frame() -> None:
