@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from pathlib import Path
 
 import columns
 import torch
@@ -46,7 +47,7 @@ def measure(source: str, config: Config, seeds: int) -> Iterator[Row]:
         calibrated = calibrate_sequence(open_first_half, NoSegmentation, config, lambda *_: lambda *_: None)
         taken = ", ".join(each.name for each in calibrated.estimates if each.taken)
         yield {
-            "sequence": load_sequence(source).name,
+            "sequence": Path(source).name,
             "change": name,
             "taken": taken or "nothing",
             "right": with_right,

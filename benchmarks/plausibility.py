@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import columns
 import torch
@@ -190,7 +191,7 @@ def measure(source: str, frames: int, config: Config) -> Iterator[Row]:
         except V3DError as error:
             warnings = [f"refused: {error}"]
         yield {
-            "sequence": sequence.name,
+            "sequence": Path(source).name,
             "frames": f"{len(sequence)}",
             "change": name,
             "result": _result(change, warnings),

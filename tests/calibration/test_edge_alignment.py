@@ -60,3 +60,10 @@ def test_number_of_views_is_limited_and_spread_over_the_run() -> None:
     views, trajectory = make_views(6)
     assert len(EdgeAlignment(views, trajectory, 0.0)) == 6
     assert len(EdgeAlignment(views, trajectory, 0.0, max_views=3)) == 3
+
+
+def test_search_leaves_values_that_are_not_free_at_zero() -> None:
+    views, trajectory = make_views(shift=(12, -8))
+    alignment = EdgeAlignment(views, trajectory, depth_delay=0.0)
+    assert alignment.search((0, 1)).tolist() == pytest.approx([-12, 8, 0], abs=2)
+    assert alignment.search((2,))[:2].tolist() == [0, 0]
