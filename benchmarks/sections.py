@@ -130,11 +130,11 @@ def plausibility_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the section on the plausibility check."""
     yield "## Plausibility of camera and depth"
     text = (
-        "The camera file, the depth images or the colour images of each sequence are made wrong, and its first frames"
-        " are run. The check should name what is wrong, and nothing in a right sequence. A camera that stands still"
-        " tells neither its focal length nor a delay of depth. The depth of 7-Scenes (walkers_room, walkers_crowd) seems"
-        " to be shifted by about (28, 3) pixels as it was published; so few views do not tell this with significance, but"
-        " it hides a delay."
+        "The camera file, the depth images or the colour images of each sequence are changed, and its first frames are"
+        " run. The check should find the change, and nothing in the original sequence. A camera that stands still"
+        " determines neither its focal length nor a delay of depth. The published depth of 7-Scenes (walkers_room,"
+        " walkers_crowd) seems to be shifted by about (28, 3) pixels; this is not significant in so few views, but it"
+        " hides a delay."
     )
     table = pivot(rows_of(measurements), "change", "sequence", "result")
     yield from part(text, table, measurements, "sequence")
