@@ -132,9 +132,9 @@ def plausibility_section(measurements: Sequence[Measurement]) -> Iterator[str]:
     text = (
         "The camera file, the depth images or the colour images of each sequence are made wrong, and its first frames"
         " are run. The check should name what is wrong, and nothing in a right sequence. A camera that stands still"
-        " tells neither its focal length nor a delay of depth. The depth of 7-Scenes (walkers_room, walkers_crowd) seems"
-        " to be shifted by about (28, 3) pixels as it was published; so few views do not tell this with significance, but"
-        " it hides a delay."
+        " tells neither its focal length nor a delay of depth. The depth of 7-Scenes (walkers_room, walkers_crowd)"
+        " seems to be shifted by about (28, 3) pixels as it was published; so few views do not tell this with"
+        " significance, but it hides a delay."
     )
     table = pivot(rows_of(measurements), "change", "sequence", "result")
     yield from part(text, table, measurements, "sequence")
