@@ -277,8 +277,8 @@ def modules_section(measurements: Sequence[Measurement]) -> Iterator[str]:
         " above 1 if ours is faster. Implementations without batches solve the problems one after the other; factor"
         " graphs of GTSAM and theseus are built beforehand, outside of the time. Errors are medians over the batch: of"
         " poses, millimetres and milliradians in one number; of essential matrices, thousandths of their norm; of"
-        " matches, the percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference"
-        " to evo, thousandths."
+        " matches, the percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the"
+        " difference to evo, thousandths."
     )
     yield from part(text, flat(rows_of(measurements), columns.MODULES), measurements)
 

@@ -196,6 +196,19 @@ def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: P
         assert line in written
 
 
+def test_estimated_depth_scale_is_a_warning_in_the_record(moment: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "seq"
+    shutil.copytree(moment, folder)
+    lines = (folder / "camera.yaml").read_text().splitlines(keepends=True)
+    (folder / "camera.yaml").write_text("".join(line for line in lines if not line.startswith("depth_scale")))
+    for path in (folder / "depth").iterdir():  # in millimetres, which the values tell
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5)
+    done = call_here("--seq", folder, "--segmenter", "none", "--out", tmp_path / "out", cwd=tmp_path)
+    assert done.exit_code == 0, done.stderr
+    warnings = json.loads((tmp_path / "out" / "metrics.json").read_text())["warnings"]
+    assert any("depth_scale" in warning for warning in warnings), warnings
+
+
 # --- mistakes of the user
 
 

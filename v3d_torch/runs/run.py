@@ -104,6 +104,9 @@ class Run:
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
         if isinstance(sequence, ImageSequence) and sequence.depth_scale_note is not None:
             _LOG.warning(sequence.depth_scale_note)
+            warnings = self.pipeline.record.warnings
+            if sequence.depth_scale_note not in warnings:  # as in a resumed run
+                warnings.append(sequence.depth_scale_note)
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"
