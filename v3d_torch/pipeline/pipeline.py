@@ -41,7 +41,8 @@ _TRIM_INTERVAL = 200
 
 _CHECKED_KEYFRAMES = 15
 """Number of keyframes after which camera and depth are checked: some seconds of a moving camera. A shorter run is
-checked at its end, and so is a live run, because a check takes up to a second. It is not repeated."""
+checked at its end, and so is a live run, because a check takes a second, or some seconds if it finds an error. It is
+not repeated."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
