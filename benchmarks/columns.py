@@ -147,4 +147,8 @@ TRACKS = {
     "id_switches": "ID switches in 60 frames (all)",
     "pixels_right": "people's pixels in the right track",
     "tracks": "tracks (people)",
+    "position": "position error, cm",
+    "velocity": "velocity error, m/s",
+    "nees": "normalised errors of position and velocity, expected 3",
+    "positions": "positions",
 }

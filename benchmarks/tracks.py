@@ -17,6 +17,7 @@ from sequences import locate_sequence
 from storage import Measurement, Row
 from systems.box_trackers import PEERS, SETTINGS, BoxTracker
 from tables import flat
+from track_evaluation.motion import MotionErrors, MotionScores, format_scores
 from track_evaluation.scores import FrameOverlap, TrackScores, frame_overlap, mask_overlap, score
 from track_evaluation.truth import TruePeople, true_people
 
@@ -65,7 +66,9 @@ def run(sequence: RGBDSequence, config: Config, frames: int | None) -> Iterator[
             yield TrackedFrame(frame, instances[instances.labels == PERSON], slam.track(preprocessed))
 
 
-def compare(sequence: RGBDSequence, truth: Sequence[TruePeople], config: Config) -> dict[str, TrackScores]:
+def compare(
+    sequence: RGBDSequence, truth: Sequence[TruePeople], config: Config
+) -> tuple[dict[str, TrackScores], MotionScores]:
     """Score our tracks and those of each peer with each setting, on the first frames of a sequence.
 
     Args:
@@ -74,24 +77,28 @@ def compare(sequence: RGBDSequence, truth: Sequence[TruePeople], config: Config)
         config: Configuration of the system.
 
     Returns:
-        Scores by name and setting.
+        Scores by name and setting, and the errors of our positions and velocities.
     """
     rate = (len(sequence) - 1) / float(sequence.stamps[-1] - sequence.stamps[0])
     settings = [(name, setting) for setting in SETTINGS for name in PEERS]
     trackers = {pair: BoxTracker(pair[0], SETTINGS[pair[1]][pair[0]], rate) for pair in settings}
     ours: list[FrameOverlap] = []
+    motion = MotionErrors(sequence.camera.rays.numpy(), sequence.groundtruth)
     theirs: dict[tuple[str, str], list[FrameOverlap]] = {pair: [] for pair in settings}
     for people, tracked in zip(truth, run(sequence, config, len(truth)), strict=True):
         objects = [each for each in tracked.result.objects if each.label == PERSON]
         ours.append(frame_overlap(people, {each.id: mask_overlap(people, each.mask.numpy()) for each in objects}))
+        states = {each.id: each.state for each in objects}
+        motion.add(people, tracked.frame.depth, ours[-1], states, tracked.result.T_wc)
         overlaps = [mask_overlap(people, mask.numpy()) for mask in tracked.people.masks]
         for pair, tracker in trackers.items():
             ids = tracker(tracked.frame, tracked.people)
             theirs[pair].append(frame_overlap(people, {id_: overlaps[index] for id_, index in ids.items()}))
-    return {OURS: score(ours)} | {f"{name}, {setting}": score(theirs[name, setting]) for name, setting in settings}
+    scores = {OURS: score(ours)} | {f"{name}, {setting}": score(theirs[name, setting]) for name, setting in settings}
+    return scores, motion.scores()
 
 
-def score_rows(sequence: str, scores: dict[str, TrackScores]) -> Iterator[Row]:
+def score_rows(sequence: str, scores: dict[str, TrackScores], motion: MotionScores) -> Iterator[Row]:
     """Yield a row for our tracks and one for each peer with its best setting, by HOTA."""
     for tracker in (OURS, *PEERS):
         settings = [name for name in scores if name.startswith(tracker)]
@@ -107,13 +114,16 @@ def score_rows(sequence: str, scores: dict[str, TrackScores]) -> Iterator[Row]:
             "id_switches": f"{best.id_switches_per_60_frames:.2f} ({best.id_switches})",
             "pixels_right": f"{best.pixels_right:.1%}",
             "tracks": f"{best.tracks} ({best.people})",
+            **(format_scores(motion) if tracker == OURS else {}),
         }
 
 
 ABOUT = (
     "Every mask of a person is compared with the true masks by intersection over union, those of the peers too: their"
     " tracks have the masks of the detections that they were given. Peers run with their defaults and with lower score"
-    " thresholds; the better result is shown."
+    " thresholds; the better result is shown. Errors of position and velocity are medians of people fully in view: the"
+    " true position is the mean of the visible surface in the true mask, the true velocity its change over half a"
+    " second in the ground-truth world. Normalised errors are squared errors divided by the variances of the filter."
 )
 
 
@@ -130,7 +140,7 @@ def main() -> None:
         for name in options.seqs:
             sequence = load_sequence(locate_sequence(name, options.data_root), data_root=options.data_root)
             truth = true_people(sequence, options.frames, correct_ids=not options.ids_as_given)
-            rows += score_rows(sequence.name, compare(sequence, truth, Config()))
+            rows += score_rows(sequence.name, *compare(sequence, truth, Config()))
     except V3DError as error:
         parser.error(str(error))
     lines = ["# Tracks of people", "", *heading.lines(), "", *flat(rows, columns.TRACKS), "", ABOUT]
