@@ -23,7 +23,7 @@ These functions, and the modules that call them, run on the device of their inpu
 | `meta` | returns the shapes and dtypes without values |
 | other device | runs on fake tensors of another device than the CPU; constants and results are there |
 | no synchronisation | does so without an operator that reads a value on the host |
-| `compile` | is captured by `torch.compile(fullgraph=True)`, with the same result |
+| `compile` | is captured by `torch.compile(fullgraph=True)`, with the same result and gradients |
 | `export` | is captured by `torch.export.export`, with the same result |
 | `vmap` | returns the same rows if `torch.func.vmap` maps it over the batch |
 | `grad`, `jacrev` | has the same gradients with `torch.func` as with `torch.autograd` |

@@ -95,9 +95,20 @@ def check_no_synchronisation(case: Case) -> None:
 
 
 def check_compile(case: Case) -> None:
-    """`torch.compile` captures the whole function in one graph, with the same result."""
-    inputs = case.inputs(BATCH, COUNT, torch.float64)
+    """`torch.compile` captures the whole function in one graph, with the same result and the same gradients."""
     torch.compiler.reset()
+    if case.differentiable and not case.sampled:
+        function, arguments = with_gradients(case)
+        compiled = torch.compile(function, fullgraph=True, backend="eager")
+        leaves = [each.clone().requires_grad_() for each in arguments]
+        found, expected = compiled(*leaves), function(*leaves)
+        assert_same_result(case, found, expected)
+        for one, other in zip(
+            *(torch.autograd.grad(flatten(each).sum(), leaves) for each in (found, expected)), strict=True
+        ):
+            assert_same_derivative(case, one, other)
+        return
+    inputs = case.inputs(BATCH, COUNT, torch.float64)
     compiled = torch.compile(function_of(case), fullgraph=True, backend="eager")
     assert_same_result(case, compiled(**inputs), function_of(case)(**inputs))
 
@@ -123,7 +134,9 @@ def check_vmap(case: Case) -> None:
 def check_grad(case: Case) -> None:
     """`torch.func.grad` gives the gradients of `torch.autograd`."""
     function, arguments = with_gradients(case)
-    found = torch.func.grad(lambda *each: function(*each).sum(), argnums=tuple(range(len(arguments))))(*arguments)
+    found = torch.func.grad(lambda *each: flatten(function(*each)).sum(), argnums=tuple(range(len(arguments))))(
+        *arguments
+    )
     for one, other in zip(found, gradients(function, arguments), strict=True):
         assert_same_derivative(case, one, other)
 
@@ -131,7 +144,7 @@ def check_grad(case: Case) -> None:
 def check_jacrev(case: Case) -> None:
     """The Jacobian of `torch.func.jacrev`, summed over the results, gives the gradient of `torch.autograd`."""
     function, arguments = with_gradients(case)
-    found = torch.func.jacrev(function)(*arguments)
+    found = torch.func.jacrev(lambda *each: flatten(function(*each)))(*arguments)
     assert_same_derivative(case, found.sum(dim=0), gradients(function, arguments)[0])
 
 
@@ -244,21 +257,24 @@ def on_fake_gpu(inputs: Inputs) -> Inputs:
     return {name: torch.empty(each.shape, dtype=each.dtype, device=DEVICE) for name, each in inputs.items()}
 
 
-def with_gradients(case: Case) -> tuple[Callable[..., Tensor], list[Tensor]]:
-    """All finite results of one problem as a function of the differentiable arguments, and the arguments."""
+def with_gradients(case: Case) -> tuple[Callable[..., tuple[Tensor, ...]], list[Tensor]]:
+    """Function from the differentiable arguments to the results of one problem, 0 if not finite, and the arguments."""
     inputs = case.inputs(1, COUNT, torch.float64)
 
-    def function(*arguments: Tensor) -> Tensor:
+    def function(*arguments: Tensor) -> tuple[Tensor, ...]:
         results = tensors(function_of(case)(**(inputs | dict(zip(case.differentiable, arguments, strict=True)))))
-        numbers = torch.cat([each.flatten() for each in results if each.is_floating_point()])
-        return torch.where(numbers.isfinite(), numbers, 0.0)
+        return tuple(torch.where(each.isfinite(), each, 0.0) for each in results if each.is_floating_point())
 
     return function, [inputs[name] for name in case.differentiable]
 
 
-def gradients(function: Callable[..., Tensor], arguments: list[Tensor]) -> tuple[Tensor, ...]:
+def flatten(results: tuple[Tensor, ...]) -> Tensor:
+    return torch.cat([each.flatten() for each in results])
+
+
+def gradients(function: Callable[..., tuple[Tensor, ...]], arguments: list[Tensor]) -> tuple[Tensor, ...]:
     leaves = [each.clone().requires_grad_() for each in arguments]
-    return torch.autograd.grad(function(*leaves).sum(), leaves)
+    return torch.autograd.grad(flatten(function(*leaves)).sum(), leaves)
 
 
 def assert_same_layout(found: object, expected: object, device: str) -> None:
