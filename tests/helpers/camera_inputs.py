@@ -180,3 +180,27 @@ def trajectories(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     T_ec = se3_exp(random.normal(batch, 1, 6)) @ T_gc @ se3_exp(0.02 * random.normal(batch, count, 6))
     stamps = (torch.arange(count) / 10).repeat(batch, 1)
     return _cast({"T_gc": T_gc, "T_ec": T_ec, "stamps": stamps, "valid": random.mask()}, dtype)
+
+
+def positions(batch: int, count: int, dtype: torch.dtype) -> Inputs:
+    """Trajectories without their timestamps."""
+    inputs = trajectories(batch, count, dtype)
+    return {name: inputs[name] for name in ("T_gc", "T_ec", "valid")}
+
+
+def correspondences(batch: int, count: int, dtype: torch.dtype) -> Inputs:
+    """Noisy points in two frames."""
+    random = _Random(batch, count)
+    p = random.normal(batch, count, 3)
+    q = _transform(se3_exp(random.normal(batch, 6)), p) + 0.01 * random.normal(batch, count, 3)
+    return _cast({"p": p, "q": q, "weights": 0.5 + random.uniform(batch, count), "valid": random.mask()}, dtype)
+
+
+def twists(batch: int, count: int, dtype: torch.dtype) -> Inputs:
+    """Tangent vectors of rigid motions."""
+    return _cast({"xi": _Random(batch, count).normal(batch, count, 6)}, dtype)
+
+
+def motions(batch: int, count: int, dtype: torch.dtype) -> Inputs:
+    """Rigid motions."""
+    return _cast({"T": se3_exp(_Random(batch, count).normal(batch, count, 6))}, dtype)

@@ -15,6 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
@@ -92,8 +93,8 @@ def optimise_pose_graph(
         robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
 
     Returns:
-        The poses of minimal cost, with the dtype of ``T_wc``. Poses without a path of edges to a fixed pose are
-        determined only relative to each other.
+        The poses of minimal cost, with the dtype of ``T_wc``; costs at least in float32. Poses without a path
+        of edges to a fixed pose are determined only relative to each other.
     """
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
@@ -109,8 +110,8 @@ def optimise_pose_graph(
         cost_after, _ = graph.linearise(torch.where(graph.is_fixed, start, found.state @ se3_exp(steps)))
     return PoseGraphResult(
         T_wc=_move(T_wc, found.state, steps, graph.is_fixed),
-        cost_before=found.cost_before.to(T_wc.dtype),
-        cost_after=cost_after.to(T_wc.dtype),
+        cost_before=found.cost_before.to(working_dtype(T_wc.dtype)),
+        cost_after=cost_after.to(working_dtype(T_wc.dtype)),
         iterations=found.iterations,
         converged=found.converged,
     )

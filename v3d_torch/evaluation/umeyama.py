@@ -56,7 +56,7 @@ def umeyama(
         spread = (a.square() if w is None else a.square() * w).sum(dim=(-2, -1))
         R = R * ((R * M).sum(dim=(-2, -1)) / spread)[..., None, None]
     top = torch.cat([R, (mean_b - (R @ mean_a[..., None])[..., 0])[..., None]], dim=-1)
-    last = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, last], dim=-2).to(p.dtype)
 
 

@@ -78,7 +78,7 @@ def _align_triangles(world: Tensor, camera: Tensor) -> Tensor:
         z = torch.nn.functional.normalize(torch.linalg.cross(x, third - first, dim=-1), dim=-1)
         axes = torch.stack([x, torch.linalg.cross(z, x, dim=-1), z], dim=-1)
         frame = torch.cat([axes, first[..., None]], dim=-1)
-        last = frame.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*frame.shape[:-2], 1, 4)
+        last = torch.eye(4, dtype=frame.dtype, device=frame.device)[3:].expand(*frame.shape[:-2], 1, 4)
         frames.append(torch.cat([frame, last], dim=-2))
     T_wt, T_ct = frames
     return T_ct @ invert(T_wt)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -78,9 +77,21 @@ def draw_samples(valid: Tensor, size: int, count: int, seed: int) -> Tensor:
     Returns:
         Indices, int64, shape :math:`(..., S, n)`.
     """
-    # Random numbers come from NumPy, because those of torch depend on the device and fail in torch.func.vmap.
-    keys = torch.from_numpy(np.random.default_rng(seed).random((count, valid.shape[-1]))).to(valid.device)
-    return torch.where(valid[..., None, :], keys, 1.0).topk(size, dim=-1, largest=False).indices
+    keys = _random_bits(count * valid.shape[-1], seed, valid.device).unflatten(0, (count, valid.shape[-1]))
+    return torch.where(valid[..., None, :], keys, 2**32).topk(size, dim=-1, largest=False).indices
+
+
+def _random_bits(count: int, seed: int, device: torch.device) -> Tensor:
+    """Random numbers of 32 bits, int64, shape (count,).
+
+    They are hashes of a counter (Wellons, Hash Prospector, 2018), because the random numbers of torch depend on the
+    device and fail in `torch.func.vmap`.
+    """
+    mask, bits = 2**32 - 1, torch.arange(count, dtype=torch.int64, device=device) + seed * 0x9E3779B9 % 2**32
+    for shift, factor in ((16, 0x21F0AAAD), (15, 0x735A2D97)):
+        bits = (bits & mask) ^ ((bits & mask) >> shift)
+        bits = bits * factor & mask
+    return bits ^ (bits >> 15)
 
 
 def gather_samples(elements: Tensor, samples: Tensor) -> Tensor:

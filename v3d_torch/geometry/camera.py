@@ -297,7 +297,7 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
     r"""Back-project a depth image: :math:`x = (u - c_x) z / f_x,\; y = (v - c_y) z / f_y` (paper, Sec. III-B.1).
 
     Args:
-        depth: Depth along z, metres, float32 or float64, shape :math:`(B, 1, H, W)`; 0 = no measurement.
+        depth: Depth along z, metres, floating point, shape :math:`(B, 1, H, W)`; 0 = no measurement.
         rays: Viewing ray of every pixel at unit depth, shape :math:`(H, W, 3)`, or :math:`(B, H, W, 3)` for one camera
             per image; see `PinholeCamera.rays`.
 
@@ -307,7 +307,7 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
     """
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     KORNIA_CHECK_SHAPE(rays, ["*", *map(str, depth.shape[2:]), "3"])
-    return rays.to(depth.dtype) * depth[:, 0, :, :, None]
+    return rays.to(depth) * depth[:, 0, :, :, None]
 
 
 class BackProjector(torch.nn.Module):

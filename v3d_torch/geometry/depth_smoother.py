@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from functools import cache
+import math
 
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from kornia.filters import get_gaussian_kernel1d
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
@@ -48,8 +48,8 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     along columns. The paper's equation is the case ``edge_ratio=inf`` on an image without holes.
 
     Args:
-        depth: Depth, metres, float32 or float64, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
-            and depth beyond 100 km count as missing, too.
+        depth: Depth, metres, floating point, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
+            and depth beyond 100 km count as missing, too. Half precision is converted to float32.
         kernel_size: Side of the window, pixels, odd.
         sigma: Standard deviation of the Gaussian, pixels.
         edge_ratio: Largest accepted difference from the centre's depth, as a fraction of the centre's depth;
@@ -67,19 +67,20 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
         raise ConfigError(f"depth.kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
     radius = kernel_size // 2
     taps, height = _gaussian(kernel_size, sigma), depth.shape[-2]
+    wide = depth.to(working_dtype(depth.dtype))  # half precision cannot represent the placeholder
     strips = []
     for top in range(0, height, _STRIP_HEIGHT):
         margin = min(radius, top)
         rows = slice(top - margin, min(top + _STRIP_HEIGHT + radius, height))
-        strips.append(_smooth(depth[..., rows, :], taps, edge_ratio)[..., margin : margin + _STRIP_HEIGHT, :])
-    return torch.cat(strips, dim=-2)
+        strips.append(_smooth(wide[..., rows, :], taps, edge_ratio)[..., margin : margin + _STRIP_HEIGHT, :])
+    return torch.cat(strips, dim=-2).to(depth.dtype)
 
 
-@cache
 def _gaussian(kernel_size: int, sigma: float) -> tuple[float, ...]:
-    """Return the weights of a Gaussian from the centre outwards."""
-    gaussian: Tensor = get_gaussian_kernel1d(kernel_size, torch.tensor([[sigma]], dtype=torch.float64))[0]
-    return tuple(gaussian[kernel_size // 2 :].tolist())
+    """Return the weights of a Gaussian from the centre outwards; their sum over the whole window is 1."""
+    taps = [math.exp(-(distance**2) / (2 * sigma**2)) for distance in range(kernel_size // 2 + 1)]
+    total = math.fsum([*taps, *taps[1:]])
+    return tuple(tap / total for tap in taps)
 
 
 def _smooth(depth: Tensor, taps: tuple[float, ...], edge_ratio: float) -> Tensor:
@@ -120,7 +121,7 @@ def _convolve(
         size = step.detach().abs()
         # Each pair of pixels counts in both directions.
         for centre, neighbour, sign in ((0, -pairs, 1), (-pairs, 0, -1)):
-            same_surface = torch.le(size, max_difference.narrow(dim, centre, pairs), out=torch.empty_like(size))
+            same_surface = (size <= max_difference.narrow(dim, centre, pairs)).to(size.dtype)
             neighbour_weight = weight.narrow(dim, neighbour, pairs)
             difference = torch.addcmul(total.narrow(dim, neighbour, pairs), neighbour_weight, step, value=sign)
             sums.narrow(dim, centre, pairs).addcmul_(difference, same_surface, value=tap)

@@ -9,6 +9,8 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import pad
 
+from v3d_torch.geometry.precision import working_dtype
+
 _EPS = 1e-30  # keeps the division by a norm finite
 
 
@@ -29,6 +31,8 @@ def surface_normals(points: Tensor, radius: int = 4, edge_ratio: float = 0.05) -
         neighbours are measured and lie on one surface.
     """
     KORNIA_CHECK_SHAPE(points, ["B", "H", "W", "3"])
+    dtype = points.dtype
+    points = points.to(working_dtype(dtype))
     z = points[..., 2]
     right, left, below, above = (_shift(points, *offset) for offset in ((0, 1), (0, -1), (1, 0), (-1, 0)))
     near = [(side[..., 2] > 0) & ((side[..., 2] - z).abs() <= edge_ratio * z) for side in (right, left, below, above)]
@@ -40,7 +44,7 @@ def surface_normals(points: Tensor, radius: int = 4, edge_ratio: float = 0.05) -
     for offset in product(steps, steps):
         same_surface = (_shift(z[..., None], *offset) - z[..., None]).abs() <= edge_ratio * z[..., None]
         total += same_surface * _shift(products, *offset)
-    return torch.where(valid, total / total.norm(dim=-1, keepdim=True).clamp(min=_EPS), 0.0)
+    return torch.where(valid, total / total.norm(dim=-1, keepdim=True).clamp(min=_EPS), 0.0).to(dtype)
 
 
 def _shift(images: Tensor, rows: int, columns: int) -> Tensor:

@@ -1,7 +1,8 @@
 """SE(3) as 4x4 matrices: exponential, logarithm, inverse, adjoint, Jacobian of the logarithm.
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
-All functions are batched over leading dimensions, differentiable, and meant for float64. Their results equal those of
+All functions are batched over leading dimensions, differentiable, and meant for float64; half precision is computed in
+float32. Their results equal those of
 PyPose, but they use plain matrices, which is faster for single poses.
 
 Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018.
@@ -12,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import se3 as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
@@ -96,7 +98,7 @@ def orthonormalise(T: Tensor) -> Tensor:
 
 def _assemble(R: Tensor, t: Tensor) -> Tensor:
     """Matrices (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3, 1), with an exact last row."""
-    last = R.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*R.shape[:-2], 1, 4)
+    last = torch.eye(4, dtype=R.dtype, device=R.device)[3:].expand(*R.shape[:-2], 1, 4)
     return torch.cat([torch.cat([R, t], dim=-1), last], dim=-2)
 
 
@@ -118,13 +120,14 @@ def se3_exp(xi: Tensor) -> Tensor:
     Returns:
         Rigid motions, shape :math:`(..., 4, 4)`.
     """
+    dtype, xi = xi.dtype, xi.to(working_dtype(xi.dtype))
     X = hat(xi)
     # Below the small angle the coefficients are constant to float64, and are multiplied by high powers of the angle.
     angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL_ANGLE)
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
     X2 = X @ X
-    return (torch.eye(4, dtype=xi.dtype, device=xi.device) + X).addcmul(b, X2).addcmul(c, X2 @ X)
+    return (torch.eye(4, dtype=xi.dtype, device=xi.device) + X).addcmul(b, X2).addcmul(c, X2 @ X).to(dtype)
 
 
 def _se3_log_compiled(T: Tensor) -> Tensor:
@@ -141,6 +144,7 @@ def se3_log(T: Tensor) -> Tensor:
     Returns:
         Tangent vectors ``[translation, rotation]``, shape :math:`(..., 6)`, with a rotation angle in [0, pi].
     """
+    dtype, T = T.dtype, T.to(working_dtype(T.dtype))
     phi = _so3_log(T[..., :3, :3])
     square = (phi * phi).sum(dim=-1)[..., None, None]
     # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.
@@ -151,7 +155,7 @@ def se3_log(T: Tensor) -> Tensor:
     K = _skew(phi)
     t = T[..., :3, 3:]
     rho = t - 0.5 * (K @ t) + c * (K @ (K @ t))
-    return torch.cat([rho[..., 0], phi], dim=-1)
+    return torch.cat([rho[..., 0], phi], dim=-1).to(dtype)
 
 
 def hat(xi: Tensor) -> Tensor:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import voxel as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
 _MAX_VOXELS = 2**62
 """Largest bounding box, in voxels: the voxels of larger boxes cannot be numbered with 64-bit integers."""
@@ -60,12 +59,13 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     does not depend on the cloud.
 
     Args:
-        points: Points, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        points: Points, metres, floating point, shape :math:`(B, N, 3)`.
         valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`; the values of padding are ignored.
         size: Side of a voxel, metres.
 
     Returns:
-        Occupied voxels; M is the largest number of voxels of a cloud in the batch. Differentiable in ``points``.
+        Occupied voxels; M is the largest number of voxels of a cloud in the batch. On devices other than the CPU, and
+        if torch traces the computation, M is N, so that no shape depends on values. Differentiable in ``points``.
 
     Raises:
         ConfigError: If ``size`` is not positive.
@@ -75,74 +75,47 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
     if size <= 0:
         raise ConfigError(f"the voxel size is {size} m; give a positive number")
-    mask = valid.numpy()
-    voxel_index = np.full(mask.shape, -1)
-    present = np.flatnonzero(mask)
-    if len(present) == 0:
-        none = torch.zeros(len(valid), 0, dtype=torch.int64)
-        return Voxels(points[:, :0], valid[:, :0], none, torch.from_numpy(voxel_index))
-    rows = points.reshape(-1, 3)
-    keys = _keys(rows.detach().numpy().take(present, axis=0), size)
-    voxel_index.ravel()[present], counts = _group(keys, mask.sum(axis=1))
-
+    wide = points.to(working_dtype(points.dtype))
+    voxel_index, occupied = _number_voxels(wide.detach(), valid, size)
+    batch, count = valid.shape
+    voxels = count if not can_read(occupied) else int(occupied.max()) if batch else 0
     # Row 0 of each cloud collects its padding and is dropped. The axes are summed one by one, because torch would
     # spread the rows of a matrix over threads, which takes longer than the sum.
-    batch, voxels = counts.shape
-    slot = torch.from_numpy((voxel_index + 1 + (voxels + 1) * np.arange(batch)[:, None]).ravel())
-    sums = [axis.new_zeros(batch * (voxels + 1)).index_add(0, slot, axis) for axis in rows.unbind(dim=1)]
-    divisor = torch.from_numpy(counts).clamp(min=1)[..., None]
-    means = torch.stack(sums, dim=1).reshape(batch, voxels + 1, 3)[:, 1:] / divisor
-    return Voxels(means, *map(torch.from_numpy, (counts > 0, counts, voxel_index)))
+    slot = voxel_index + 1
+    sums = [axis.new_zeros(batch, voxels + 1).scatter_add(1, slot, axis) for axis in wide.unbind(dim=2)]
+    counts = slot.new_zeros(batch, voxels + 1).scatter_add(1, slot, valid.to(torch.int64))[:, 1:]
+    means = torch.stack(sums, dim=2)[:, 1:] / counts.clamp(min=1)[..., None]
+    return Voxels(means.to(points.dtype), counts > 0, counts, voxel_index)
 
 
-def _keys(points: NDArray[np.floating], size: float) -> NDArray[np.unsignedinteger]:
-    """Voxel number of each point in the bounding box of all points, (N, 3) to (N,), with z varying fastest."""
-    cells = np.divide(points.T, size, order="C")
-    np.floor(cells, out=cells)
-    low, high = cells.min(axis=1), cells.max(axis=1)
-    sides = [last - first + 1 for first, last in zip(low.tolist(), high.tolist(), strict=True)]
-    box = sides[0] * sides[1] * sides[2]
-    if not box < _MAX_VOXELS:  # also true if a side is NaN or infinite
-        raise InputError(
-            f"points are not finite or lie too far apart for voxels of {size} m; remove them or use larger voxels"
-        )
-    # The sort takes time for every byte, so the keys use the smallest integer type that is a multiple of 16 bits.
-    dtype = np.promote_types(np.uint16, np.min_scalar_type(int(box)))
-    key, y, z = (cells - low[:, None]).astype(dtype)
-    for axis, side in ((y, sides[1]), (z, sides[2])):
-        key *= int(side)
-        key += axis
-    return key
-
-
-def _group(keys: NDArray[np.unsignedinteger], sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _number_voxels(points: Tensor, valid: Tensor, size: float) -> tuple[Tensor, Tensor]:
     """Number the occupied voxels of each cloud.
 
     Args:
-        keys: Voxel numbers of the points, cloud after cloud, shape (N,).
-        sizes: Number of points of each cloud, shape (B,).
+        points: Points, shape (B, N, 3).
+        valid: Mask of the points that are not padding, shape (B, N).
+        size: Side of a voxel.
 
     Returns:
-        Index of each point's voxel, from 0 in every cloud, shape (N,), and number of points per voxel, shape (B, M).
+        Index of each point's voxel, from 0 in every cloud, -1 for padding, shape (B, N), and number of occupied voxels,
+        shape (B,).
     """
-    ends = np.concatenate([[0], sizes.cumsum()])
-    # Sort by 16-bit digits: NumPy sorts 16-bit integers by radix, which is faster than comparing whole keys.
-    digits = keys.view(np.uint16).reshape(len(keys), -1).T
-    order = np.concatenate([first + np.lexsort(digits[:, first:last]) for first, last in pairwise(ends.tolist())])
-    keys = keys[order]
-
-    begins = np.ones(len(keys) + 1, dtype=np.bool_)
-    np.not_equal(keys[1:], keys[:-1], out=begins[1:-1])
-    begins[ends] = True
-    edges = np.flatnonzero(begins)  # voxel k of all clouds has the sorted points edges[k] to edges[k + 1]
-    rank = edges.searchsorted(ends)
-    first, last = rank[:-1, None], rank[1:, None]
-    edges = edges.take(np.minimum(first + np.arange((last - first).max() + 1), last))
-    counts = edges[:, 1:] - edges[:, :-1]
-
-    voxel = np.empty_like(order)
-    voxel[order] = np.tile(np.arange(counts.shape[1]), len(counts)).repeat(counts.ravel())
-    return voxel, counts
+    if valid.shape[1] == 0:
+        return valid.to(torch.int64), valid.sum(dim=1)
+    cells = (points / size).floor().to(torch.float64)
+    low = torch.where(valid[..., None], cells, torch.inf).amin(dim=1, keepdim=True)
+    sides = torch.where(valid[..., None], cells, -torch.inf).amax(dim=1, keepdim=True) - low + 1
+    if can_read(valid) and not bool((sides.prod(dim=2) < _MAX_VOXELS)[valid.any(dim=1)].all()):  # also for NaN
+        raise InputError(
+            f"points are not finite or lie too far apart for voxels of {size} m; remove them or use larger voxels"
+        )
+    x, y, z = torch.where(valid[..., None], cells - low, 0.0).to(torch.int64).unbind(dim=2)
+    _, y_side, z_side = torch.where(valid.any(dim=1)[:, None, None], sides, 0.0).to(torch.int64).unbind(dim=2)
+    key = torch.where(valid, (x * y_side + y) * z_side + z, _MAX_VOXELS)  # number in the bounding box; padding is last
+    key, order = key.sort(dim=1, stable=True)
+    begins = torch.cat([torch.ones_like(valid[:, :1]), key[:, 1:] != key[:, :-1]], dim=1) & (key < _MAX_VOXELS)
+    rank = torch.where(key < _MAX_VOXELS, begins.cumsum(dim=1) - 1, -1)
+    return torch.zeros_like(order).scatter(1, order, rank), begins.sum(dim=1)
 
 
 class VoxelPool(torch.nn.Module):

@@ -146,7 +146,7 @@ def can_read(tensor: Tensor) -> bool:
     Values on another device require waiting for the device. Meta tensors, and tensors that `torch.func` transforms or a
     compiler traces, have no values.
     """
-    return type(tensor) is Tensor and tensor.device.type == "cpu" and not _is_traced()
+    return not _is_traced() and type(tensor) is Tensor and tensor.device.type == "cpu"
 
 
 def is_all_true(mask: Tensor) -> bool:
@@ -156,7 +156,7 @@ def is_all_true(mask: Tensor) -> bool:
 
 def _is_traced() -> bool:
     """Check whether `torch.func` or a compiler traces the computation."""
-    return torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling()
+    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
 
 
 def _is_plain(argument: object) -> bool:

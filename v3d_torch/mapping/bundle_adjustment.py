@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
@@ -110,7 +111,8 @@ def bundle_adjust(
         tolerance: Relative change of the cost that ends the optimisation.
 
     Returns:
-        Poses and landmarks with the lowest robust cost found, with the dtypes of ``T_cw`` and of ``points``.
+        Poses and landmarks with the lowest robust cost found, with the dtypes of ``T_cw`` and of ``points``; chi2 and
+        costs at least in float32.
     """
     problem, initial = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
@@ -124,13 +126,14 @@ def bundle_adjust(
     else:
         found = _minimise(*start, *problem, iterations, tolerance)
     chi2 = found.chi2 if valid is None else torch.where(valid, found.chi2, torch.inf)
+    wide = working_dtype(T_cw.dtype)  # costs can exceed the range of half precision
     return BundleAdjustment(
         T_cw=found.T_cw.to(T_cw.dtype),
         points=found.points.to(points.dtype),
         inliers=chi2 <= problem.thresholds,
-        chi2=chi2.to(T_cw.dtype),
-        cost_before=found.cost_before.to(T_cw.dtype),
-        cost_after=found.cost_after.to(T_cw.dtype),
+        chi2=chi2.to(wide),
+        cost_before=found.cost_before.to(wide),
+        cost_after=found.cost_after.to(wide),
         iterations=found.iterations,
     )
 

@@ -7,12 +7,14 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from v3d_torch.kernels.compiler import can_read
+
 
 def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: Tensor | None = None) -> Tensor:
     """Match each instance to the object that it continues, if any.
 
     The assignment maximises the total log-likelihood ratio. A pair whose ratio is not positive is never matched: its
-    instance is more likely a new object.
+    instance is more likely a new object. SciPy computes the assignment on the host for all devices.
 
     Args:
         log_ratio: Log-likelihood ratio that instance n continues object t, shape :math:`(B, T, N)`; -inf for impossible
@@ -24,13 +26,35 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
         Index of the object that each instance continues, from 0 to T - 1, or -1; int64, shape :math:`(B, N)`.
     """
     KORNIA_CHECK_SHAPE(log_ratio, ["B", "T", "N"])
-    gain = log_ratio.detach().clamp(min=0)
+    gain = log_ratio.detach().to(torch.float64).clamp(min=0)
     if tracked is not None:
         gain = gain * tracked[..., :, None]
     if present is not None:
         gain = gain * present[..., None, :]
+    return _assign(gain) if can_read(gain) else _assign_on_host(gain)
+
+
+def _assign(gain: Tensor) -> Tensor:
+    """Row of the highest total gain that each column gets, (B, T, N) to (B, N); -1 if its gain is 0."""
     matched = torch.full((gain.shape[0], gain.shape[2]), -1)
     for gains, matches in zip(gain, matched, strict=True):
         rows, columns = map(torch.from_numpy, linear_sum_assignment(gains.numpy(), maximize=True))
         matches[columns] = torch.where(gains[rows, columns] > 0, rows, -1)
     return matched
+
+
+@torch.library.custom_op("v3d_torch::assign", mutates_args=(), schema="(Tensor gain) -> Tensor")
+def _assign_on_host(gain: Tensor) -> Tensor:
+    """`_assign` as an operator, which compilers call as a whole. It copies the gains from other devices."""
+    return _assign(gain.cpu()).to(gain.device)
+
+
+@_assign_on_host.register_fake
+def _(gain: Tensor) -> Tensor:
+    return gain.new_empty(gain.shape[0], gain.shape[2], dtype=torch.int64)
+
+
+@_assign_on_host.register_vmap
+def _(info: object, in_dims: tuple[int], gain: Tensor) -> tuple[Tensor, int]:
+    gain = gain.movedim(in_dims[0], 0)
+    return _assign_on_host(gain.flatten(0, 1)).unflatten(0, gain.shape[:2]), 0

@@ -12,12 +12,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.kernels.compiler import can_read
 
 _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 """FLANN_INDEX_KDTREE_SINGLE, an exact KD-tree for few dimensions; faster here than the one of SciPy."""
 
 _MAX_COORDINATE = 1e18
 """Maximum coordinate, metres: squared distances between larger coordinates overflow in float32."""
+
+_CHUNK = 1024
+"""Number of points compared with all others at once; it bounds the memory."""
 
 _MIN_POINTS_FOR_THREADS = 20_000
 """Number of points from which the search uses several threads: it then takes much longer than starting a thread."""
@@ -30,12 +35,13 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
         D(P, Q) = \frac{1}{|P|} \sum_{p \in P} \min_{q \in Q} \|p - q\|^2
                 + \frac{1}{|Q|} \sum_{q \in Q} \min_{p \in P} \|q - p\|^2
 
-    KD-trees find the nearest points, so that memory is linear in the number of points. The search uses float32: if two
-    distances differ by less than 1e-6 of the extent of the clouds, either point can be returned as the nearest. The
-    distance to this point is computed in the dtype of the clouds.
+    On the CPU, KD-trees find the nearest points, so that memory is linear in the number of points. The search uses
+    float32: if two distances differ by less than 1e-6 of the extent of the clouds, either point can be returned as the
+    nearest. The distance to this point is computed in the dtype of the clouds. On other devices, and if torch traces
+    the computation, all pairs of points are compared.
 
     Args:
-        p: Point clouds P, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        p: Point clouds P, metres, floating point, shape :math:`(B, N, 3)`.
         q: Point clouds Q, metres, dtype of ``p``, shape :math:`(B, M, 3)`.
         p_valid: Mask of the points of ``p`` that are not padding, bool, shape :math:`(B, N)`; None for all.
         q_valid: Mask of the points of ``q`` that are not padding, bool, shape :math:`(B, M)`; None for all.
@@ -49,26 +55,76 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
     """
     KORNIA_CHECK_SHAPE(p, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(q, [str(p.shape[0]), "M", "3"])
-    p_points, p_sizes = _valid_points(p, p_valid)
-    q_points, q_sizes = _valid_points(q, q_valid)
-    points, sizes = torch.cat([p_points, q_points]), np.concatenate([p_sizes, q_sizes])
-    nearest = torch.from_numpy(_nearest_points(points.detach().numpy(), sizes))
-    x, y, z = (points - points.index_select(0, nearest)).square().unbind(dim=1)
-    # Sequential sums in float64: the result does not depend on the number of threads.
-    cloud = torch.from_numpy(np.arange(len(sizes)).repeat(sizes))
-    sums = x.new_zeros(len(sizes), dtype=torch.float64).index_add(0, cloud, (x + y + z).to(torch.float64))
-    return (sums / torch.from_numpy(sizes)).reshape(2, -1).sum(dim=0).to(points.dtype)
+    p_valid, q_valid = _mask(p, p_valid), _mask(q, q_valid)
+    dtype = p.dtype
+    # Padding is set to the origin: NaN would reach the gradients.
+    p, q = (
+        torch.where(valid[..., None], points.to(working_dtype(dtype)), 0.0)
+        for points, valid in ((p, p_valid), (q, q_valid))
+    )
+    if can_read(p) and can_read(q):
+        nearest_q, nearest_p = _search_trees(p, q, p_valid, q_valid)
+    else:
+        nearest_q, nearest_p = _search_all(p, q, q_valid), _search_all(q, p, p_valid)
+    means = [
+        _mean_square(p, q, nearest_q, p_valid, q_valid),
+        _mean_square(q, p, nearest_p, q_valid, p_valid),
+    ]
+    return (means[0] + means[1]).to(dtype)
 
 
-def _valid_points(points: Tensor, valid: Tensor | None) -> tuple[Tensor, NDArray[np.int64]]:
-    """Return the valid points of all clouds in one list, shape (sum of sizes, 3), and the size of each cloud."""
-    batch, count = points.shape[:2]
-    rows = points.reshape(-1, 3)
+def _mask(points: Tensor, valid: Tensor | None) -> Tensor:
+    """Mask of the points that are not padding, (B, N)."""
     if valid is None:
-        return rows, np.full(batch, count)
-    KORNIA_CHECK_SHAPE(valid, [str(batch), str(count)])
-    mask = valid.numpy()
-    return rows.index_select(0, torch.from_numpy(np.flatnonzero(mask))), mask.sum(axis=1)
+        return torch.ones_like(points[..., 0], dtype=torch.bool)
+    KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
+    return valid
+
+
+def _mean_square(points: Tensor, others: Tensor, nearest: Tensor, valid: Tensor, others_valid: Tensor) -> Tensor:
+    """Mean squared distance of each cloud's points (B, N, 3) to the points of the other cloud with indices (B, N)."""
+    batch, count = nearest.shape
+    if 0 in (count, others.shape[1]):
+        return points.new_full((batch,), torch.nan, dtype=torch.float64)
+    cloud = torch.arange(batch, device=points.device)[:, None]
+    row = (nearest + others.shape[1] * cloud).flatten()
+    partner = others.reshape(-1, 3).index_select(0, row).reshape(points.shape)
+    x, y, z = (points - partner).square().unbind(dim=2)
+    squared = torch.where(valid & others_valid.any(dim=1, keepdim=True), x + y + z, 0.0).to(torch.float64)
+    # Sequential sums in float64: the result does not depend on the number of threads.
+    sums = squared.new_zeros(batch).index_add(0, cloud.expand(batch, count).flatten(), squared.flatten())
+    size = torch.where(others_valid.any(dim=1), valid.sum(dim=1), 0)
+    return torch.where(size > 0, sums / size.clamp(min=1), torch.nan)
+
+
+def _search_all(points: Tensor, others: Tensor, others_valid: Tensor) -> Tensor:
+    """Index of the valid point of the other cloud that is nearest to each point, (B, N), from all pairs of points."""
+    if others.shape[1] == 0:
+        return torch.zeros_like(points[..., 0], dtype=torch.int64)
+    indices = []
+    for some in points.detach().split(_CHUNK, dim=1):
+        axes = zip(some.unbind(dim=2), others.detach().unbind(dim=2), strict=True)
+        squared = sum((a[:, :, None] - b[:, None, :]).square() for a, b in axes)
+        indices.append(torch.where(others_valid[:, None, :], squared, torch.inf).argmin(dim=2))
+    return torch.cat(indices, dim=1)
+
+
+def _search_trees(p: Tensor, q: Tensor, p_valid: Tensor, q_valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Index of the nearest point of the other cloud for each point of P, (B, N), and of Q, (B, M), from KD-trees."""
+    masks = [valid.numpy() for valid in (p_valid, q_valid)]
+    rows = [np.flatnonzero(mask) for mask in masks]
+    coordinates = [
+        each.detach().numpy().reshape(-1, 3).take(row, axis=0) for each, row in zip((p, q), rows, strict=True)
+    ]
+    nearest = _nearest_points(np.concatenate(coordinates), np.concatenate([mask.sum(axis=1) for mask in masks]))
+    column = np.concatenate([row % max(mask.shape[1], 1) for row, mask in zip(rows, masks, strict=True)])[nearest]
+    indices, first = [], 0
+    for mask, row in zip(masks, rows, strict=True):
+        index = np.zeros(mask.shape, np.int64)
+        index.ravel()[row] = column[first : first + len(row)]
+        indices.append(torch.from_numpy(index))
+        first += len(row)
+    return indices[0], indices[1]
 
 
 def _nearest_points(points: NDArray[np.floating], sizes: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.kernels import dbscan as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
 _MAX_PAIRS = 2**25
 """Maximum number of neighbour pairs that are listed at once; it bounds the memory."""
@@ -38,6 +38,8 @@ Pairs = tuple[Ints, Ints]
 def _dbscan_compiled(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape or eps <= 0 or min_samples < 1:
         return NotImplemented
+    if points.dtype not in (torch.float32, torch.float64):
+        return NotImplemented
     mask, coordinates = valid.numpy(), to_array(points)
     labels = np.full(mask.shape, -1)
     for cloud, present, found in zip(coordinates, mask, labels, strict=True):
@@ -52,7 +54,7 @@ def _dbscan_compiled(points: Tensor, valid: Tensor, eps: float, min_samples: int
 
 @compiled_by(_dbscan_compiled)
 def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
-    """Label the density-connected clusters of every cloud of a batch.
+    r"""Label the density-connected clusters of every cloud of a batch.
 
     A point with at least ``min_samples`` points within ``eps`` (itself and the boundary included) is a core point; core
     points within ``eps`` of each other belong to the same cluster. Clusters are numbered by their first core point. A
@@ -60,15 +62,16 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     exactly those of scikit-learn.
 
     Args:
-        points: Point clouds, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        points: Point clouds, metres, floating point, shape :math:`(B, N, 3)`.
         valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`; the values of padding are ignored.
         eps: Radius of a neighbourhood, metres.
         min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
 
     Returns:
         Cluster of each point, from 0 in every cloud; -1 for noise and for points that are not valid; int64, shape
-        :math:`(B, N)`. Distances are compared in float64. Memory grows with the number of neighbours, not with
-        :math:`N^2`, and is bounded.
+        :math:`(B, N)`. Distances are compared in float64. On the CPU, memory grows with the number of neighbours, not
+        with :math:`N^2`, and is bounded. On other devices, and if torch traces the computation, memory grows with
+        :math:`N^2` and time with :math:`N^3 \log N`.
 
     Raises:
         ConfigError: If ``eps`` or ``min_samples`` is not positive.
@@ -80,15 +83,39 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
         raise ConfigError(
             f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"
         )
+    if not can_read(points):
+        return _cluster_densely(points.detach(), valid, eps, min_samples)
     mask = valid.numpy()
     index = np.flatnonzero(mask)
-    coordinates = points.detach().numpy().reshape(-1, 3).take(index, axis=0).astype(np.float64)
+    coordinates = points.detach().to(torch.float64).numpy().reshape(-1, 3).take(index, axis=0)
     if not np.isfinite(coordinates).all():
         raise InputError("dbscan: a valid point is not finite; mark points without depth as invalid")
     clouds = np.split(coordinates, mask.sum(axis=1).cumsum()[:-1])
     labels = np.full(mask.size, -1)
     labels[index] = np.concatenate([_cluster(cloud, eps, min_samples) for cloud in clouds])
     return torch.from_numpy(labels.reshape(mask.shape))
+
+
+def _cluster_densely(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
+    """Labels of a batch of clouds, (B, N), from matrices of all pairs of points; no value is read on the host."""
+    axes = torch.where(valid[..., None], points.to(torch.float64), 0.0).unbind(dim=-1)
+    squared = sum((axis[..., :, None] - axis[..., None, :]).square() for axis in axes)
+    near = (squared <= eps**2) & valid[..., :, None] & valid[..., None, :]
+    core = near.sum(dim=-1) >= min_samples
+    # Squaring the matrix of connections doubles the number of steps between two points that it connects.
+    connected, size = near & core[..., :, None] & core[..., None, :], valid.shape[1]
+    for _ in range((size - 1).bit_length() if size else 0):
+        paths = connected.to(torch.float32)
+        connected = paths @ paths > 0
+    index = torch.arange(size, device=points.device)
+    if size == 0:
+        return index.expand(valid.shape)
+    first = torch.where(connected, index, size).amin(dim=-1)  # lowest core point of the cluster of each core point
+    number = (first == index).cumsum(dim=-1) - 1
+    label = number.gather(-1, first.clamp(max=size - 1))
+    # A border point gets the lowest label of the core points near it.
+    lowest = torch.where(near & core[..., None, :], label[..., None, :], size).amin(dim=-1)
+    return torch.where(lowest < size, lowest, -1)
 
 
 def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:

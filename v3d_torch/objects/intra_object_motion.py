@@ -8,6 +8,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.objects.chamfer import chamfer_distance
 
 
@@ -39,7 +40,7 @@ def intra_object_motion(
     the frame of its own camera together with ``T_current_previous``.
 
     Args:
-        previous: Clouds at the earlier time, metres, float32 or float64, shape :math:`(B, N, 3)`.
+        previous: Clouds at the earlier time, metres, floating point, shape :math:`(B, N, 3)`.
         current: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
         distance_threshold: Minimum distance of a deforming object, metres.
         previous_valid: Mask of the previous points that are not padding, bool, shape :math:`(B, N)`; None for all.
@@ -54,13 +55,15 @@ def intra_object_motion(
     Raises:
         InputError: If a valid point is not finite.
     """
+    dtype = previous.dtype
+    previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))
     if T_current_previous is not None:
         previous = _transform(T_current_previous, previous, previous_valid)
     mean_square = chamfer_distance(previous, current, previous_valid, current_valid) / 2
     # torch.where evaluates both branches: the 1 keeps the gradient of the unused branch finite.
     is_zero = mean_square == 0
     distance = torch.where(is_zero, 0, torch.where(is_zero, 1, mean_square).sqrt())
-    return Deformation(distance, deforming=distance >= distance_threshold)
+    return Deformation(distance.to(dtype), deforming=distance >= distance_threshold)
 
 
 def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:

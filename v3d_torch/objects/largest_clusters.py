@@ -6,6 +6,8 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.kernels.compiler import can_read
+
 
 def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_points: int = 1) -> Tensor:
     """Select the points of the ``n`` largest clusters of every cloud.
@@ -14,7 +16,7 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
     largest cluster of each cloud, ``n=1``.
 
     Args:
-        labels: Cluster of each point, -1 = noise, int64, shape :math:`(B, N)`.
+        labels: Cluster of each point, below N, -1 = noise, int64, shape :math:`(B, N)`; see :func:`dbscan`.
         valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`.
         n: Number of clusters to keep, one number for all clouds or int64 of shape :math:`(B,)`. Of two clusters of the
             same size, the one with the lower label ranks first.
@@ -29,10 +31,13 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
         return torch.zeros_like(valid)
     clustered = valid & (labels >= 0)
     cluster = torch.where(clustered, labels, 0)
-    size = labels.new_zeros(labels.shape[0], int(cluster.max()) + 1).scatter_add_(1, cluster, clustered.to(torch.int64))
+    count = int(cluster.max()) + 1 if can_read(cluster) else labels.shape[1]
+    size = labels.new_zeros(labels.shape[0], count).scatter_add(1, cluster, clustered.to(torch.int64))
     order = size.argsort(dim=1, descending=True, stable=True)
-    rank = torch.empty_like(order).scatter_(1, order, torch.arange(order.shape[1]).expand_as(order))
-    selected = (rank < torch.as_tensor(n).reshape(-1, 1)) & (size >= min_points)
+    place = torch.arange(count, device=labels.device).expand_as(order)
+    rank = torch.zeros_like(order).scatter(1, order, place)
+    most = n.reshape(-1, 1) if isinstance(n, Tensor) else n
+    selected = (rank < most) & (size >= min_points)
     return clustered & selected.gather(1, cluster)
 
 

@@ -9,6 +9,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import VotingConfig
+from v3d_torch.geometry.precision import working_dtype
 
 _STATIC_VOTER_RATIO = 0.5
 """Maximum motion of the centroid of a voting object if the free-space check is enabled, as a fraction of the distance
@@ -65,9 +66,11 @@ def hough_vote(
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
     KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])
-    diagonal = torch.eye(present.shape[-1], dtype=torch.bool)
+    diagonal = torch.eye(present.shape[-1], dtype=torch.bool, device=present.device)
     comparable = present[..., :, None] & present[..., None, :] & ~diagonal
 
+    dtype = previous.dtype
+    previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))
     change = (_pairwise_distances(current, present) - _pairwise_distances(previous, present)).abs()
     change = torch.where(comparable, change, 0)
     if temperature is None:
@@ -76,7 +79,7 @@ def hough_vote(
         indicator = torch.sigmoid((change - distance_threshold) / temperature)
     pair = torch.where(comparable, indicator, 0)
     votes = pair.sum(dim=-1)
-    return Votes(votes, pair, change, dynamic=present & (votes >= vote_threshold))
+    return Votes(votes.to(dtype), pair.to(dtype), change.to(dtype), dynamic=present & (votes >= vote_threshold))
 
 
 def _pairwise_distances(centroids: Tensor, present: Tensor) -> Tensor:

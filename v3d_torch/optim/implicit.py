@@ -25,7 +25,7 @@ from torch.func import jvp, vmap
 
 def needs_gradient(*tensors: Tensor) -> bool:
     """Check whether derivatives with respect to any of the tensors are tracked."""
-    if torch._C._are_functorch_transforms_active():
+    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
         return True
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 

@@ -15,6 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
@@ -176,7 +177,8 @@ def refine_pose(
         tolerance: Relative change of the cost that ends a round.
 
     Returns:
-        The refined poses and their inliers, with the dtype of ``T_cw``. A pose without measurements is the prediction.
+        The refined poses and their inliers, with the dtype of ``T_cw``; chi2 and information at least in float32. A
+        pose without measurements is the prediction.
 
     Example:
         Learn the weights of features through the poses of 32 frames:
@@ -232,9 +234,8 @@ def _is_robust(index: int, rounds: int) -> bool:
 def _cast(refined: PoseRefinement, dtype: torch.dtype) -> PoseRefinement:
     if refined.T_cw.dtype == dtype:
         return refined
-    return PoseRefinement(
-        refined.T_cw.to(dtype), refined.inliers, refined.chi2.to(dtype), refined.information.to(dtype)
-    )
+    wide = working_dtype(dtype)  # information exceeds the range of half precision
+    return PoseRefinement(refined.T_cw.to(dtype), refined.inliers, refined.chi2.to(wide), refined.information.to(wide))
 
 
 def _minimise_compiled(
