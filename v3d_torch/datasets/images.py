@@ -151,6 +151,11 @@ def _decode(file: Path | BytesIO, source: object) -> Image.Image:
     """Decode a whole image."""
     image = _read_header(file, source)
     try:
+        if image.format == "PNG":  # Pillow ignores the checksum of pixel data unless it is asked to verify it
+            image.verify()
+            if isinstance(file, BytesIO):
+                file.seek(0)
+            image = _read_header(file, source)
         image.load()
     except Exception as error:  # on invalid data a decoder can raise any exception
         image.close()

@@ -68,8 +68,8 @@ CASES = [
         set_sequence("{seq}/rgb/1305031102.000000.png"),
         Fails(
             "{seq}/rgb/1305031102.000000.png: is not a sequence of a supported format; the README lists the"
-            " formats, the simplest is a folder with colour images in a subfolder rgb and depth images in a"
-            " subfolder depth"
+            " formats, of which the simplest is a folder with colour images in a subfolder rgb and depth images in"
+            " a subfolder depth"
         ),
     ),
     Case(
