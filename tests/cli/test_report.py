@@ -117,7 +117,7 @@ def test_command_writes_one_self_contained_page(copy: Path) -> None:
     assert all(url.startswith(("data:image/", "#")) for url in page.urls), page.urls
     assert "<script" not in html and "@import" not in html and "<link" not in html
     assert not re.search(r"url\((?!#)", html)
-    assert page.images == 3  # masks, votes, clusters
+    assert page.images == 4  # masks, objects, votes, clusters
     assert "copy <b>& " in page.text  # escaped, so not parsed as markup
     metrics = json.loads((copy / "metrics.json").read_text())
     for number in (f"{metrics['ate']['rmse']:.4f} m", f"{metrics['rpe']['trans']['rmse']:.4f} m/s", f"{FRAMES} of"):
@@ -188,9 +188,9 @@ def test_page_reports_run_that_ended_early(tmp_path: Path) -> None:
         (
             ["dynamics.parquet", "groundtruth.txt"],
             ["not known: dynamics.parquet is missing", "There is no ground truth"],
-            3,
+            4,
         ),
-        (["frames.parquet", "config.yaml", "keyframes.txt"], ["There is no config.yaml", "0 keyframes"], 3),
+        (["frames.parquet", "config.yaml", "keyframes.txt"], ["There is no config.yaml", "0 keyframes"], 4),
         (["trajectory.txt", "figures"], ["trajectory.txt is missing", "person 1"], 0),
     ],
 )

@@ -272,15 +272,16 @@ def test_any_folder_in_data_root_is_found_by_its_name(folder: Path) -> None:
 
 
 def test_demo_is_rendered_to_the_cache(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    caches: list[Path] = []
+    calls: list[tuple[Path, str]] = []
 
-    def ensure(cache: Path, progress: object) -> Path:
-        caches.append(cache)
+    def ensure(cache: Path, progress: object, name: str) -> Path:
+        calls.append((cache, name))
         return folder
 
     monkeypatch.setattr("v3d_torch.datasets.demo.ensure_demo", ensure)
-    assert load_sequence("demo").name == "demo"
-    assert caches == [tmp_path / "cache"]
+    for name in ("demo", "demo:sitting"):
+        assert load_sequence(name).name == name
+    assert calls == [(tmp_path / "cache", "demo"), (tmp_path / "cache", "demo:sitting")]
 
 
 def test_unknown_name_suggests_similar_ones() -> None:
