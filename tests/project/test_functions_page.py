@@ -14,8 +14,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "functions.md"
 
 
 def test_examples_give_what_the_page_shows() -> None:
-    with torch.random.fork_rng():
-        results = doctest.testfile(str(PAGE), module_relative=False)
+    results = doctest.testfile(str(PAGE), module_relative=False)
     assert results.attempted > 50 and results.failed == 0
 
 
