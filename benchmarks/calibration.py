@@ -56,7 +56,7 @@ def measure(source: str, config: Config) -> Iterator[Row]:
                 "right": "unknown" if math.isnan(truth) else f"{truth:.6g}",
                 "given": "unknown" if each.given is None else f"{each.given:.6g}",
                 "estimated": f"{each.value:.5g} +- {each.sigma:.2g}" if math.isfinite(each.sigma) else "-",
-                "result": "taken" if each.taken else f"left: {each.reason}",
+                "result": "accepted" if each.accepted else f"not used: {each.reason}",
             }
 
 

@@ -60,7 +60,7 @@ CALIBRATION = {
 HELD_OUT = {
     "sequence": "sequence",
     "change": "wrong in the camera file",
-    "taken": "taken from the first half",
+    "accepted": "accepted from the first half",
     "right": "right camera, ATE, m",
     "given": "wrong camera, ATE, m",
     "calibrated": "calibrated camera, ATE, m",

@@ -45,11 +45,11 @@ def measure(source: str, config: Config, seeds: int) -> Iterator[Row]:
             return Replay(sequence, range(len(sequence) // 2))
 
         calibrated = calibrate_sequence(open_first_half, NoSegmentation, config, lambda *_: lambda *_: None)
-        taken = ", ".join(each.name for each in calibrated.estimates if each.taken)
+        accepted = ", ".join(each.name for each in calibrated.estimates if each.accepted)
         yield {
             "sequence": Path(source).name,
             "change": name,
-            "taken": taken or "nothing",
+            "accepted": accepted or "nothing",
             "right": with_right,
             "given": with_right if given == right else ate_of_second_half(source, given, config, seeds),
             "calibrated": ate_of_second_half(source, calibrated.camera, config, seeds),

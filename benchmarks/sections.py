@@ -113,7 +113,7 @@ def calibration_section(measurements: Sequence[Measurement], held_out: Sequence[
     yield "## Calibration"
     text = (
         "`v3d-torch calibrate --segmenter none` estimates the camera from the images, starting with a deliberately"
-        " wrong camera file. An estimate is taken if the recording determines it within its tolerance, and if it"
+        " wrong camera file. An estimate is accepted if the recording determines it within its tolerance, and if it"
         " differs significantly from the given value. The right values of a recording are those of its data set, which"
         " can differ by some pixels from the truth."
     )

@@ -114,7 +114,9 @@ class RGBDFrame:
             )
         scale = camera.depth_scale if camera is not None else None
         if measured.dtype.kind != "f" and scale is None:
-            raise InputError(f"frame {index}: depth is {measured.dtype}, {estimate_depth_scale([measured]).request}")
+            raise InputError(
+                f"frame {index}: depth is {measured.dtype}, {estimate_depth_scale([measured]).array_prompt}"
+            )
         metres = depth_to_metres(measured, scale)
         if measured.dtype.kind != "f" and camera is not None:
             metres = camera.correct_depth(metres)

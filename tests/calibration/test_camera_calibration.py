@@ -11,7 +11,7 @@ from helpers.board_room import CAMERA, make_views
 
 from v3d_torch.calibration import camera_calibration
 from v3d_torch.calibration.camera_calibration import Calibration, calibrate_camera
-from v3d_torch.calibration.selection import AGREES, NOT_TOLD, Estimate
+from v3d_torch.calibration.selection import AGREES, NOT_DETERMINED, Estimate
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.map_tables import MapTables
@@ -50,10 +50,10 @@ def estimate_of(calibration: Calibration, name: str) -> Estimate:
     return next(each for each in calibration.estimates if each.name == name)
 
 
-def test_delay_of_depth_is_taken() -> None:
+def test_delay_of_depth_is_accepted() -> None:
     calibration = calibrate(delay=0.04)
     estimate = estimate_of(calibration, "depth_delay")
-    assert estimate.taken and estimate.value == pytest.approx(0.04, abs=4 * estimate.sigma)
+    assert estimate.accepted and estimate.value == pytest.approx(0.04, abs=4 * estimate.sigma)
     assert calibration.camera.depth_delay == estimate.value
 
 
@@ -61,18 +61,18 @@ def test_depth_scale_is_told_by_measured_poses_only() -> None:
     """A room of twice the size in metres means half the units per metre."""
     calibration = calibrate(scale=2.0)
     estimate = estimate_of(calibration, "depth_scale")
-    assert estimate.taken and estimate.value == pytest.approx(2500.0, rel=1e-3)
+    assert estimate.accepted and estimate.value == pytest.approx(2500.0, rel=1e-3)
     assert calibration.camera.depth_scale == estimate.value
     untold = calibrate()
     estimate = estimate_of(untold, "depth_scale")
-    assert not estimate.taken and estimate.reason == NOT_TOLD and untold.camera.depth_scale == 5000.0
+    assert not estimate.accepted and estimate.reason == NOT_DETERMINED and untold.camera.depth_scale == 5000.0
 
 
 def test_right_delay_and_scale_are_left() -> None:
     calibration = calibrate(scale=1.0)
     for name in ("depth_delay", "depth_scale"):
         estimate = estimate_of(calibration, name)
-        assert not estimate.taken and estimate.reason == AGREES
+        assert not estimate.accepted and estimate.reason == AGREES
 
 
 def test_depth_in_floating_point_has_no_scale() -> None:
@@ -84,4 +84,4 @@ def test_depth_in_floating_point_has_no_scale() -> None:
 def test_camera_at_rest_tells_no_delay() -> None:
     views, trajectory = make_views(COUNT, moving=False)
     calibration = calibrate_camera(MapTables(), views, trajectory, None, CAMERA, CAMERA, Config())
-    assert estimate_of(calibration, "depth_delay").reason == NOT_TOLD
+    assert estimate_of(calibration, "depth_delay").reason == NOT_DETERMINED

@@ -12,7 +12,7 @@ from helpers.calibration_map import TRUE, make_map
 from v3d_torch.calibration.problem import SelfCalibration
 from v3d_torch.calibration.selection import (
     AGREES,
-    NOT_TOLD,
+    NOT_DETERMINED,
     Estimate,
     ParameterSelection,
     covariance,
@@ -33,39 +33,41 @@ def select(given: PinholeCamera, **settings: float) -> dict[str, Estimate]:
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "taken", "reason"),
+    ("value", "sigma", "accepted", "reason"),
     [
         (5.0, 0.1, True, ""),
-        (5.0, 1.1, False, NOT_TOLD),
-        (5.0, math.inf, False, NOT_TOLD),
-        (math.nan, math.nan, False, NOT_TOLD),
+        (5.0, 1.1, False, NOT_DETERMINED),
+        (5.0, math.inf, False, NOT_DETERMINED),
+        (math.nan, math.nan, False, NOT_DETERMINED),
         (2.0, 1.0, False, AGREES),
     ],
 )
-def test_estimate_is_taken_if_it_is_accurate_and_differs(value: float, sigma: float, taken: bool, reason: str) -> None:
+def test_estimate_is_accepted_if_it_is_accurate_and_differs(
+    value: float, sigma: float, accepted: bool, reason: str
+) -> None:
     estimate = decide("x", 0.0, value, sigma, tolerance=1.0)
-    assert (estimate.taken, estimate.reason) == (taken, reason)
+    assert (estimate.accepted, estimate.reason) == (accepted, reason)
 
 
 def test_nothing_is_taken_if_the_given_camera_is_right() -> None:
     estimates = select(KNOWN)
-    assert not any(each.taken for each in estimates.values())
+    assert not any(each.accepted for each in estimates.values())
     assert len(estimates) == 11  # focal lengths, centre, five coefficients, inverse-depth offset, readout
 
 
-def test_only_the_group_that_is_wrong_is_taken() -> None:
+def test_only_the_group_that_is_wrong_is_accepted() -> None:
     estimates = select(replace(KNOWN, fx=1.08 * TRUE.fx, fy=1.08 * TRUE.fy))
-    assert {name for name, each in estimates.items() if each.taken} == {"fx", "fy"}
+    assert {name for name, each in estimates.items() if each.accepted} == {"fx", "fy"}
     for name in ("fx", "fy"):
         each = estimates[name]
         assert each.given == pytest.approx(1.08 * getattr(TRUE, name))
         assert abs(each.value - getattr(TRUE, name)) < 4 * each.sigma
-    assert {each.reason for each in estimates.values() if not each.taken} <= {AGREES, NOT_TOLD}
+    assert {each.reason for each in estimates.values() if not each.accepted} <= {AGREES, NOT_DETERMINED}
 
 
 def test_camera_at_rest_tells_nothing() -> None:
     estimates = select(replace(KNOWN, fx=1.08 * TRUE.fx, fy=1.08 * TRUE.fy), swing=torch.zeros(6).double())
-    assert not any(each.taken for each in estimates.values() if each.name in ("fx", "fy", "cx", "cy"))
+    assert not any(each.accepted for each in estimates.values() if each.name in ("fx", "fy", "cx", "cy"))
 
 
 def test_unknown_readout_has_no_given_value() -> None:

@@ -39,7 +39,7 @@ def test_wrong_focal_lengths_are_found_again(sequence: Path, tmp_path: Path, mon
     found, text = load_camera(out), out.read_text()
     assert found.fx == pytest.approx(right.fx, rel=0.03) and found.fy == pytest.approx(right.fy, rel=0.03)
     assert "# Calibrated by v3d-torch calibrate from " in text and " +- " in text
-    assert "taken" in done.stdout and f"camera: {out}" in done.stdout
+    assert "accepted" in done.stdout and f"camera: {out}" in done.stdout
 
 
 def test_existing_file_and_unknown_sequence_are_errors(sequence: Path, tmp_path: Path) -> None:

@@ -70,8 +70,8 @@ def test_estimate_of_a_room_is_found(scale: float, step: float) -> None:
 def test_ambiguous_images_ask_for_the_depth_scale(image: NDArray[np.uint16], evidence: str) -> None:
     estimate = estimate_depth_scale([image])
     assert estimate.depth_scale is None
-    assert re.search(evidence, estimate.question)
-    assert "write the line depth_scale: 1000 into camera.yaml if depth is in millimetres" in estimate.question
+    assert re.search(evidence, estimate.file_prompt)
+    assert "write the line depth_scale: 1000 into camera.yaml if depth is in millimetres" in estimate.file_prompt
 
 
 def test_no_images_give_no_estimate() -> None:

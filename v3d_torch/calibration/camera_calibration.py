@@ -70,8 +70,8 @@ def calibrate_camera(
         _estimate_delay(views, trajectory, camera, given),
         *_estimate_scale(groundtruth, trajectory, camera, given),
     ]
-    taken = {each.name: each.value for each in estimates if each.taken}
-    return Calibration(with_values(given, taken), tuple(estimates))
+    accepted = {each.name: each.value for each in estimates if each.accepted}
+    return Calibration(with_values(given, accepted), tuple(estimates))
 
 
 def _estimate_delay(

@@ -45,7 +45,7 @@ class Estimate:
         given: Value of the given camera; None if it states none.
         value: Estimated value; NaN if there is none.
         sigma: Standard deviation of the estimate; infinite if the recording does not determine the parameter.
-        taken: True if the estimate replaces the given value.
+        accepted: True if the estimate replaces the given value.
         reason: Reason why the given value was kept; empty if it was replaced.
     """
 
@@ -53,11 +53,11 @@ class Estimate:
     given: float | None
     value: float
     sigma: float
-    taken: bool
+    accepted: bool
     reason: str
 
 
-NOT_TOLD, AGREES = "not determined by the recording", "agrees with the given value"
+NOT_DETERMINED, AGREES = "not determined by the recording", "agrees with the given value"
 """Reasons why given values are kept."""
 
 
@@ -72,10 +72,10 @@ def decide(name: str, given: float, value: float, sigma: float, tolerance: float
         tolerance: Maximum accepted standard deviation.
     """
     if not sigma <= tolerance:
-        return Estimate(name, given, value, sigma, taken=False, reason=NOT_TOLD)
+        return Estimate(name, given, value, sigma, accepted=False, reason=NOT_DETERMINED)
     if chi2.sf(((value - given) / sigma) ** 2, 1) > MAX_P_VALUE:
-        return Estimate(name, given, value, sigma, taken=False, reason=AGREES)
-    return Estimate(name, given, value, sigma, taken=True, reason="")
+        return Estimate(name, given, value, sigma, accepted=False, reason=AGREES)
+    return Estimate(name, given, value, sigma, accepted=True, reason="")
 
 
 @dataclass(frozen=True)
@@ -110,42 +110,42 @@ class ParameterSelection:
     Attributes:
         free: Groups whose estimates are accepted.
         fit: Fit with these groups free.
-        left: Estimates of the parameters whose given values are kept.
+        rejected: Estimates of the parameters whose given values are kept.
     """
 
     def __init__(self, problem: SelfCalibration) -> None:
         self._problem = problem
         self.free: list[ParameterGroup] = []
         self.fit = _Fit({}, torch.zeros(0, 0, dtype=torch.float64))
-        self.left: list[Estimate] = []
+        self.rejected: list[Estimate] = []
         for group in groups_of(problem.given):
-            self._free_if_told(group)
+            self._free_if_determined(group)
         while (confirmed := self._most_confirmed()) is not None:
-            self._leave(confirmed, self.fit, AGREES)
+            self._reject(confirmed, self.fit, AGREES)
             self.free.remove(confirmed)
             self.fit = self._fit(self.free)
 
     @property
     def estimates(self) -> list[Estimate]:
         """Estimates of all parameters, accepted estimates first."""
-        taken = [
-            Estimate(name, self._given(name), value, self.fit.sigma(name), taken=True, reason="")
+        accepted = [
+            Estimate(name, self._given(name), value, self.fit.sigma(name), accepted=True, reason="")
             for name, value in self.fit.values.items()
         ]
-        return taken + self.left
+        return accepted + self.rejected
 
     def _given(self, name: str) -> float | None:
         """Value of the given camera; None for an unknown readout."""
         unknown = name == "readout" and self._problem.given.readout is None
         return None if unknown else float(self._problem.given_values([name])[0])
 
-    def _free_if_told(self, group: ParameterGroup) -> None:
+    def _free_if_determined(self, group: ParameterGroup) -> None:
         fit = self._fit([*self.free, group])
-        if all(self._is_told(each, fit) for each in (*self.free, group)):
+        if all(self._is_determined(each, fit) for each in (*self.free, group)):
             self.free.append(group)
             self.fit = fit
         else:
-            self._leave(group, fit, NOT_TOLD)
+            self._reject(group, fit, NOT_DETERMINED)
 
     def _fit(self, groups: Sequence[ParameterGroup]) -> _Fit:
         names = [name for group in groups for name in group.parameters]
@@ -156,7 +156,7 @@ class ParameterSelection:
         values, at = self._problem.minimise(names, torch.tensor(start, dtype=torch.float64))
         return _Fit(dict(zip(names, values.tolist(), strict=True)), covariance(self._problem, at))
 
-    def _is_told(self, group: ParameterGroup, fit: _Fit) -> bool:
+    def _is_determined(self, group: ParameterGroup, fit: _Fit) -> bool:
         """Check whether a fit determines a group within its tolerance."""
         of_group = fit.covariance_of(group)
         if not of_group.isfinite().all():
@@ -183,10 +183,10 @@ class ParameterSelection:
         statistic = difference @ torch.linalg.solve(self.fit.covariance_of(group), difference)
         return float(chi2.sf(float(statistic), len(names)))
 
-    def _leave(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
+    def _reject(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
         for name in group.parameters:
-            self.left.append(
-                Estimate(name, self._given(name), fit.values[name], fit.sigma(name), taken=False, reason=reason)
+            self.rejected.append(
+                Estimate(name, self._given(name), fit.values[name], fit.sigma(name), accepted=False, reason=reason)
             )
 
 

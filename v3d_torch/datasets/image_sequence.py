@@ -135,7 +135,7 @@ class ImageSequence(StoredSequence):
             return
         estimate = estimate_depth_scale(images)
         if estimate.depth_scale is None:
-            raise InputError(f"{source}: {estimate.question}")
+            raise InputError(f"{source}: {estimate.file_prompt}")
         self.camera = replace(self.camera, depth_scale=estimate.depth_scale)
         self.depth_scale_note = estimate.note
 

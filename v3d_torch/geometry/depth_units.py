@@ -84,7 +84,7 @@ class DepthScaleEstimate:
         )
 
     @property
-    def question(self) -> str:
+    def file_prompt(self) -> str:
         """Cause and fix for an error that asks the user of a recording for the depth scale."""
         return (
             f"the unit of depth is not stated and cannot be estimated from the images ({self.evidence}); write the line"
@@ -92,7 +92,7 @@ class DepthScaleEstimate:
         )
 
     @property
-    def request(self) -> str:
+    def array_prompt(self) -> str:
         """Cause and fix for an error that asks a programmer for the depth scale of an array."""
         scale = self.depth_scale or MILLIMETRES
         reason = f"which fits {self.evidence}" if self.depth_scale is not None else "if it is in millimetres"

@@ -87,11 +87,11 @@ def calibrate_sequence(
 def _is_converged(calibration: Calibration, previous: Calibration | None) -> bool:
     """Check whether the last two runs gave the same values, up to a fraction of their uncertainty."""
     if previous is None:
-        return not any(each.taken for each in calibration.estimates)
+        return not any(each.accepted for each in calibration.estimates)
     before = {each.name: each for each in previous.estimates}
     return all(
-        each.taken == before[each.name].taken
-        and (not each.taken or abs(each.value - before[each.name].value) <= _CONVERGED * each.sigma)
+        each.accepted == before[each.name].accepted
+        and (not each.accepted or abs(each.value - before[each.name].value) <= _CONVERGED * each.sigma)
         for each in calibration.estimates
     )
 
@@ -109,7 +109,7 @@ def calibration_text(calibration: Calibration, name: str) -> str:
         comments.setdefault(field, []).append(
             f"{each.name} {_describe(each)}" if field != each.name else _describe(each)
         )
-    heading = f"# Calibrated by v3d-torch calibrate from {name}. Values are taken if the recording determines them.\n"
+    heading = f"# Calibrated by v3d-torch calibrate from {name}. Values are accepted if determined by it.\n"
     return heading + camera_text(calibration.camera, {field: "; ".join(texts) for field, texts in comments.items()})
 
 
@@ -127,15 +127,15 @@ def calibration_table(calibration: Calibration) -> Table:
 
 
 def _result(estimate: Estimate) -> str:
-    return "taken" if estimate.taken else f"left: {estimate.reason}"
+    return "accepted" if estimate.accepted else f"not used: {estimate.reason}"
 
 
 def _describe(estimate: Estimate) -> str:
     """Describe an estimate in a few words, for a comment."""
     if not math.isfinite(estimate.sigma) or not math.isfinite(estimate.value):
-        return f"left: {estimate.reason}"
+        return f"not used: {estimate.reason}"
     value = f"{estimate.value:.6g} +- {estimate.sigma:.2g}"
-    if not estimate.taken:
-        return f"left: {estimate.reason} ({value})"
+    if not estimate.accepted:
+        return f"not used: {estimate.reason} ({value})"
     given = "unknown" if estimate.given is None else f"{estimate.given:.6g}"
     return f"{value}, given {given}"

@@ -36,7 +36,7 @@ ROS = (
     "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0, 0, 0, 0, 0]\n"
 )
 STATED = f"depth_scale: {SCALE}\n"
-QUESTION = Fails(
+NO_SCALE = Fails(
     "{seq}: the unit of depth is not stated and cannot be estimated from the images (8 depth images with values from"
     " 5000 to 5000, median 5000); write the line depth_scale: 1000 into camera.yaml if depth is in millimetres, or else"
     " its units per metre (TUM: 5000)"
@@ -66,10 +66,14 @@ def rename(name: str) -> Damage:
 
 
 CASES = [
-    Case("no depth scale", edit(YAML, replace_text("depth_scale", "#depth_scale")), QUESTION),
-    Case("K.txt with a matrix, no depth scale", numbers(MATRIX), QUESTION),
-    Case("K.txt with six numbers, no depth scale", numbers(f"{FOCAL} {FOCAL} {CX} {CY} {WIDTH} {HEIGHT}\n"), QUESTION),
-    Case("camera_info of ROS, no depth scale", write(YAML, ROS), QUESTION),
+    Case("no depth scale", edit(YAML, replace_text("depth_scale", "#depth_scale")), NO_SCALE),
+    Case("K.txt with a matrix, no depth scale", numbers(MATRIX), NO_SCALE),
+    Case(
+        "K.txt with six numbers, no depth scale",
+        numbers(f"{FOCAL} {FOCAL} {CX} {CY} {WIDTH} {HEIGHT}\n"),
+        NO_SCALE,
+    ),
+    Case("camera_info of ROS, no depth scale", write(YAML, ROS), NO_SCALE),
     Case(
         "K.txt with a matrix, in a folder of the TUM benchmark",
         all_of(numbers(MATRIX), rename("rgbd_dataset_freiburg3_walking_xyz")),
