@@ -27,7 +27,7 @@ from v3d_torch.datasets.base import RGBDSequence
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.segmentation import keep_upright, make_instance_source
+from v3d_torch.segmentation import make_instance_source, wrap_upright
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, Segmenter, Trajectory
 
@@ -187,7 +187,7 @@ def measure(source: str, frames: int, config: Config) -> Iterator[Row]:
         instances = network if change.exchanged or not change.words else remembered
         sequence = ChangedSequence(source, change, frames)
         try:
-            warnings = find_warnings(sequence, keep_upright(instances, config.segmentation), config)
+            warnings = find_warnings(sequence, wrap_upright(instances, config.segmentation), config)
         except V3DError as error:
             warnings = [f"refused: {error}"]
         yield {

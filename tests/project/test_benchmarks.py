@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,20 @@ from systems.process import Measured, SystemRunError, measure
 def measured(rate: float, cpu: float, **stages: float) -> Measured:
     """Run of 100 frames without a pose, with frames per second and CPU ms per frame."""
     return Measured(None, 100, 100 / rate, cpu / 10, stages)
+
+
+SCRIPTS = sorted(path.stem for path in (Path(__file__).parents[2] / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_script_can_be_imported(name: str) -> None:
+    """mypy does not check the benchmarks, and few of them run in tests: a renamed function fails here."""
+    try:
+        import_module(name)
+    except ModuleNotFoundError as error:  # of another package; an ImportError of ours has no other type
+        if error.name is None or error.name.partition(".")[0] in {"v3d_torch", *SCRIPTS}:
+            raise
+        pytest.skip(f"{error.name} is not installed")
 
 
 class TestReplay:
