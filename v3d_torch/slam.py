@@ -149,7 +149,7 @@ class V3DSLAM(ReplaceableStages):
         """Direction against gravity as it is known now, unit vector, world frame, float64, shape :math:`(3,)`.
 
         It comes from measured gravity, else from the floor in the occupancy map, else from the segmentation, else from
-        the first image. Boxes of objects need it: ``result.objects[0].box(slam.up)``.
+        the first image. Boxes of objects need it: ``result.boxes(slam.up)``.
         """
         floor = None if self.occupancy is None else self.occupancy.floor
         if self.gravity is None and floor is not None:

@@ -10,11 +10,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.geometry.level_frame import level_frame
-from v3d_torch.objects.upright_box import upright_box
+from v3d_torch.objects.upright_box import UprightBox, upright_boxes
 
 UP = torch.tensor([0.1, -0.9, 0.2], dtype=torch.float64)
 R_LW = level_frame(UP)[:3, :3]
 AT_REST = torch.zeros(3, dtype=torch.float64)
+
+
+def upright_box(cloud: Tensor, up: Tensor, velocity: Tensor) -> UprightBox:
+    (box,) = upright_boxes([cloud], up, [velocity])
+    return box
 
 
 def cloud_of_box(centre: Tensor, size: Tensor, yaw: float) -> Tensor:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import torch
 
 from v3d_torch.geometry.level_frame import level_frame
-from v3d_torch.objects.frame_objects import MotionState, TrackedObject
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.objects_figure import box_outline, draw_objects
 
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+MASK = torch.zeros(2, 2, dtype=torch.bool)
 CUBE = torch.cartesian_prod(*[torch.tensor([-0.25, 0.25])] * 3)
 
 
@@ -19,8 +20,7 @@ def object_at(stamp: float, number: int, x: float, state: MotionState) -> Tracke
     position = torch.tensor([x, 0.0, 3.0], dtype=torch.float64)
     velocity = torch.tensor([1.0 if state is MotionState.DYNAMIC else 0.0, 0.0, 0.0], dtype=torch.float64)
     motion = ObjectState(stamp, position, velocity, (0.01, 0.0, 0.1), 2.0)
-    mask = torch.zeros(2, 2, dtype=torch.bool)
-    return TrackedObject(number, 0, mask, motion, (), 0, torch.nan, state, False, CUBE + position.float())
+    return TrackedObject(number, 0, MASK, motion, (), 0, torch.nan, state, False, CUBE + position.float())
 
 
 def table_of(*objects: tuple[int, MotionState], frames: int = 8) -> ObjectTable:
@@ -29,7 +29,9 @@ def table_of(*objects: tuple[int, MotionState], frames: int = 8) -> ObjectTable:
     for index in range(frames):
         stamp = index / 10
         shown = [object_at(stamp, n, n + (stamp if state is MotionState.DYNAMIC else 0), state) for n, state in objects]
-        table.append_objects(RGBDFrame(index, stamp, image, torch.ones(1, 2, 2)), shown, UP)
+        table.append_objects(
+            RGBDFrame(index, stamp, image, torch.ones(1, 2, 2)), FrameObjects(shown, MASK, MASK, []), UP
+        )
     return table
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-import torch
 from torch import Tensor
 
 from v3d_torch.objects.object_state import ObjectState
-from v3d_torch.objects.upright_box import UprightBox, upright_box
+from v3d_torch.objects.upright_box import UprightBox, upright_boxes
 from v3d_torch.segmentation.coco import class_name
 
 
@@ -56,19 +55,6 @@ class TrackedObject:
         """Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown."""
         return self.state.position
 
-    def box(self, up: Tensor) -> UprightBox | None:
-        """Return the upright box around the cloud; None without a cloud or a centroid.
-
-        The cloud of a missed object is moved to the predicted centroid.
-
-        Args:
-            up: Direction against gravity, world frame, shape :math:`(3,)`, such as `V3DSLAM.up`.
-        """
-        if not len(self.cloud) or not self.state.is_known:
-            return None
-        motion = self.centroid - self.cloud.to(torch.float64).mean(dim=0) if self.missed else torch.zeros(3)
-        return upright_box(self.cloud + motion, up, self.state.velocity)
-
     @property
     def name(self) -> str:
         """Class name and id, for example ``person 3``."""
@@ -92,3 +78,19 @@ class FrameObjects:
     static_mask: Tensor
     static_without_people: Tensor
     vote_pairs: list[tuple[int, int]]
+
+    def boxes(self, up: Tensor) -> dict[int, UprightBox]:
+        """Compute the upright box of each object that has a cloud and a centroid, by id.
+
+        The cloud of a missed object is moved to the predicted centroid.
+
+        Args:
+            up: Direction against gravity, world frame, shape :math:`(3,)`, such as `V3DSLAM.up`.
+        """
+        located = [each for each in self.objects if len(each.cloud) and each.state.is_known]
+        clouds = [
+            each.cloud + (each.centroid - each.cloud.double().mean(dim=0)) if each.missed else each.cloud
+            for each in located
+        ]
+        boxes = upright_boxes(clouds, up, [each.state.velocity for each in located])
+        return {each.id: box for each, box in zip(located, boxes, strict=True)}

@@ -1,13 +1,15 @@
-"""Upright 3D box of an object: the smallest one around its cloud that stands on the ground plane."""
+"""Upright 3D boxes of objects: the smallest ones around their clouds that stand on the ground plane."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.geometry.level_frame import level_frame
@@ -18,7 +20,7 @@ _MIN_SPEED = 0.3
 
 @dataclass(frozen=True)
 class UprightBox:
-    """Box with two vertical axes planes, turned by the yaw.
+    """Box with vertical sides, rotated by the yaw.
 
     Attributes:
         T_wb: Pose of the box in the world, float64, shape :math:`(4, 4)`. The origin is the centre of the box, x points
@@ -32,20 +34,27 @@ class UprightBox:
     yaw: float
 
 
-def upright_box(cloud: Tensor, up: Tensor, velocity: Tensor) -> UprightBox:
-    """Compute the upright box of a cloud: the rectangle of minimum area around its top view, from bottom to top.
+def upright_boxes(clouds: Sequence[Tensor], up: Tensor, velocities: Sequence[Tensor]) -> list[UprightBox]:
+    """Compute the upright box of each cloud: the rectangle of minimum area around its top view, from bottom to top.
 
     Forward is the side of the rectangle nearest to the velocity. For an object that is slow it is along the longer
     side, and the yaw is from -pi/2 to pi/2.
 
     Args:
-        cloud: Points, world frame, metres, float32 or float64, shape :math:`(P, 3)`; at least one.
+        clouds: Points of each of K objects, world frame, metres, shape :math:`(P_k, 3)`; at least one point each.
         up: Direction against gravity, world frame, shape :math:`(3,)`.
-        velocity: Velocity, world frame, m/s, float64, shape :math:`(3,)`.
+        velocities: Velocity of each object, world frame, m/s, float64, shape :math:`(3,)`.
     """
-    R_lw = level_frame(up)[:3, :3]
-    level = cloud.to(torch.float64) @ R_lw.T
-    (x, y), (side, other), degrees = cv2.minAreaRect(level[:, :2].to(torch.float32).numpy())
+    R_lw = level_frame(up)[:3, :3].numpy()
+    return [
+        _upright_box(cloud.numpy(), R_lw, velocity.numpy()) for cloud, velocity in zip(clouds, velocities, strict=True)
+    ]
+
+
+def _upright_box(cloud: NDArray[np.floating], R_lw: NDArray[np.float64], velocity: NDArray[np.float64]) -> UprightBox:
+    # NumPy is faster here than torch: a frame has tens of small clouds.
+    level = cloud @ R_lw.T
+    (x, y), (side, other), degrees = cv2.minAreaRect(level[:, :2].astype(np.float32))
     vx, vy, _ = (R_lw @ velocity).tolist()
     yaw = math.radians(degrees)
     if math.hypot(vx, vy) >= _MIN_SPEED:
@@ -55,9 +64,10 @@ def upright_box(cloud: Tensor, up: Tensor, velocity: Tensor) -> UprightBox:
         quarters = int(other > side)
         yaw = math.remainder(yaw + quarters * math.pi / 2, math.pi)
     length, width = (side, other) if quarters % 2 == 0 else (other, side)
-    bottom, top = level[:, 2].amin(), level[:, 2].amax()
-    R_lb = torch.from_numpy(np.asarray(cv2.Rodrigues(np.array([0.0, 0.0, yaw]))[0]))
-    T_wb = torch.eye(4, dtype=torch.float64)
-    T_wb[:3, :3] = R_lw.T @ R_lb
-    T_wb[:3, 3] = R_lw.T @ torch.stack([level.new_tensor(x), level.new_tensor(y), (bottom + top) / 2])
-    return UprightBox(T_wb, torch.stack([level.new_tensor(length), level.new_tensor(width), top - bottom]), yaw)
+    bottom, top = float(level[:, 2].min()), float(level[:, 2].max())
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    T_wb = np.eye(4)
+    T_wb[:3, :3] = R_lw.T @ np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    T_wb[:3, 3] = R_lw.T @ np.array([x, y, (bottom + top) / 2])
+    size = torch.tensor([length, width, top - bottom], dtype=torch.float64)
+    return UprightBox(torch.from_numpy(T_wb), size, yaw)

@@ -285,7 +285,7 @@ class Pipeline:
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.states.append_state(result)
-        self.record.dynamics.append_objects(frame, result.objects, self.slam.up)
+        self.record.dynamics.append_objects(frame, result, self.slam.up)
         self._evaluate_masks(frame, result)
         for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
             if folder is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -14,7 +14,7 @@ from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.live_slam import LiveResult
 from v3d_torch.mapping.tensor_table import TensorTable
-from v3d_torch.objects.frame_objects import MotionState, TrackedObject
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.objects.upright_box import UprightBox
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.tracking.camera_state import CameraState
@@ -116,8 +116,9 @@ class ObjectTable(TensorTable):
             missed=((), torch.bool),
         )
 
-    def append_objects(self, frame: RGBDFrame, objects: Sequence[TrackedObject], up: Tensor) -> None:
+    def append_objects(self, frame: RGBDFrame, found: FrameObjects, up: Tensor) -> None:
         """Append the objects of a frame; `up` is the direction against gravity in the world frame, shape (3,)."""
+        objects, boxes = found.objects, found.boxes(up)
         if not objects:
             return
         self.append(
@@ -128,7 +129,7 @@ class ObjectTable(TensorTable):
             centroid=torch.stack([each.centroid for each in objects]),
             velocity=torch.stack([each.state.velocity for each in objects]),
             sigmas=torch.tensor([each.state.sigmas for each in objects], dtype=torch.float64),
-            box=torch.tensor([_box_values(each.box(up)) for each in objects], dtype=torch.float64),
+            box=torch.tensor([_box_values(boxes.get(each.id)) for each in objects], dtype=torch.float64),
             votes=torch.tensor([each.votes for each in objects]),
             chamfer=torch.tensor([each.chamfer for each in objects], dtype=torch.float64),
             motion_state=torch.tensor([_MOTION_STATES.index(each.motion_state) for each in objects]),

@@ -47,9 +47,10 @@ def object_markers(
         T_mw: Transform from the world frame to ``map``, float64, shape :math:`(4, 4)`.
     """
     markers = [_marker(stamp, "", 0, Marker.CUBE, "unknown", action=Marker.DELETEALL)]
+    boxes = objects.boxes(up)
     for each in objects.objects:
-        if (box := each.box(up)) is not None:
-            markers += _box_and_name(stamp, each, box, T_mw)
+        if each.id in boxes:
+            markers += _box_and_name(stamp, each, boxes[each.id], T_mw)
             if each.motion_state is MotionState.DYNAMIC:
                 markers.append(_arrow(stamp, each, T_mw))
     return ros.visualization_msgs__msg__MarkerArray(markers)  # type: ignore[arg-type]  # rosbags annotates an old Marker

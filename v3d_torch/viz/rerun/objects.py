@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 from v3d_torch.viz.voting import VOTE_COLOUR, IdPair, split_votes
 
@@ -42,7 +41,7 @@ def log_objects(stream: rr.RecordingStream, frame_objects: FrameObjects, up: Ten
     sizes = [len(obj.cloud) for obj in objects]
     classes = np.repeat([CLASS_IDS[obj.motion_state] for obj in objects], sizes).astype(np.uint16)
     stream.log("world/objects", rr.Points3D(clouds.numpy(), class_ids=classes, show_labels=False))
-    _log_boxes(stream, objects, up)
+    _log_boxes(stream, frame_objects, up)
     _log_votes(stream, frame_objects)
     for obj in objects:
         stream.log(f"votes/{obj.id}", rr.Scalars(obj.votes))
@@ -83,18 +82,20 @@ def _log_masks(stream: rr.RecordingStream, frame_objects: FrameObjects) -> None:
     stream.log("world/camera/image/objects", boxes)
 
 
-def _log_boxes(stream: rr.RecordingStream, objects: Sequence[TrackedObject], up: Tensor) -> None:
+def _log_boxes(stream: rr.RecordingStream, frame_objects: FrameObjects, up: Tensor) -> None:
     """Log the upright box of each object, and the path of the last seconds of those that move."""
-    boxes = [(obj, box) for obj in objects if (box := obj.box(up)) is not None]
-    rotations = [box.T_wb[:3, :3].numpy() for _, box in boxes]
+    boxes, states = frame_objects.boxes(up), {obj.id: obj.motion_state for obj in frame_objects.objects}
+    rotations = [box.T_wb[:3, :3].numpy() for box in boxes.values()]
     solids = rr.Boxes3D(
-        centers=[box.T_wb[:3, 3].numpy() for _, box in boxes],
-        sizes=[box.size.numpy() for _, box in boxes],
+        centers=[box.T_wb[:3, 3].numpy() for box in boxes.values()],
+        sizes=[box.size.numpy() for box in boxes.values()],
         quaternions=[rr.Quaternion(xyzw=Rotation.from_matrix(R).as_quat()) for R in rotations],
-        class_ids=[CLASS_IDS[obj.motion_state] for obj, _ in boxes],
+        class_ids=[CLASS_IDS[states[number]] for number in boxes],
     )
     stream.log("world/objects/boxes", solids)
-    moving = [obj for obj in objects if obj.motion_state is not MotionState.STATIC and len(obj.history) > 1]
+    moving = [
+        obj for obj in frame_objects.objects if obj.motion_state is not MotionState.STATIC and len(obj.history) > 1
+    ]
     paths = rr.LineStrips3D(
         [np.stack([state.position.numpy() for state in obj.history]) for obj in moving],
         class_ids=[CLASS_IDS[obj.motion_state] for obj in moving],
