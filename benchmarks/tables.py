@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TypeVar
 
+import columns
 from descriptions import describe, kind, published
 from storage import Measurement, Row
 
@@ -24,6 +25,20 @@ COMMANDS = {
     "pyorbslam3": "ORB-SLAM3 (PyPI; no segmentation)",
 }
 """Names of systems in tables, in the order of their rows."""
+
+
+VARIANTS = {
+    "baseline": "no masks",
+    "no_voting": "no votes",
+    "no_chamfer": "no Chamfer distance",
+    "no_prediction": "no prediction of missed objects",
+    "no_unlabelled": "no unlabelled instances",
+    "not_upright": "images not rotated upright",
+    "global_shutter": "no model of the rolling shutter",
+    "paper": "the paper's literal rules",
+    "full": "full",
+}
+"""Names of the variants of the ablation study in tables."""
 
 
 def accuracy_table(measurements: Sequence[Measurement]) -> Iterator[str]:
@@ -63,6 +78,50 @@ def speed_table(measurements: Sequence[Measurement]) -> Iterator[str]:
         yield markdown_row([COMMANDS[system], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)])
 
 
+def objects_table(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the table of masks and ids: a line per variant, a column per sequence, three values in a cell."""
+    rows = [
+        cells | {"objects": f"{cells['moving_masked']} / {cells['static_masked']} / {cells['id_switches']}"}
+        for cells in rows_of(measurements)
+        if "moving_masked" in cells
+    ]
+    yield from pivot(rows, "variant", "sequence", "objects", VARIANTS)
+
+
+def tracks_table(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield the table of tracks, a line per sequence and tracker, with the highest values of a sequence in bold."""
+    rows, marked = rows_of(measurements), []
+    for sequence in unique(cells["sequence"] for cells in rows):
+        of_sequence = [cells for cells in rows if cells["sequence"] == sequence]
+        bold = {name: mark_highest([cells[name] for cells in of_sequence]) for name in ("hota", "idf1")}
+        marked += [
+            cells | {"hota": hota, "idf1": idf1}
+            for cells, hota, idf1 in zip(of_sequence, bold["hota"], bold["idf1"], strict=True)
+        ]
+    yield from flat(marked, columns.TRACKS)
+
+
+def network_tables(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield a table of segmentation networks per sequence, each under a heading."""
+    rows = rows_of(measurements)
+    for number, sequence in enumerate(unique(cells["sequence"] for cells in rows)):
+        if number:
+            yield ""
+        yield f"### {sequence} ({kind(sequence)})"
+        yield ""
+        yield from flat([cells for cells in rows if cells["sequence"] == sequence], columns.SEGMENTATION)
+
+
+def design_table(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield a line per measurement behind a design choice, with the commit and date of each."""
+    rows = [
+        cells | {"commit": f"{measurement.heading.commit}, {measurement.heading.date}"}
+        for measurement in measurements
+        for cells in measurement.rows
+    ]
+    yield from flat(rows, columns.DESIGN_CHOICES)
+
+
 def pivot(
     rows: Sequence[Row], index: str, column: str, value: str, names: Mapping[str, str] | None = None
 ) -> Iterator[str]:
@@ -76,23 +135,23 @@ def pivot(
         names: Names of the lines.
     """
     cells = {(cells[index], cells[column]): cells[value] for cells in rows}
-    columns = unique(key for _, key in cells)
-    headings = [f"{key} ({kind(key)})" if column == "sequence" else key for key in columns]
+    keys = unique(key for _, key in cells)
+    headings = [f"{key} ({kind(key)})" if column == "sequence" else key for key in keys]
     yield markdown_row([index, *headings])
-    yield markdown_row(["---", *["---:"] * len(columns)])
+    yield markdown_row(["---", *["---:"] * len(keys)])
     for line in unique(key for key, _ in cells):
-        yield markdown_row([(names or {}).get(line, line), *(cells.get((line, key), "-") for key in columns)])
+        yield markdown_row([(names or {}).get(line, line), *(cells.get((line, key), "-") for key in keys)])
 
 
-def flat(rows: Sequence[Row], columns: Mapping[str, str]) -> Iterator[str]:
+def flat(rows: Sequence[Row], headings: Mapping[str, str]) -> Iterator[str]:
     """Yield a table with a line per row and the columns that at least one row has.
 
     Args:
         rows: Rows to tabulate.
-        columns: Headings of the columns by cell.
+        headings: Headings of the columns by cell.
     """
-    shown = [name for name in columns if any(name in cells for cells in rows)]
-    yield markdown_row([columns[name] for name in shown])
+    shown = [name for name in headings if any(name in cells for cells in rows)]
+    yield markdown_row([headings[name] for name in shown])
     yield markdown_row(["---"] * len(shown))
     for cells in rows:
         yield markdown_row([cells.get(name, "-") for name in shown])
@@ -134,7 +193,7 @@ def commits(measurements: Iterable[Measurement]) -> list[str]:
     return unique(measurement.heading.commit for measurement in measurements)
 
 
-def bullets(texts: Sequence[str]) -> Iterator[str]:
+def bullets(texts: Iterable[str]) -> Iterator[str]:
     """Yield a list item per text."""
     yield from (f"- {text}" for text in texts)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from descriptions import sequence_list
-from sections import SECTIONS
+from sections import SECTIONS, section_lines
 from storage import RESULTS, load
 from tables import accuracy_table, commits, speed_table
 
@@ -36,9 +36,8 @@ def page(folder: Path = RESULTS) -> str:
     """Return the page of all benchmarks."""
     results = {path.stem: load(path.stem, folder) for path in sorted(folder.glob("*.json"))}
     lines = [*INTRODUCTION.splitlines(), "", *sequence_list()]
-    for names, section in SECTIONS:
-        if any(results.get(name) for name in names):
-            lines += ["", *section(*(results.get(name, []) for name in names))]
+    for title in SECTIONS:
+        lines += section_lines(title, results)
     return "\n".join(lines) + "\n"
 
 
