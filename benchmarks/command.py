@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from storage import Measurement, save
+from heading import make_heading
+from sequences import locate_sequence
+from storage import Measurement, Row, save
+from tables import flat
 
-from v3d_torch.errors import OutputError
+from v3d_torch.errors import OutputError, V3DError
 from v3d_torch.io.files import write_text
 
 
@@ -32,6 +35,38 @@ def add_vocabulary_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vocabulary", type=Path, help="vocabulary of pyorbslam3, in DBoW2's text format [trained on the sequences]"
     )
+
+
+def add_sequences_option(parser: argparse.ArgumentParser, kind: str) -> None:
+    """Add the option ``--seqs``, with the demo as its default; `kind` says what the sequences must have."""
+    parser.add_argument("--seqs", nargs="+", default=["demo"], help=f"sequences with {kind} [demo]")
+
+
+def publish_rows(
+    parser: argparse.ArgumentParser,
+    options: argparse.Namespace,
+    name: str,
+    headings: Mapping[str, str],
+    measure: Callable[[str], Iterable[Row]],
+    about: Iterable[str] = (),
+) -> None:
+    """Measure each sequence of ``--seqs`` and publish the rows as one table.
+
+    Args:
+        parser: Reports a sequence that fails.
+        options: Parsed options.
+        name: Name of the file of the measurement.
+        headings: Headings of the columns by cell.
+        measure: Returns the rows of a sequence, given as `load_sequence` takes it.
+        about: Lines below the table.
+    """
+    heading = make_heading()
+    try:
+        rows = [row for sequence in options.seqs for row in measure(locate_sequence(sequence, options.data_root))]
+    except V3DError as error:
+        parser.error(str(error))
+    lines = [*heading.lines(), "", *flat(rows, headings), *about]
+    publish(lines, options, parser, {name: Measurement(heading, rows)})
 
 
 def publish(

@@ -7,25 +7,21 @@ squared (NEES; Bar-Shalom, Li and Kirubarajan, Estimation with Applications to T
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import columns
 import numpy as np
 import torch
-from command import make_parser, publish
-from heading import make_heading
+from command import add_sequences_option, make_parser, publish_rows
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2, norm
-from sequences import locate_sequence
-from storage import Measurement, Row
+from storage import Row
 from systems.ours import OPTIONS, Ours
-from tables import flat
 from torch import Tensor
 
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import adjoint, invert, se3_exp, se3_log
 from v3d_torch.types import Trajectory
 
@@ -190,38 +186,38 @@ def make_row(sequence: str, configuration: str, errors: Errors, sigmas: Tensor) 
     }
 
 
-def run(sequence: str, configuration: str, options: argparse.Namespace) -> Row:
+def run(source: str, configuration: str) -> Row:
     """Run a sequence and return its row.
+
+    Args:
+        source: Sequence as `load_sequence` takes it.
+        configuration: One of `OPTIONS`.
 
     Raises:
         InputError: If there is no ground truth.
         V3DError: If the run fails.
     """
-    source = load_sequence(locate_sequence(sequence, options.data_root), data_root=options.data_root)
-    if source.groundtruth is None:
-        raise InputError(f"{sequence}: has no ground truth; choose another sequence")
-    system = Ours(source, configuration, seed=0)
+    sequence = load_sequence(source)
+    if sequence.groundtruth is None:
+        raise InputError(f"{source}: has no ground truth; choose another sequence")
+    system = Ours(sequence, configuration, seed=0)
     system()
     states = system.pipeline.record.states
     T_wc = torch.eye(4, dtype=torch.float64).repeat(len(states), 1, 1)
     T_wc[:, :3] = states["T_wc"]
-    errors = calibrated_errors(source.groundtruth, states["stamp"], T_wc, states["covariance"].to(torch.float64))
-    return make_row(sequence, configuration, errors, groundtruth_noise(source.groundtruth))
+    errors = calibrated_errors(sequence.groundtruth, states["stamp"], T_wc, states["covariance"].to(torch.float64))
+    return make_row(sequence.name, configuration, errors, groundtruth_noise(sequence.groundtruth))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run all sequences and print the table."""
     parser = make_parser("Consistency of the covariance of poses with their errors, as Markdown.")
-    parser.add_argument("--seqs", nargs="+", default=["demo"], help="sequences with ground truth [demo]")
+    add_sequences_option(parser, "ground truth")
     parser.add_argument("--configuration", choices=OPTIONS, default="v3d_torch", help="configuration [v3d_torch]")
     options = parser.parse_args(arguments)
-    heading = make_heading()
-    try:
-        rows = [run(name, options.configuration, options) for name in options.seqs]
-    except V3DError as error:
-        parser.error(str(error))
-    lines = [*heading.lines(), "", *flat(rows, columns.CONSISTENCY)]
-    publish(lines, options, parser, {"consistency": Measurement(heading, rows)})
+    publish_rows(
+        parser, options, "consistency", columns.CONSISTENCY, lambda source: [run(source, options.configuration)]
+    )
 
 
 if __name__ == "__main__":

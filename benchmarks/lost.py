@@ -7,15 +7,13 @@ interruption and has nearly the same orientation.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import columns
 import torch
-from command import make_parser, publish
-from heading import make_heading
+from command import add_sequences_option, make_parser, publish_rows
 from interruptions import (
     COVERED,
     NO_POSITION,
@@ -27,15 +25,13 @@ from interruptions import (
     elsewhere,
     uninterrupted,
 )
-from sequences import locate_sequence
-from storage import Measurement, Row
-from tables import flat
+from storage import Row
 from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
 from v3d_torch.geometry.se3 import invert, se3_log
@@ -176,10 +172,11 @@ def true_poses(sequence: RGBDSequence) -> Tensor:
     return T_gc
 
 
-def measure(
-    sequence: RGBDSequence, gaps: Sequence[int], before: int, after: int, config: Config, masks: Path | None
-) -> Iterator[Row]:
+def measure(source: str, gaps: Sequence[int], before: int, after: int, with_masks: bool) -> Iterator[Row]:
     """Yield a row per interruption."""
+    config = load_config(overrides=[f"segmentation.source={'masks' if with_masks else 'none'}"])
+    masks = Path(source) / "masks" if with_masks else None
+    sequence = load_sequence(source)
     count, T_gc = len(sequence), true_poses(sequence)
     plain = run_case(sequence, uninterrupted(count, before + max(gaps) + after), config, masks)
     cases = [make(count, before, gap, after) for make in (covered, dropped) for gap in gaps]
@@ -200,36 +197,24 @@ def measure(
         }
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
+def main() -> None:
+    """Run all cases and print the table."""
     parser = make_parser("Recovery of a camera that was covered, lost frames or was moved elsewhere, as Markdown.")
-    parser.add_argument("--seqs", nargs="+", default=["demo"], help="sequences with ground truth [demo]")
+    add_sequences_option(parser, "ground truth")
     parser.add_argument(
         "--gaps", nargs="+", type=int, default=[30, 60, 150], help="frames covered or dropped [30 60 150]"
     )
     parser.add_argument("--before", type=int, default=90, help="number of frames before the interruption [90]")
     parser.add_argument("--after", type=int, default=60, help="number of frames after the interruption [60]")
     parser.add_argument("--masks", action="store_true", help="mask people with the true masks [no masks]")
-    return parser
-
-
-def main() -> None:
-    """Run all cases and print the table."""
-    parser = arguments()
     options = parser.parse_args()
-    heading = make_heading()
-    rows: list[Row] = []
-    config = load_config(overrides=[f"segmentation.source={'masks' if options.masks else 'none'}"])
-    try:
-        for name in options.seqs:
-            source = locate_sequence(name, options.data_root)
-            masks = Path(source) / "masks" if options.masks else None
-            sequence = load_sequence(source, data_root=options.data_root)
-            rows += measure(sequence, options.gaps, options.before, options.after, config, masks)
-    except V3DError as error:
-        parser.error(str(error))
-    lines = [*heading.lines(), "", *flat(rows, columns.LOST | {"reference": "ATE uninterrupted, m"})]
-    publish(lines, options, parser, {"lost": Measurement(heading, rows)})
+    publish_rows(
+        parser,
+        options,
+        "lost",
+        columns.LOST | {"reference": "ATE uninterrupted, m"},
+        lambda source: measure(source, options.gaps, options.before, options.after, options.masks),
+    )
 
 
 if __name__ == "__main__":

@@ -6,18 +6,14 @@ of each sequence, runs its first frames, and counts the warnings: a right sequen
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import columns
 import torch
-from command import make_parser, publish
-from heading import make_heading
-from sequences import locate_sequence
-from storage import Measurement, Row
-from tables import flat
+from command import add_sequences_option, make_parser, publish_rows
+from storage import Row
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -183,7 +179,7 @@ def measure(source: str, frames: int, config: Config) -> Iterator[Row]:
     network = make_instance_source(config.segmentation)
     remembered = RememberedInstances(network)
     for name, change in CHANGES.items():
-        # Only the network itself is asked whether the colours are right.
+        # Colours are compared by the network, so its instances must be found again.
         instances = network if change.exchanged or not change.words else remembered
         sequence = ChangedSequence(source, change, frames)
         try:
@@ -207,27 +203,16 @@ def _result(change: Change, warnings: list[str]) -> str:
     return "another cause named" if warnings else "missed"
 
 
-def arguments() -> argparse.ArgumentParser:
-    """Return the parser of the command line."""
-    parser = make_parser("What the plausibility check finds in sequences that were made wrong, as Markdown.")
-    parser.add_argument("--seqs", nargs="+", default=["demo"], help="sequences with a right camera [demo]")
-    parser.add_argument("--frames", type=int, default=120, help="frames of each sequence [120]")
-    return parser
-
-
 def main() -> None:
     """Run all changes and print the table."""
-    parser = arguments()
+    parser = make_parser("What the plausibility check finds in sequences that were made wrong, as Markdown.")
+    add_sequences_option(parser, "a right camera")
+    parser.add_argument("--frames", type=int, default=120, help="frames of each sequence [120]")
     options = parser.parse_args()
-    heading = make_heading()
-    config, rows = load_config(), list[Row]()
-    try:
-        for name in options.seqs:
-            rows += measure(locate_sequence(name, options.data_root), options.frames, config)
-    except V3DError as error:
-        parser.error(str(error))
-    lines = [*heading.lines(), "", *flat(rows, columns.PLAUSIBILITY)]
-    publish(lines, options, parser, {"plausibility": Measurement(heading, rows)})
+    config = load_config()
+    publish_rows(
+        parser, options, "plausibility", columns.PLAUSIBILITY, lambda source: measure(source, options.frames, config)
+    )
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.unlabelled import unlabelled_instances
+from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.occupancy.up_direction import estimate_up
 from v3d_torch.odometry.motion_estimator import MotionEstimator
@@ -151,9 +152,8 @@ class V3DSLAM(ReplaceableStages):
         It comes from measured gravity, else from the floor in the occupancy map, else from the segmentation, else from
         the first image. Boxes of objects need it: ``result.boxes(slam.up)``.
         """
-        floor = None if self.occupancy is None else self.occupancy.floor
-        if self.gravity is None and floor is not None:
-            return floor.up
+        if self.gravity is None and self._floor is not None:
+            return self._floor.up
         return estimate_up(self.gravity, up_votes(self._segmenter_state)).direction
 
     @property
@@ -163,10 +163,11 @@ class V3DSLAM(ReplaceableStages):
         Up is against the measured gravity; without a measurement it is the normal of the floor in the occupancy map,
         and follows it. None while neither is known.
         """
-        if self.gravity is not None:
-            return level_frame(-self.gravity)
-        floor = None if self.occupancy is None else self.occupancy.floor
-        return None if floor is None else level_frame(floor.up)
+        return None if self.gravity is None and self._floor is None else level_frame(self.up)
+
+    @property
+    def _floor(self) -> Floor | None:
+        return None if self.occupancy is None else self.occupancy.floor
 
     def __call__(self, frame: RGBDFrame) -> FrameResult:
         """Process the next frame: preprocess and track.

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from track_evaluation.scores import FrameOverlap
 from track_evaluation.truth import TruePeople
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.types import Trajectory
 
@@ -142,9 +144,9 @@ def _true_position(
         return None
     z = depth[inside]
     near = np.abs(z - np.median(z)) < _MAX_DEPTH_DIFFERENCE
-    points = (rays[inside] * z[:, None])[near].astype(np.float64)
-    _, first = np.unique(np.floor(points / _VOXEL_SIZE), axis=0, return_index=True)
-    return np.asarray(points[first].mean(axis=0))
+    points = torch.from_numpy((rays[inside] * z[:, None])[near].astype(np.float64))[None]
+    voxels = voxel_pool(points, torch.ones(points.shape[:2], dtype=torch.bool), _VOXEL_SIZE)
+    return np.asarray(voxels.means[0].mean(dim=0).numpy())
 
 
 def format_scores(scores: MotionScores) -> dict[str, str]:
