@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
-from v3d_torch.calibration import Calibration
+from v3d_torch.calibration.camera_calibration import Calibration
 from v3d_torch.config import Config
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.geometry.camera import PinholeCamera

@@ -1,7 +1,7 @@
 """Time and memory of long runs and large maps, as Markdown.
 
-``python benchmarks/growth.py --seq fr1_rpy --frames 5000`` plays a sequence forth and back. A second table has place
-recognition and pose graph alone, on thousands of synthetic keyframes.
+``python benchmarks/growth.py --seq fr1_rpy --frames 5000`` plays a sequence forwards and backwards. A second table
+has place recognition and pose graph alone, on thousands of synthetic keyframes.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def close_ring(count: int, generator: torch.Generator) -> Row:
 def arguments() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = make_parser("Time and memory of a long run and of many keyframes, as Markdown.")
-    parser.add_argument("--seq", default="demo", help="sequence to play forth and back [demo]")
+    parser.add_argument("--seq", default="demo", help="sequence to play forwards and backwards [demo]")
     parser.add_argument("--frames", type=int, default=5000, help="number of frames of the run [5000]")
     parser.add_argument("--keyframes", type=int, default=5000, help="largest number of synthetic keyframes [5000]")
     return parser
@@ -204,7 +204,7 @@ def main() -> None:
     except V3DError as error:
         parser.error(str(error))
     rows = list(measure_keyframes(options.keyframes))
-    lines = [*heading.lines(), "", f"## {options.seq}, forth and back", "", *run.lines]
+    lines = [*heading.lines(), "", f"## {options.seq}, forwards and backwards", "", *run.lines]
     lines += ["", "## Synthetic keyframes", "", *flat(rows, columns.KEYFRAMES | {"iterations": "iterations"})]
     measurements = {"growth": Measurement(heading, [run.row]), "keyframes": Measurement(heading, rows)}
     publish(lines, options, parser, measurements)

@@ -53,7 +53,7 @@ def test_script_can_be_imported(name: str) -> None:
 
 
 class TestReplay:
-    def test_forth_and_back_turns_at_the_ends(self) -> None:
+    def test_back_and_forth_turns_at_the_ends(self) -> None:
         assert back_and_forth(4, 11) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2]
 
     def test_time_advances_by_intervals_between_frames(self, moment: Path) -> None:

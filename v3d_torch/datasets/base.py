@@ -43,6 +43,15 @@ class LiveStream(RGBDStream, Protocol):
 
 
 @runtime_checkable
+class SkipsFrames(Protocol):
+    """A stream that leaves out frames of its source to keep up with their rate."""
+
+    @property
+    def skipped(self) -> int:
+        """Number of frames that were skipped so far."""
+
+
+@runtime_checkable
 class RGBDSequence(RGBDStream, Protocol):
     """A source with a fixed number of RGB-D frames that can be indexed."""
 

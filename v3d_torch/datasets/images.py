@@ -151,7 +151,7 @@ def _decode(file: Path | BytesIO, source: object) -> Image.Image:
     """Decode a whole image."""
     image = _read_header(file, source)
     try:
-        if image.format == "PNG":  # Pillow ignores the checksum of pixel data unless it is asked to verify it
+        if image.format == "PNG":  # Pillow ignores the checksum of pixel data unless verify() is called
             image.verify()
             if isinstance(file, BytesIO):
                 file.seek(0)

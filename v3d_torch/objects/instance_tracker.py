@@ -48,9 +48,9 @@ class InstanceTracker(torch.nn.Module):
 
     The instances of a frame continue tracks in four stages, each an optimal assignment: first confirmed tracks, then
     those without masks, then new ones that are not confirmed yet; instances without a class continue what is left. If
-    an object is not detected any more and may move, its mask is predicted for a short time. Nobody needs the mask of
-    furniture, whose pixels tracking uses: it rests for this time, without a mask. Then both are lost: they keep their
-    ids for some seconds, in case they were hidden or out of view. The state (tracks and next id) is part of
+    an object is not detected any more and may move, its mask is predicted for a short time. An object that does not
+    move has no mask in this time, because tracking uses its pixels; it is called resting. Then both are lost: they keep
+    their ids for some seconds, in case they were hidden or out of view. The state (tracks and next id) is part of
     ``state_dict()``.
 
     Args:
