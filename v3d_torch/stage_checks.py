@@ -8,13 +8,16 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError
 from v3d_torch.features.features import Features
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
+from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
@@ -94,6 +97,16 @@ class ReplaceableStages:
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
         super().__setattr__(name, value)
+
+    def replace_configured(self, config: Config, camera: PinholeCamera) -> None:
+        """Replace the stages for which the configuration has an import path, but the segmenter, see `make_segmenter`.
+
+        Raises:
+            ConfigError: If a stage cannot be made, see `make_stage`.
+        """
+        for name, path in config.stages.paths.items():
+            if name != "segment":
+                setattr(self, name, make_stage(name, path, config, camera))
 
 
 class ReplacedStage(StageProxy):
