@@ -105,6 +105,7 @@ class V3DSLAM(ReplaceableStages):
         known_map: SparseMap | None = None,
     ) -> None:
         check_parameters(camera, segment, config)
+        super().__init__()
         self.camera = camera
         self.config = config = config or Config()
         self.timer = StageTimer()
