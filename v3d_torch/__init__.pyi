@@ -2,6 +2,7 @@ from .backend.pose_graph import PoseGraphOptimiser, PoseGraphResult, optimise_po
 from .config import Config
 from .config.loading import load_config
 from .datasets import SourceOptions, load_sequence, open_source
+from .datasets.frame_datasets import ClipDataset, FrameDataset, PairDataset
 from .datasets.realtime_playback import RealtimePlayback
 from .datasets.tum_trajectory import read_trajectory, write_trajectory
 from .errors import ConfigError, DownloadError, GroundTruthWarning, InputError, V3DError
@@ -56,6 +57,7 @@ __all__ = [
     "BundleAdjustment",
     "CameraState",
     "ChamferDistance",
+    "ClipDataset",
     "Config",
     "ConfigError",
     "Deformation",
@@ -67,6 +69,7 @@ __all__ = [
     "EssentialMatrix",
     "EssentialRANSAC",
     "Floor",
+    "FrameDataset",
     "FrameResult",
     "GroundTruthWarning",
     "HoughVoting",
@@ -82,6 +85,7 @@ __all__ = [
     "OccupancyGrid",
     "OccupancyMap",
     "OccupancyMapper",
+    "PairDataset",
     "PinholeCamera",
     "PnP",
     "PnPRANSAC",

@@ -73,7 +73,8 @@ class V3DSLAM(ReplaceableStages):
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
     signature; the results of the replacement are checked. `compensate`, `estimate_motion`, `track_map` and
     `loop_closer` are also used inside other stages, which keep their own references to the original. `preprocess` runs
-    the stages that depend only on the frame, and can run ahead of `track`.
+    the stages that depend only on the frame, and can run ahead of `track`. Hooks see the
+    arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -143,7 +144,7 @@ class V3DSLAM(ReplaceableStages):
         # Free and occupied space
         self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
         self.gravity: Tensor | None = None
-        self.replace_configured(config, camera)
+        self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)

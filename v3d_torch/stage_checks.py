@@ -142,7 +142,7 @@ class ReplaceableStages:
         self._stage_hooks[handle.id] = name, hook
         return handle
 
-    def replace_configured(self, config: Config, camera: PinholeCamera) -> None:
+    def _replace_configured(self, config: Config, camera: PinholeCamera) -> None:
         """Replace the stages for which the configuration has an import path, but the segmenter, see `make_segmenter`.
 
         Raises:

@@ -22,6 +22,7 @@ from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
+from v3d_torch.geometry.se3 import interpolate
 
 
 @runtime_checkable
@@ -323,3 +324,19 @@ class Trajectory:
 
     def __len__(self) -> int:
         return self.stamps.shape[0]
+
+    def poses_at(self, stamps: Tensor) -> Tensor:
+        """Return the poses at given times, interpolated between the nearest poses before and after.
+
+        Args:
+            stamps: Timestamps, seconds, float64, shape :math:`(K,)`; before the first pose and after the last one, the
+                camera is at rest.
+
+        Returns:
+            Camera-to-world poses, float64, shape :math:`(K, 4, 4)`.
+        """
+        before = (torch.searchsorted(self.stamps, stamps, right=True) - 1).clamp(min=0)
+        after = (before + 1).clamp(max=len(self) - 1)
+        span = (self.stamps[after] - self.stamps[before]).clamp(min=torch.finfo(torch.float64).tiny)  # 0 at the end
+        fraction = ((stamps - self.stamps[before]) / span).clamp(0, 1)
+        return interpolate(self.T_wc[before], self.T_wc[after], fraction)

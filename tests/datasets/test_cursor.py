@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import pickle
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -23,3 +26,24 @@ def test_cursor_restarts_the_stream_only_to_go_back() -> None:
     with pytest.raises(IndexError):
         cursor[5]
     assert cursor[2] == "c"
+
+
+def test_pickled_cursor_starts_again() -> None:
+    cursor = Cursor(partial(iter, "abc"))
+    assert cursor[2] == "c"
+    copy = pickle.loads(pickle.dumps(cursor))  # noqa: S301
+    assert copy[0] == "a" and cursor[2] == "c"
+
+
+def test_cursor_starts_again_in_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    starts: list[Iterator[str]] = []
+
+    def start() -> Iterator[str]:
+        starts.append(iter("abcde"))
+        return starts[-1]
+
+    cursor = Cursor(start)
+    assert cursor[1] == "b"
+    monkeypatch.setattr(os, "getpid", lambda: -1)  # as in a process that was forked
+    assert [cursor[1], cursor[3]] == ["b", "d"] and len(starts) == 2
+    assert next(starts[0]) == "c"  # the position of the parent has not changed

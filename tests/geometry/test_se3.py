@@ -9,9 +9,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, orthonormalise, se3_exp, se3_log
+from v3d_torch.geometry.se3 import adjoint, interpolate, invert, left_jacobian_inverse, orthonormalise, se3_exp, se3_log
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
@@ -125,6 +126,17 @@ def test_orthonormalised_chain_of_poses_stays_rigid() -> None:
     assert pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     identity = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(pose[:3, :3] @ pose[:3, :3].T, identity, rtol=0, atol=1e-12)
+
+
+def test_interpolation_turns_like_slerp_and_reaches_both_ends() -> None:
+    random = torch.Generator().manual_seed(2)
+    T = se3_exp(torch.randn(2, 6, dtype=torch.float64, generator=random))
+    fraction = torch.tensor([0.0, 0.2, 0.7, 1.0], dtype=torch.float64)
+    found = interpolate(T[0], T[1], fraction)
+    rotations = Slerp([0, 1], Rotation.from_matrix(T[:, :3, :3].numpy()))(fraction.numpy()).as_matrix()
+    torch.testing.assert_close(found[:, :3, :3], torch.from_numpy(rotations), rtol=0, atol=1e-12)
+    assert found[0].equal(T[0])
+    torch.testing.assert_close(found[-1], T[1], rtol=0, atol=1e-12)
 
 
 def test_functions_accept_any_batch_shape() -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from v3d_torch.calibration.view_edges import ViewEdges, find_edges
-from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.optim.jackknife import jackknife_covariance
 from v3d_torch.types import Trajectory
@@ -105,7 +105,7 @@ class EdgeAlignment:
         self._depth_stamp = self._stamp + delays
         if not pairs:
             return
-        self._T_cw = _poses_at(trajectory, self._stamp)
+        self._T_cw = invert(trajectory.poses_at(self._stamp))
         self._pixel, depth, self._axis = (
             torch.cat([getattr(edges, name) for edges in self._edges]) for name in ("pixel", "depth", "axis")
         )
@@ -224,7 +224,7 @@ class EdgeAlignment:
 
     def _at_time_of_colour(self, delay: float) -> Tensor:
         """Pixels of the boundaries at the time of the colour image, if depth has an additional delay, (E, 2)."""
-        T_cd = self._T_cw @ invert(_poses_at(self._trajectory, self._depth_stamp + delay))
+        T_cd = self._T_cw @ self._trajectory.poses_at(self._depth_stamp + delay)
         R, t = T_cd[self._view, :3, :3], T_cd[self._view, :3, 3]
         return self._camera.project((R @ self._points[..., None])[..., 0] + t)
 
@@ -281,15 +281,6 @@ def _ascent_step(gradient: Tensor, hessian: Tensor) -> Tensor:
     curvature, directions = torch.linalg.eigh(hessian)
     step = directions @ (directions.T @ gradient / curvature.abs().clamp(min=1e-9))
     return step / max(float(step.abs().max()), 1.0)
-
-
-def _poses_at(trajectory: Trajectory, stamps: Tensor) -> Tensor:
-    """World-to-camera poses at given times, interpolated between the nearest frames, (K, 4, 4)."""
-    known = trajectory.stamps
-    after = torch.searchsorted(known, stamps).clamp(1, len(known) - 1)
-    fraction = ((stamps - known[after - 1]) / (known[after] - known[after - 1])).clamp(0, 1)
-    first, second = (invert(trajectory.T_wc[index]) for index in (after - 1, after))
-    return se3_exp(fraction[:, None] * se3_log(second @ invert(first))) @ first
 
 
 def _correlation(edges: ViewEdges, reach: int) -> Tensor:

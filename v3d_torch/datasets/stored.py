@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
@@ -119,7 +120,8 @@ class StoredSequence(ABC):
 class Cursor(Generic[_T]):
     """Random access to the items of a stream that can only be read forward.
 
-    Reading forward continues the stream; reading backward restarts it.
+    Reading forward continues the stream; reading backward restarts it, and so does another process, to which a cursor
+    was copied or pickled.
 
     Args:
         start: Function that returns an iterator over all items.
@@ -127,6 +129,7 @@ class Cursor(Generic[_T]):
 
     def __init__(self, start: Callable[[], Iterator[_T]]) -> None:
         self._start = start
+        self._process = os.getpid()
         self._items: Iterator[_T] = iter(())
         self._index: int | None = None
         self._item: _T | None = None
@@ -137,6 +140,11 @@ class Cursor(Generic[_T]):
         Raises:
             IndexError: If the stream has no such item.
         """
+        if self._process != os.getpid():
+            # A process that was forked shares the position in open files with its parent. The files are not closed,
+            # because a decoder would wait for its threads, which are not in this process.
+            self._of_parent = self._items
+            self._process, self._index, self._item = os.getpid(), None, None
         if self._item is not None and index == self._index:
             return self._item
         if self._index is None or index < self._index:
@@ -147,3 +155,7 @@ class Cursor(Generic[_T]):
             self._index = None
             raise IndexError(index)
         return self._item
+
+    def __reduce__(self) -> tuple[type[Cursor[_T]], tuple[Callable[[], Iterator[_T]]]]:
+        """Pickle the start of the stream alone."""
+        return Cursor, (self._start,)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 
@@ -74,8 +75,8 @@ class VideoSequence(ImageSequence):
                 " that both videos belong to the same recording"
             )
         super().__init__(path.resolve().stem, [stamps[i] for i, _ in self._pairs], chosen)
-        self._colour_frames = Cursor(lambda: _open_frames(colour_path))
-        self._depth_frames = Cursor(lambda: _open_frames(depth_path, is_depth=True))
+        self._colour_frames = Cursor(partial(_open_frames, colour_path))
+        self._depth_frames = Cursor(partial(_open_frames, depth_path, is_depth=True))
         self._settle_depth_scale(path, _SAMPLED_FRAMES)
 
     def frames_from(self, index: int) -> Iterator[RGBDFrame]:

@@ -158,6 +158,20 @@ def se3_log(T: Tensor) -> Tensor:
     return torch.cat([rho[..., 0], phi], dim=-1).to(dtype)
 
 
+def interpolate(T_a: Tensor, T_b: Tensor, fraction: Tensor) -> Tensor:
+    """Interpolate rigid motions along the geodesic between them, with a constant twist.
+
+    Args:
+        T_a: Rigid motions at fraction 0, shape :math:`(..., 4, 4)`.
+        T_b: Rigid motions at fraction 1, shape :math:`(..., 4, 4)`.
+        fraction: Fractions, shape :math:`(...)`.
+
+    Returns:
+        Rigid motions, shape :math:`(..., 4, 4)`.
+    """
+    return se3_exp(fraction[..., None] * se3_log(T_b @ invert(T_a))) @ T_a
+
+
 def hat(xi: Tensor) -> Tensor:
     r"""Hat operator of se(3): tangent vectors as matrices.
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log
+from v3d_torch.geometry.se3 import interpolate, invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
@@ -208,5 +208,5 @@ def _interpolate(stamps: Tensor, T: Tensor, found: Tensor) -> Tensor:
     a, b = known[after[between] - 1], known[after[between].clamp(max=known.shape[0] - 1)]
     fraction = (stamps[between] - stamps[a]) / (stamps[b] - stamps[a])
     T = T.clone()
-    T[between] = se3_exp(fraction[:, None] * se3_log(T[b] @ invert(T[a]))) @ T[a]
+    T[between] = interpolate(T[a], T[b], fraction)
     return T
