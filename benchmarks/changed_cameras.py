@@ -56,5 +56,7 @@ def calibrate_changed_cameras(
             return select(load_sequence(source, camera=camera or given))
 
         yield ChangedCamera(
-            name, given, calibrate_sequence(open_sequence, NoSegmentation, config, lambda *_: lambda *_: None)
+            name,
+            given,
+            calibrate_sequence(open_sequence, lambda _: NoSegmentation(), config, lambda *_: lambda *_: None),
         )

@@ -48,7 +48,7 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
         InputError: If a frame has no true mask.
     """
     config = Config()
-    slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
+    slam = V3DSLAM(sequence.camera, make_segmenter(config, sequence.camera), config)
     views, masked, unmasked = (StaticViews(sequence.camera, config.dense_map.stride) for _ in range(3))
     for frame in sequence:
         objects = slam(frame)

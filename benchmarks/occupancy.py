@@ -53,7 +53,7 @@ def run(sequence: RGBDSequence) -> tuple[Pipeline, OccupancyMapper]:
     """Run the system with an occupancy map over a sequence."""
     config = load_config(overrides=["occupancy.enabled=true"])
     set_num_threads(config.threads)
-    slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
+    slam = V3DSLAM(sequence.camera, make_segmenter(config, sequence.camera), config)
     pipeline = Pipeline(sequence, slam, evaluate_masks=False)
     pipeline()
     pipeline.flush()

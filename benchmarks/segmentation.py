@@ -101,7 +101,7 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
     for name, variant in VARIANTS.items():
         config = load_config(overrides=[*SERIAL, *variant.overrides])
         set_num_threads(config.threads)
-        segmenter = MeasuredSegmenter(make_segmenter(config.segmentation), variant.every)
+        segmenter = MeasuredSegmenter(make_segmenter(config, sequence.camera), variant.every)
         pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segmenter, config))
         run = pipeline()
         if run.failure is not None:

@@ -55,7 +55,7 @@ class TrackedFrame:
 def run(sequence: RGBDSequence, config: Config, frames: int | None) -> Iterator[TrackedFrame]:
     """Run the system over the first frames of a sequence."""
     set_num_threads(config.threads)
-    slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
+    slam = V3DSLAM(sequence.camera, make_segmenter(config, sequence.camera), config)
     with torch.inference_mode():
         for index in range(len(sequence) if frames is None else frames):
             preprocessed = slam.preprocess(sequence[index], slam.predictions[0])

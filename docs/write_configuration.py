@@ -76,6 +76,8 @@ def sections(classes: dict[str, ast.ClassDef], name: str, path: str) -> Iterator
 def default(value: ast.expr | None) -> str:
     """Return the default of a field as it is written in YAML."""
     literal = ast.literal_eval(value.args[0] if isinstance(value, ast.Call) else value or ast.Constant(None))
+    if literal is None:
+        return "null"
     if isinstance(literal, bool):
         return str(literal).lower()
     return str(list(literal) if isinstance(literal, tuple) else literal)

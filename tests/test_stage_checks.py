@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from helpers.own_stages import MODULE, write_own_stages
 
-from v3d_torch.config.loading import load_config
+from v3d_torch.config import Config, StagesConfig
+from v3d_torch.config.loading import load_config, override_config
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.odometry.odometry import Odometry
 from v3d_torch.runs.numerics_check import CheckedSLAM
+from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.stage_checks import ReplacedStage
 from v3d_torch.types import Instances, RGBDFrame
@@ -197,3 +202,57 @@ def test_segmenter_on_another_device_is_rejected() -> None:
     slam = V3DSLAM(CAMERA, lambda frame: replace(segment(frame), scores=torch.ones(2, device="meta")), CONFIG)
     with pytest.raises(ConfigError, match=r"segmenter's scores for frame 0 are torch.float32 of shape \(2,\) on meta"):
         slam(FRAMES[0])
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(write_own_stages(tmp_path))
+    monkeypatch.delitem(sys.modules, MODULE, raising=False)
+
+
+def configure(*overrides: str) -> Config:
+    return override_config(CONFIG, overrides)
+
+
+def test_configured_stages_are_checked_stages() -> None:
+    from v3d_torch import stage_checks
+
+    checked = {name for name, result in stage_checks._RESULTS.items() if result is not None}
+    assert StagesConfig.model_fields.keys() == checked - {"track_camera"} | {"segment"}
+
+
+@pytest.mark.parametrize("system", [V3DSLAM, CheckedSLAM])
+def test_configured_stage_that_does_the_same_gives_the_same_results(own: None, system: type[V3DSLAM]) -> None:
+    slam, config = make_slam(system), configure(f"stages.smooth_depth={MODULE}:Outer.Same")
+    configured = system(CAMERA, segment, config)
+    assert isinstance(configured.smooth_depth, ReplacedStage)
+    for frame in FRAMES:
+        assert torch.equal(slam(frame).T_wc, configured(frame).T_wc)
+
+
+def test_wrong_result_of_a_configured_stage_is_named(own: None) -> None:
+    slam = V3DSLAM(CAMERA, segment, configure(f"stages.smooth_depth={MODULE}:flat"))
+    with pytest.raises(ConfigError, match=r"^smooth_depth is torch.float32 of shape \(1, 48, 64\), expected a tensor"):
+        slam(FRAMES[0])
+
+
+def test_configured_segmenter_takes_the_place_of_the_network(own: None) -> None:
+    config = load_config(overrides=[f"stages.segment={MODULE}:Corner"])
+    slam = V3DSLAM(CAMERA, config=config)
+    (found,) = slam(FRAMES[0]).objects
+    assert found.label == 0 and type(slam.segment).__name__ == "Corner"
+    assert V3DSLAM(CAMERA, segment, config).segment is segment  # an argument has priority
+
+
+@pytest.mark.parametrize(
+    ("option", "source", "arguments"),
+    [
+        ("segmentation.source=none", "none", {}),
+        ("--masks ids", "masks", {"masks_dir": Path("ids")}),
+        ("--weights a.onnx", "yolo", {"weights": Path("a.onnx")}),
+    ],
+)
+def test_configured_segmenter_excludes_other_sources(option: str, source: str, arguments: dict[str, Path]) -> None:
+    config = configure("stages.segment=lab:Segmenter", f"segmentation.source={source}")
+    with pytest.raises(ConfigError, match=rf"^{option}: not used with stages.segment=lab:Segmenter; re"):
+        make_segmenter(config, CAMERA, **arguments)

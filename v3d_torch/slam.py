@@ -84,7 +84,8 @@ class V3DSLAM(ReplaceableStages):
 
     Raises:
         WeightsError: If the weights of the network are not available.
-        ConfigError: If a parameter has the wrong type.
+        ConfigError: If a parameter has the wrong type, or if a stage that the configuration names by its import path
+            cannot be made, see `StagesConfig`.
     """
 
     def __init__(
@@ -95,6 +96,7 @@ class V3DSLAM(ReplaceableStages):
         known_map: SparseMap | None = None,
     ) -> None:
         check_parameters(camera, segment, config)
+        super().__init__()
         self.camera = camera
         self.config = config = config or Config()
         self.timer = StageTimer()
@@ -102,7 +104,7 @@ class V3DSLAM(ReplaceableStages):
         self.poses = PoseHistory()
         self.motion_model = MotionModel()
         # Preprocessing
-        self.segment = segment or make_segmenter(config.segmentation)
+        self.segment = segment or make_segmenter(config, camera)
         self.smooth_depth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio)
         self.detect_features = ORB(config.features, camera)
         # Motion of the camera since the previous frame
@@ -132,6 +134,7 @@ class V3DSLAM(ReplaceableStages):
         # Free and occupied space
         self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
         self.gravity: Tensor | None = None
+        self.replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.utils.hooks import RemovableHandle
 
+from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError
 from v3d_torch.features.features import Features
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
+from v3d_torch.runtime.stage_hooks import HookedStage, StageHook
+from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
@@ -82,8 +88,18 @@ _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] |
 result is not checked."""
 
 
+STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end", "loop_closer")))
+"""Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
+
+
 class ReplaceableStages:
-    """Base class of `V3DSLAM`: stages are attributes that can be replaced; results of the replacements are checked."""
+    """Base class of `V3DSLAM`: stages are attributes that can be replaced; results of the replacements are checked.
+
+    Hooks see the arguments and results of the stages.
+    """
+
+    def __init__(self) -> None:
+        self._stage_hooks: OrderedDict[int, tuple[str | None, StageHook]] = OrderedDict()
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute.
@@ -93,7 +109,48 @@ class ReplaceableStages:
         """
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
-        super().__setattr__(name, value)
+        is_hooked = isinstance(vars(self).get(name), HookedStage)
+        super().__setattr__(name, HookedStage(value, name, self._stage_hooks) if is_hooked else value)
+
+    def register_stage_hook(self, name: str | None, hook: StageHook) -> RemovableHandle:
+        """Register a function that is called after each call of a stage, as `torch.nn.Module.register_forward_hook`.
+
+        A hook does not change results: what it returns is ignored, and it must not change tensors in place. Arguments
+        and results are not copied; copy what a later stage could change. An error in a hook ends the call of the stage.
+
+        `segment` is called in the thread "segmentation", `smooth_depth` and `detect_features` in the thread "features",
+        if frames are preprocessed ahead, which is the default in `v3d_torch.pipeline.Pipeline` and `LiveSLAM`: these
+        calls are some frames ahead of those of the other stages, which are called in the thread that calls `track`.
+        Within a thread, calls are in the order of the frames.
+
+        Args:
+            name: Name of a stage, such as ``odometry``; None for all stages.
+            hook: Called with the name of the stage, the arguments of the call in their order, and the result.
+
+        Returns:
+            Handle whose method ``remove()`` removes the hook.
+
+        Raises:
+            ConfigError: If there is no such stage.
+        """
+        if name is not None and name not in STAGES:
+            raise ConfigError(f"{name}: is not a stage that can have a hook; choose from {', '.join(STAGES)}")
+        for each in STAGES if name is None else (name,):
+            if not isinstance(stage := vars(self)[each], HookedStage):
+                vars(self)[each] = HookedStage(stage, each, self._stage_hooks)
+        handle = RemovableHandle(self._stage_hooks)
+        self._stage_hooks[handle.id] = name, hook
+        return handle
+
+    def replace_configured(self, config: Config, camera: PinholeCamera) -> None:
+        """Replace the stages for which the configuration has an import path, but the segmenter, see `make_segmenter`.
+
+        Raises:
+            ConfigError: If a stage cannot be made, see `make_stage`.
+        """
+        for name, path in config.stages.paths.items():
+            if name != "segment":
+                setattr(self, name, make_stage(name, path, config, camera))
 
 
 class ReplacedStage(StageProxy):

@@ -43,7 +43,7 @@ class Ours:
         config = load_config(configuration, [f"seed={seed}", *overrides])
         set_num_threads(config.threads)
         torch.manual_seed(seed)
-        self.slam = V3DSLAM(sequence.camera, make_segmenter(config.segmentation), config)
+        self.slam = V3DSLAM(sequence.camera, make_segmenter(config, sequence.camera), config)
         self.pipeline = Pipeline(sequence, self.slam, evaluate_masks=False)  # not part of tracking
         deque(compile_kernels(), maxlen=0)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
@@ -15,6 +17,7 @@ import pandas as pd
 import psutil
 import pytest
 from helpers.batches import plan_seeds, repeat_sequence
+from helpers.own_stages import SEGMENT, write_own_stages
 from typer.testing import CliRunner
 
 from v3d_torch.batch.executor import JobFinished
@@ -22,6 +25,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli.batch import app
+from v3d_torch.config.loading import override_config
 from v3d_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,15 +40,23 @@ def test_missing_ray_is_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def nodes() -> Iterator[Nodes]:
-    """Cluster of two nodes, which is shut down after the tests."""
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a module with stages."""
+    return write_own_stages(tmp_path_factory.mktemp("own"))
+
+
+@pytest.fixture(scope="module")
+def nodes(own: Path) -> Iterator[Nodes]:
+    """Cluster of two nodes, started with the module's folder in PYTHONPATH, and shut down after the tests."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'v3d-torch[ray]'")
     from ray.cluster_utils import Cluster as Nodes
 
-    cluster = Nodes(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    cluster.add_node(num_cpus=1)
-    yield cluster
-    cluster.shutdown()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(own), prepend=os.pathsep)
+        cluster = Nodes(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+        cluster.add_node(num_cpus=1)
+        yield cluster
+        cluster.shutdown()
 
 
 def test_results_on_cluster_are_identical_to_local_results(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
@@ -58,6 +70,14 @@ def test_results_on_cluster_are_identical_to_local_results(nodes: Nodes, moment:
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "config.yaml"):
         remote = tmp_path / "cluster" / "moment" / "baseline" / "seed0" / name
         assert remote.read_bytes() == (job.folder / name).read_bytes(), name
+
+
+def test_worker_imports_the_stages_of_the_configuration(nodes: Nodes, own: Path, moment: Path, tmp_path: Path) -> None:
+    (job,) = plan_seeds(moment, tmp_path / "out", seeds=1)
+    config = override_config(job.config, [SEGMENT, "segmentation.source=yolo"])
+    *_, end = RayExecutor(nodes.address)([replace(job, config=config)], Event())
+    assert isinstance(end, JobFinished) and end.failure is None
+    assert json.loads((job.folder / "metrics.json").read_text())["stages"] == config.stages.paths
 
 
 def find_process(job: Job) -> int:

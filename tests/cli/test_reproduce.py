@@ -117,7 +117,7 @@ def fake_runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             yield JobFinished(job, None)
 
     monkeypatch.setattr(reproduction, "ProcessExecutor", lambda workers: execute)
-    monkeypatch.setattr(reproduction, "prepare_networks", lambda configs: None)
+    monkeypatch.setattr(reproduction, "prepare_stages", lambda configs: None)
     return executed
 
 

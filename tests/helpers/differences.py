@@ -20,7 +20,7 @@ from v3d_torch.odometry.rolling_shutter import Readout
 
 TIMED_STAGES = (
     *("segmentation", "depth", "features", "motion", "free_space", "clouds", "objects", "tracking", "mapping"),
-    *("bundle", "loop"),
+    *("bundle", "loop", "plausibility"),
 )
 """Stages whose measured times are not compared."""
 

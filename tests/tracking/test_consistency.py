@@ -77,7 +77,7 @@ def test_covariance_on_recorded_images_is_consistent(real_sequence: Callable[[st
     sequence = load_sequence(str(folder))
     assert sequence.groundtruth is not None
     config = load_config(overrides=["segmentation.source=masks"])
-    segment = make_segmenter(config.segmentation, masks_dir=folder / "masks")
+    segment = make_segmenter(config, sequence.camera, masks_dir=folder / "masks")
     slam = V3DSLAM(sequence.camera, segment, config)
     states = [slam(frame) for frame in islice(sequence, 45)]
     errors = consistency.calibrated_errors(

@@ -33,7 +33,7 @@ from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
-from v3d_torch.segmentation import make_instance_source, wrap_upright
+from v3d_torch.segmentation import make_instance_source, make_segmenter, wrap_upright
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 _NOTE = (
@@ -90,16 +90,23 @@ def run_ablation_study(
     }
     sequences = open_sequences(names, data_root, console)
     network = cache(make_instance_source)
-    for config in configs.values():
-        network(_network_config(config))  # a missing network is an error before the first run
+    camera = next(iter(sequences.values())).camera
+    for config in configs.values():  # a missing segmenter is an error before the first run
+        if config.stages.segment is None:
+            network(_network_config(config))
+        else:
+            make_segmenter(config, camera)
     folder = make_result_folder(out, "ablation")
     outcomes: list[Outcome] = []
     try:
         for name, sequence in sequences.items():
             sources: dict[SegmentationConfig, Segmenter] = {}
             for (variant, seed), config in configs.items():
-                source = sources.setdefault(_network_config(config), CachedSegmenter(network(_network_config(config))))
-                segment = wrap_upright(source, config.segmentation)
+                if config.stages.segment is None:
+                    key = _network_config(config)
+                    segment = wrap_upright(sources.setdefault(key, CachedSegmenter(network(key))), config.segmentation)
+                else:
+                    segment = make_segmenter(config, sequence.camera)
                 run_folder = make_result_folder(folder / folder_name(name) / variant / f"seed{seed}", name)
                 metrics, failure = _run(sequence, segment, config, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))

@@ -11,6 +11,7 @@ from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError
 from v3d_torch.io.paths import expand_user, folder_name
+from v3d_torch.runtime.stage_import import import_stage
 from v3d_torch.segmentation import make_instance_source
 
 
@@ -36,16 +37,19 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
     return {label: single_threaded(config) for label, config in configs.items()} if one_thread else configs
 
 
-def prepare_networks(configs: Mapping[str, Config]) -> None:
-    """Download and export the networks that the configurations need, once, before the first run.
+def prepare_stages(configs: Mapping[str, Config]) -> None:
+    """Import the stages that the configurations name, and download and export their networks, before the first run.
 
     Raises:
         WeightsError: If the weights of a network are not available.
-        ConfigError: If a configuration reads masks from files, which belong to one sequence.
+        ConfigError: If a configuration reads masks from files, which belong to one sequence, or if a stage cannot be
+            imported.
     """
     prepared: list[SegmentationConfig] = []
     for config in configs.values():
-        if config.segmentation not in prepared:
+        for name, path in config.stages.paths.items():
+            import_stage(name, path)
+        if config.stages.segment is None and config.segmentation not in prepared:
             prepared.append(config.segmentation)
             make_instance_source(config.segmentation)
 

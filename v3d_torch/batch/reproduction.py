@@ -10,7 +10,7 @@ from rich.table import Table
 
 from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.job import Job
-from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_networks
+from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.runner import check_resume, run_missing_jobs
 from v3d_torch.batch.wide_console import wide_console
@@ -66,7 +66,7 @@ def run_reproduction(
         if not opened:
             raise InputError(advice)
         console.print(advice, markup=False)
-    prepare_networks(configs)
+    prepare_stages(configs)
     folder = make_result_folder(out, "reproduce")
     sequences = {name: (name, sequence) for name, sequence in opened.items()}
     jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder)

@@ -46,7 +46,7 @@ def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
             if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
                 clear_earlier_results(job.folder)
                 checkpoint = None
-            segment = make_segmenter(job.config.segmentation)
+            segment = make_segmenter(job.config, sequence.camera)
             run = Run(_make_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
             run(on_frame)
     except Exception as error:  # continue the batch after an error in one run; its log has the traceback

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.executor import Executor, JobFinished
-from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_networks
+from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_executor import RayExecutor
@@ -49,7 +49,7 @@ def run_batch(
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
     opened = open_sequences(names, data_root, console, skip_broken=skip_broken)
     sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
-    prepare_networks(configs)
+    prepare_stages(configs)
     folder = make_result_folder(out, "batch")
     jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder, skip_broken=skip_broken)
     run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume)

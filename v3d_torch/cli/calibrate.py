@@ -74,7 +74,7 @@ def main(
         with progress_bars(console) as progress, interrupts_between_frames() as interrupted:
             calibration = calibrate_sequence(
                 open_sequence,
-                lambda: make_segmenter(config.segmentation),
+                lambda calibrated: make_segmenter(config, calibrated),
                 config,
                 lambda number, frames: TrackingBar(progress, frames, interrupted, description=f"run {number}"),
             )

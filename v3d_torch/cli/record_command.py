@@ -69,7 +69,7 @@ def record_static(
     """
     set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    slam = V3DSLAM(source.camera, make_segmenter(config.segmentation), config)
+    slam = V3DSLAM(source.camera, make_segmenter(config, source.camera), config)
     pipeline = Pipeline(source, slam, evaluate_masks=False)
     compile_kernels(console)
     total = len(source) if isinstance(source, Sized) else None

@@ -32,6 +32,7 @@ from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
+from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.viz.viewer import make_viewer
 
@@ -135,6 +136,10 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
         raise InputError(f"{option}: conflicts with the run in {folder}; remove this option")
     if (option := choice.conflict(request.config)) is not None:
         raise ConfigError(f"{option}: conflicts with the run in {folder}; remove this option")
+    if (stage := first_not_given(request.config.stages, choice.load().stages)) is not None:
+        raise ConfigError(
+            f"{folder}: its run imported code, {stage}; give --set {stage} again if it is to be imported, too"
+        )
     changed = {name: value for name in CHANGEABLE if (value := getattr(given, name))}
     _run(replace(request, **changed), folder, checkpoint, display)
 
@@ -155,7 +160,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     known_map = None
     if request.load_map is not None and checkpoint is None:  # a checkpoint contains the map
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
-    segment = make_segmenter(request.config.segmentation, weights=_path(request.weights), masks_dir=masks)
+    segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
     viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
     if masks is not None and masks.resolve() == (folder / "masks").resolve():

@@ -420,6 +420,41 @@ class OccupancyConfig(Section):
         return heights
 
 
+class StagesConfig(Section):
+    """Stages of your own, each by its import path ``module:attribute``; null for the stage of the package.
+
+    The attribute is called with configuration and camera, and returns the stage: see [Your own stage](your_stage.md).
+    """
+
+    segment: str | None = None
+    """Segmenter: instances of a frame. It replaces `segmentation.source`."""
+    smooth_depth: str | None = None
+    """Depth re-estimation."""
+    detect_features: str | None = None
+    """Detector of features."""
+    compensate: str | None = None
+    """Compensation of rolling shutter and depth delay."""
+    odometry: str | None = None
+    """Motion of the camera since the previous frame."""
+    free_space_check: str | None = None
+    """Free-space check."""
+    propose_unlabelled: str | None = None
+    """Proposal of moving regions without a class."""
+    back_project_instances: str | None = None
+    """Clouds of the instances."""
+    describe_appearance: str | None = None
+    """Appearance of the instances."""
+    classify_motion: str | None = None
+    """Tracks and motion states of the objects."""
+    estimate_state: str | None = None
+    """Covariance of the pose, and velocity of the camera."""
+
+    @property
+    def paths(self) -> dict[str, str]:
+        """Import paths by stage, of the stages that are replaced."""
+        return {name: path for name, path in self if path is not None}
+
+
 class CheckpointConfig(Section):
     """Checkpoints, from which an interrupted run is resumed."""
 
@@ -455,3 +490,4 @@ class Config(Section):
     dense_map: DenseMapConfig = DenseMapConfig()
     occupancy: OccupancyConfig = OccupancyConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
+    stages: StagesConfig = StagesConfig()

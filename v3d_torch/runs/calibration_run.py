@@ -41,7 +41,7 @@ OpenSequence = Callable[[PinholeCamera | None], RGBDSequence]
 
 def calibrate_sequence(
     open_sequence: OpenSequence,
-    make_segmenter: Callable[[], Segmenter],
+    make_segmenter: Callable[[PinholeCamera], Segmenter],
     config: Config,
     on_run: Callable[[int, int], FrameCallback],
 ) -> Calibration:
@@ -49,7 +49,7 @@ def calibrate_sequence(
 
     Args:
         open_sequence: Function that opens the sequence.
-        make_segmenter: Function that makes the segmenter of a run.
+        make_segmenter: Function that makes the segmenter of a run with this camera.
         config: Configuration of the runs.
         on_run: Called before each run with its number, from 1, and the number of frames; returns a function that is
             called after each frame.
@@ -63,7 +63,7 @@ def calibrate_sequence(
     previous: Calibration | None = None
     for number in range(1, _MAX_RUNS + 1):
         torch.manual_seed(config.seed)
-        pipeline = Pipeline(sequence, V3DSLAM(camera, make_segmenter(), config), evaluate_masks=False)
+        pipeline = Pipeline(sequence, V3DSLAM(camera, make_segmenter(camera), config), evaluate_masks=False)
         record = pipeline(on_run(number, len(sequence)))
         if record.failure is not None:
             raise InputError(record.failure)

@@ -215,6 +215,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "seconds_per_stage": dict(slam.timer.seconds),
         "peak_memory_mb": _peak_memory_mb(),
         "seed": slam.config.seed,
+        "stages": slam.config.stages.paths,
         "versions": {
             "v3d-torch": version("v3d-torch"),
             "python": platform.python_version(),

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from v3d_torch.config import Config, TrackerConfig
-from v3d_torch.errors import InputError
+from v3d_torch.config import Config, StagesConfig, TrackerConfig
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import StrPath
@@ -24,6 +24,7 @@ from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.up_direction import UpDirection
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
+from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.camera_state import CameraState
@@ -55,14 +56,17 @@ def save_state(path: StrPath, slam: V3DSLAM) -> None:
     write_state(Path(path), metadata, slam.state_dict())
 
 
-def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
+def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesConfig | None = None) -> V3DSLAM:
     """Load a system that `save_state` saved. With the same frames it gives the same results, to the bit.
 
     Args:
         path: File.
         segment: Segmenter; None to create the one named in the configuration.
+        stages: Import paths of the saved configuration, ``config.stages``, if it has any; nothing is imported on the
+            word of a file alone.
 
     Raises:
+        ConfigError: If the configuration has import paths that ``stages`` does not have, or a stage cannot be made.
         InputError: If the file is missing, damaged, not a saved state, or from another version.
         WeightsError: If the weights of the network are not available.
     """
@@ -70,6 +74,8 @@ def load_state(path: StrPath, segment: Segmenter | None = None) -> V3DSLAM:
     try:
         config = Config.model_validate(metadata["config"])
         camera = PinholeCamera(**{**metadata["camera"], "distortion": tuple(metadata["camera"]["distortion"])})
+        if (stage := first_not_given(config.stages, stages or StagesConfig())) is not None:
+            raise ConfigError(f"{path}: would import code, {stage}; give load_state the stages that it may import")
         slam = V3DSLAM(camera, segment, config)
         slam.load_state_dict(state)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:

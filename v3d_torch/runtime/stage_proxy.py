@@ -1,4 +1,4 @@
-"""Proxy of a stage: base class of wrappers that check the results of the stage."""
+"""Proxy of a stage: base class of wrappers that check or show the results of the stage."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
 class StageProxy:
     """Proxy that checks the results of a stage; attributes are read from and written to the stage itself.
 
+    To `isinstance`, a proxy is of the class of the stage: a segmenter that is a torch module, for example, has no state
+    that changes from frame to frame.
+
     Args:
         stage: Stage.
         name: Name of the stage in messages.
@@ -22,6 +25,10 @@ class StageProxy:
     def __init__(self, stage: Any, name: str) -> None:
         self._stage = stage
         self._name = name
+
+    @property  # type: ignore[misc]  # object declares a plain attribute
+    def __class__(self) -> type:
+        return self._stage.__class__
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call the stage and check its result."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from v3d_torch.config import SegmentationConfig
+from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.errors import ConfigError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.segmentation.mask_files import MaskFolder
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.segmentation.yolo import YOLOSegmenter
@@ -20,13 +22,35 @@ class NoSegmentation:
         return Instances.empty(*frame.image.shape[1:])
 
 
-def make_segmenter(config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None) -> Segmenter:
-    """Create the segmenter for one run, with upright images for the network if configured.
+def make_segmenter(
+    config: Config, camera: PinholeCamera, weights: Path | None = None, masks_dir: Path | None = None
+) -> Segmenter:
+    """Create the segmenter for one run: the one with the import path ``stages.segment``, else that of the package.
 
-    Use a new one for each run: `UprightSegmenter` accumulates votes over the frames of a run. Arguments and errors are
-    those of `make_instance_source`.
+    The network of the package gets upright images if configured. Use a new segmenter for each run: `UprightSegmenter`
+    accumulates votes over the frames of a run.
+
+    Args:
+        config: Configuration of the run.
+        camera: Camera of the run.
+        weights: As for `make_instance_source`.
+        masks_dir: As for `make_instance_source`.
+
+    Raises:
+        ConfigError: If a segmenter is given by its import path, and it cannot be made or there is also another source;
+            and as `make_instance_source`.
+        WeightsError: As `make_instance_source`.
+        InputError: As `make_instance_source`.
     """
-    return wrap_upright(make_instance_source(config, weights, masks_dir), config)
+    source, path = config.segmentation.source, config.stages.segment
+    if path is None:
+        return wrap_upright(make_instance_source(config.segmentation, weights, masks_dir), config.segmentation)
+    others = [f"--weights {weights}"] if weights is not None else []
+    others += [f"--masks {masks_dir}"] if masks_dir is not None else []
+    others += [f"segmentation.source={source}"] if source != "yolo" else []
+    if others:
+        raise ConfigError(f"{others[0]}: not used with stages.segment={path}; remove one of them")
+    return make_stage("segment", path, config, camera)
 
 
 def wrap_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:

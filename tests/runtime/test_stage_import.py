@@ -1,0 +1,76 @@
+"""Stages by import path: what can be imported, and one sentence for each mistake."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers.own_stages import MODULE, write_own_stages
+
+from v3d_torch.config import Config, StagesConfig
+from v3d_torch.config.loading import dump_config, load_config
+from v3d_torch.errors import ConfigError
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.runtime.stage_import import first_not_given, import_stage, make_stage
+
+CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = write_own_stages(tmp_path)
+    (folder / "broken_stages.py").write_text("import a_package_that_is_missing\n")
+    (folder / "wrong_stages.py").write_text("raise ValueError('two\\nlines')\n")
+    monkeypatch.syspath_prepend(folder)
+    yield folder
+    for name in (MODULE, "broken_stages", "wrong_stages"):
+        sys.modules.pop(name, None)
+
+
+def test_class_gets_configuration_and_camera(own: Path) -> None:
+    config = Config()
+    segment = make_stage("segment", f"{MODULE}:Corner", config, CAMERA)
+    assert segment.size == (48, 64) and segment.threshold == config.segmentation.score_threshold
+    assert import_stage("smooth_depth", f"{MODULE}:Outer.Same").__qualname__ == "Outer.Same"
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        (MODULE, "is not an import path; write module:attribute, such as my_package:MyStage"),
+        (f"{MODULE}.Corner", "is not an import path"),
+        (":Corner", "is not an import path"),
+        (f"{MODULE}:", "is not an import path"),
+        ("", "is not an import path"),
+        ("no_such_stages:Stage", "the module no_such_stages cannot be imported (ModuleNotFoundError: No module named"),
+        (".relative:Stage", "the module .relative cannot be imported (TypeError: "),
+        ("broken_stages:Stage", "(ModuleNotFoundError: No module named 'a_package_that_is_missing'); correct it, ins"),
+        ("wrong_stages:Stage", "the module wrong_stages cannot be imported (ValueError: two lines); correct it, inst"),
+        (f"{MODULE}:Missing", f"{MODULE} has no attribute Missing; correct the name after the colon"),
+        (f"{MODULE}:Corner:Same", "has no attribute Corner:Same"),
+        (f"{MODULE}:number", "is a int, which cannot be called; name a class, or a function that returns the stage"),
+        (f"{MODULE}:one_argument", "does not accept two arguments, config and camera (too many positional arguments)"),
+        (f"{MODULE}:nothing", "returned a NoneType, which cannot be called; return the stage"),
+    ],
+)
+def test_mistake_is_one_sentence_with_the_key(own: Path, path: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        make_stage("odometry", path, Config(), CAMERA)
+    assert str(caught.value).startswith(f"stages.odometry={path}: ")
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_reading_and_writing_a_configuration_imports_nothing(own: Path, tmp_path: Path) -> None:
+    config = load_config(overrides=[f"stages.segment={MODULE}:Corner", "stages.odometry=no_such_stages:Odometry"])
+    (tmp_path / "config.yaml").write_text(dump_config(config))
+    assert load_config(tmp_path / "config.yaml") == config
+    assert MODULE not in sys.modules
+
+
+def test_only_stages_that_the_user_gives_as_well_are_accepted() -> None:
+    stored = StagesConfig(segment="a:A", odometry="b:B")
+    assert first_not_given(stored, stored) is None and first_not_given(StagesConfig(), stored) is None
+    assert first_not_given(stored, StagesConfig(segment="a:A")) == "stages.odometry=b:B"
+    assert first_not_given(stored, StagesConfig(segment="c:C", odometry="b:B")) == "stages.segment=a:A"
