@@ -28,8 +28,9 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.segmentation.segmenter import segment_frame
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import Instances, RGBDFrame, Segmenter, segment_frame
+from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 SERIAL = ("prefetch=false",)  # as in v3d_torch/cli/run.py
 

@@ -38,7 +38,9 @@ from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
+from v3d_torch.runtime.stateful import Stateful, is_stateful
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.segmenter import restore_segmenter, segment_frame, segmenter_state_of
 from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stage_checks import ReplaceableStages
 from v3d_torch.tracking.camera_state import CameraState
@@ -49,18 +51,7 @@ from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.tracking.previous_frame import PreviousFrameRefinement
 from v3d_torch.tracking.state_estimator import StateEstimator
 from v3d_torch.tracking.state_history import StateHistory
-from v3d_torch.types import (
-    FramePose,
-    Instances,
-    RGBDFrame,
-    Segmenter,
-    Stateful,
-    TrackingStatus,
-    is_stateful,
-    restore_segmenter,
-    segment_frame,
-    segmenter_state_of,
-)
+from v3d_torch.types import FramePose, Instances, RGBDFrame, Segmenter, TrackingStatus
 
 PREFETCHED_FRAMES = 4
 """Number of frames that are preprocessed ahead: a frame that becomes a keyframe takes twice as long to track as others,

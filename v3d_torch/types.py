@@ -8,32 +8,22 @@ measurement"; timestamps are in seconds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
+from v3d_torch.geometry.depth_scale import estimate_depth_scale
+from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.geometry.se3 import interpolate
-
-
-@runtime_checkable
-class Stateful(Protocol):
-    """A component with state that changes from frame to frame, saved and restored as in `torch.nn.Module`."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state: tensors, numbers and data classes of the package."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> Any:
-        """Restore a state that `state_dict` of a component with the same configuration returned."""
 
 
 @dataclass(frozen=True)
@@ -197,57 +187,6 @@ class Instances:
 
 Segmenter = Callable[[RGBDFrame], Instances]
 """Finds the instances in the colour image of a frame."""
-
-
-@runtime_checkable
-class PoseAwareSegmenter(Protocol):
-    """A segmenter that uses the predicted pose of the camera, for example to rotate images upright."""
-
-    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
-        """Find the instances in the colour image of a frame.
-
-        Args:
-            frame: Frame.
-            T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`; None if it is not known.
-        """
-
-
-def segment_frame(segmenter: Segmenter, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
-    """Segment a frame; only a `PoseAwareSegmenter` receives the predicted pose.
-
-    Args:
-        segmenter: Segmenter.
-        frame: Frame.
-        T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`; None if it is not known.
-    """
-    pose_aware = cast("PoseAwareSegmenter", segmenter)
-    return pose_aware.segment_with_pose(frame, T_cw) if _has(segmenter, "segment_with_pose") else segmenter(frame)
-
-
-def is_stateful(component: object) -> bool:
-    """Check whether a component has ``state_dict`` and ``load_state_dict``."""
-    return _has(component, "state_dict", "load_state_dict")
-
-
-def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
-    """Return the state of a segmenter; None if it has no state.
-
-    A torch module counts as stateless: its state_dict holds its weights, which are constant and too large to copy in
-    each frame.
-    """
-    has_state = is_stateful(segmenter) and not isinstance(segmenter, nn.Module)
-    return cast("Stateful", segmenter).state_dict() if has_state else None
-
-
-def restore_segmenter(segmenter: object, state: Mapping[str, Any] | None) -> None:
-    """Restore a state that `segmenter_state_of` returned; do nothing if it is None."""
-    if state is not None and is_stateful(segmenter):
-        cast("Stateful", segmenter).load_state_dict(state)
-
-
-def _has(value: object, *methods: str) -> bool:
-    """Check for methods by name: since Python 3.12, isinstance does not find the methods that a proxy forwards."""
-    return all(callable(getattr(value, method, None)) for method in methods)
 
 
 class TrackingStatus(StrEnum):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from v3d_torch.batch.executor import JobFinished, JobProgress
 from v3d_torch.batch.progress import BatchProgress
-from v3d_torch.runs.console import progress_bars
+from v3d_torch.runs.progress_bar import progress_bars
 
 
 def test_bars_show_all_running_jobs(moment: Path, tmp_path: Path) -> None:

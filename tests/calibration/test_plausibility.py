@@ -24,7 +24,7 @@ KINECT = CAMERA  # has its field of view
 def check(
     views: StaticViews, trajectory: Trajectory, tables: MapTables | None = None, camera: PinholeCamera = CAMERA
 ) -> list[str]:
-    return check_plausibility(tables or MapTables(), views, trajectory, camera, Config())
+    return check_plausibility(tables or MapTables(), views, [], trajectory, camera, Config())
 
 
 def no_views() -> tuple[StaticViews, Trajectory]:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from helpers.rooms import CAMERA, render
 from v3d_torch.config import OccupancyConfig
-from v3d_torch.kernels.occupancy import BITS, HIT, VOLUME
+from v3d_torch.kernels.voxel_blocks import BITS, HIT, VOLUME
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.ray_casting import Observations, index_in_block

@@ -8,13 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from v3d_torch.features import matching
+from v3d_torch.features import matching, projection_search
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 
 pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
 
-EXHAUSTIVE, NEAR = (TWINS[f"{matching.__name__}.match_{name}"] for name in ("descriptors", "by_projection"))
+EXHAUSTIVE = TWINS[f"{matching.__name__}.match_descriptors"]
+NEAR = TWINS[f"{projection_search.__name__}.match_by_projection"]
 
 
 def descriptors(count: int, seed: int, distinct: int = 40, noise: float = 0.03) -> Tensor:

@@ -15,7 +15,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
-from v3d_torch.kernels.occupancy import FREE, HIT, SIDE
+from v3d_torch.kernels.voxel_blocks import FREE, HIT, SIDE
 from v3d_torch.occupancy.ray_casting import Observations, observe_voxels
 
 CAMERA = PinholeCamera(fx=7.0, fy=7.0, cx=3.5, cy=2.5, width=8, height=6)

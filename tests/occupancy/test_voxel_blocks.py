@@ -11,7 +11,7 @@ from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
-from v3d_torch.kernels.occupancy import BITS, HIT, SIDE, UNKNOWN, VOLUME
+from v3d_torch.kernels.voxel_blocks import BITS, HIT, SIDE, UNKNOWN, VOLUME
 from v3d_torch.occupancy.ray_casting import Observations
 from v3d_torch.occupancy.sensor_model import SensorModel
 from v3d_torch.occupancy.voxel_blocks import VoxelBlocks

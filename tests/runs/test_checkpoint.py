@@ -14,7 +14,8 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import describe_change, read_checkpoint, write_checkpoint
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
-from v3d_torch.types import TrackingStatus, segmenter_state_of
+from v3d_torch.segmentation.segmenter import segmenter_state_of
+from v3d_torch.types import TrackingStatus
 
 STOPS = (0, 1, 7, 8, 19, 22, 31, 32, 33, 45, 53)
 

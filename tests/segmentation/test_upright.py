@@ -7,58 +7,18 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor, nn
+from helpers.tilted_frames import HEIGHT, IDENTITY, WIDTH, Network, make_frame
+from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.segmentation.segmenter import segmenter_state_of
 from v3d_torch.segmentation.upright import UprightSegmenter, up_votes
-from v3d_torch.types import (
-    Instances,
-    PoseAwareSegmenter,
-    RGBDFrame,
-    Stateful,
-    restore_segmenter,
-    segment_frame,
-    segmenter_state_of,
-)
-
-HEIGHT, WIDTH = 24, 32
-IDENTITY = torch.eye(4, dtype=torch.float64)
 
 
 def rolled(degrees: float) -> Tensor:
     """World-to-camera pose of a camera rolled clockwise about its optical axis, as seen from behind the camera."""
     twist = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, math.radians(degrees)], dtype=torch.float64)
     return invert(se3_exp(twist))
-
-
-def make_frame(index: int, upright_turns: int | None) -> RGBDFrame:
-    """Frame whose upper edge is bright after the given counterclockwise quarter turns; None for a dark image."""
-    portrait = (upright_turns or 0) % 2 == 1
-    image = torch.zeros(3, WIDTH, HEIGHT, dtype=torch.uint8) if portrait else torch.zeros(3, HEIGHT, WIDTH).byte()
-    if upright_turns is not None:
-        image[:, :2, : image.shape[2]] = 255
-        image = torch.rot90(image, -upright_turns, dims=(1, 2)).contiguous()
-    assert image.shape == (3, HEIGHT, WIDTH)
-    return RGBDFrame(index, index / 30, image, torch.ones(1, HEIGHT, WIDTH))
-
-
-class Network:
-    """Segmenter with one detection in the upper left corner: label 0 if the upper edge is bright, else a doubtful 1."""
-
-    def __init__(self, confident: float = 0.9, doubtful: float = 0.3) -> None:
-        self.sizes: list[tuple[int, int]] = []
-        self._scores = confident, doubtful
-
-    def __call__(self, frame: RGBDFrame) -> Instances:
-        height, width = frame.image.shape[1:]
-        assert frame.depth.shape == (1, height, width)
-        self.sizes.append((height, width))
-        masks = torch.zeros(1, height, width, dtype=torch.bool)
-        masks[0, 2:5, 3:9] = True
-        is_upright = bool((frame.image[:, 0] == 255).all())
-        score = self._scores[0] if is_upright else self._scores[1]
-        boxes = torch.tensor([[3.0, 2, 9, 5]])
-        return Instances(masks, torch.tensor([int(not is_upright)]), torch.tensor([score]), boxes)
 
 
 @pytest.mark.parametrize("turns", range(4))
@@ -173,48 +133,6 @@ def test_state_is_a_snapshot() -> None:
     upright.load_state_dict({"calls": 3, "up": up})
     up.zero_()
     assert upright.state_dict()["up"].norm() > 0
-
-
-def test_protocols_and_helper_functions_apply_to_upright_segmenters_only() -> None:
-    network = Network()
-    upright = UprightSegmenter(network)
-    assert isinstance(upright, PoseAwareSegmenter) and isinstance(upright, Stateful)
-    assert not isinstance(network, PoseAwareSegmenter) and not isinstance(network, Stateful)
-    assert segment_frame(upright, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
-    assert segment_frame(network, make_frame(0, 1), IDENTITY).labels.tolist() == [1]
-    state = segmenter_state_of(upright)
-    assert state is not None and state["calls"] == 1 and segmenter_state_of(network) is None
-    other = UprightSegmenter(Network())
-    restore_segmenter(other, None)
-    assert other.state_dict()["calls"] == 0
-    restore_segmenter(other, state)
-    restore_segmenter(network, state)
-    assert other.state_dict()["calls"] == 1 and torch.equal(other.state_dict()["up"], state["up"])
-
-
-def test_weights_of_a_torch_module_are_not_its_state() -> None:
-    class Module(nn.Module):
-        def forward(self, frame: RGBDFrame) -> Instances:
-            return Instances.empty(*frame.image.shape[1:])
-
-    assert segmenter_state_of(Module()) is None
-
-
-def test_methods_forwarded_by_a_proxy_are_used() -> None:
-    class Proxy:
-        def __init__(self, target: object) -> None:
-            self._target = target
-
-        def __call__(self, frame: RGBDFrame) -> Instances:
-            raise AssertionError("called without the pose")
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(self._target, name)
-
-    proxy = Proxy(UprightSegmenter(Network()))
-    assert segment_frame(proxy, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
-    state = segmenter_state_of(proxy)
-    assert state is not None and state["calls"] == 1
 
 
 def test_votes_are_read_from_the_state_of_upright_segmenters_only() -> None:

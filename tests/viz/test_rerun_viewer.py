@@ -342,7 +342,7 @@ def test_ground_truth_without_orientations_is_not_logged(tmp_path: Path) -> None
 
 def test_run_without_viewer_does_not_import_rerun() -> None:
     assert make_viewer(None, None, Wall()) is NULL_VIEWER
-    probe = "import sys, v3d_torch.runs.console; print('rerun' in sys.modules)"
+    probe = "import sys, v3d_torch.runs.open_sequences; print('rerun' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "False"
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
@@ -27,7 +28,8 @@ from v3d_torch.evaluation.ablation import (
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import folder_name
-from v3d_torch.runs.console import open_sequences, run_with_progress, wide_console
+from v3d_torch.runs.console import run_with_progress
+from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run

@@ -14,7 +14,7 @@ from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobPro
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.errors import InputError
-from v3d_torch.runs.console import interrupts_between_frames
+from v3d_torch.runs.interrupts import interrupts_between_frames
 
 _POLL_INTERVAL = 0.2
 """Time between two polls of the progress, seconds: often enough for a progress bar, and cheap for the cluster."""

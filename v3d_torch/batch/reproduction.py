@@ -13,6 +13,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.runner import check_resume, run_missing_jobs
+from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config.loading import FULL
 from v3d_torch.datasets import PAPER_SEQUENCES, RGBDSequence, short_name
 from v3d_torch.datasets.locate import data_folder, find_stored
@@ -30,7 +31,7 @@ from v3d_torch.evaluation.summary import (
 )
 from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_table
 from v3d_torch.io.files import write_text
-from v3d_torch.runs.console import open_sequence, wide_console
+from v3d_torch.runs.open_sequences import open_sequence
 from v3d_torch.runs.result_folder import make_result_folder
 
 TABLE_CONFIGS = (FULL, "paper", "baseline")

@@ -14,15 +14,13 @@ from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_executor import RayExecutor
+from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
-from v3d_torch.runs.console import (
-    compile_kernels,
-    interrupts_between_frames,
-    open_sequences,
-    progress_bars,
-    wide_console,
-)
+from v3d_torch.runs.interrupts import interrupts_between_frames
+from v3d_torch.runs.kernel_compilation import compile_kernels
+from v3d_torch.runs.open_sequences import open_sequences
+from v3d_torch.runs.progress_bar import progress_bars
 from v3d_torch.runs.result_folder import make_result_folder
 
 

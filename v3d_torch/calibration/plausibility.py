@@ -6,11 +6,14 @@ contradict the camera significantly.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from v3d_torch.calibration.depth_steps import disparity_step
 from v3d_torch.calibration.edge_alignment import EdgeAlignment, Misalignment
+from v3d_torch.calibration.people_size import check_people_size
 from v3d_torch.calibration.problem import SelfCalibration
 from v3d_torch.calibration.selection import covariance
 from v3d_torch.config import Config
@@ -79,13 +82,19 @@ _NEAR = 0.3
 
 
 def check_plausibility(
-    tables: MapTables, views: StaticViews, trajectory: Trajectory, camera: PinholeCamera, config: Config
+    tables: MapTables,
+    views: StaticViews,
+    people_sizes: Sequence[float],
+    trajectory: Trajectory,
+    camera: PinholeCamera,
+    config: Config,
 ) -> list[str]:
     """Check whether the camera and the depth images agree with a map that was built with them.
 
     Args:
         tables: Data of the map.
         views: Static views of its keyframes.
+        people_sizes: Apparent sizes of people in its keyframes, see `apparent_sizes`, metres.
         trajectory: Poses of all frames so far.
         camera: Camera of the frames.
         config: Configuration of the run.
@@ -96,7 +105,8 @@ def check_plausibility(
     registration = _check_registration(views, trajectory, camera)
     # If depth is not registered, no focal length fits.
     focal_length = [] if registration else _check_focal_length(tables, camera, config)
-    return [*_check_depth_scale(views, camera), *registration, *focal_length]
+    depth_scale = _check_depth_scale(views, camera) or check_people_size(people_sizes, camera)
+    return [*depth_scale, *registration, *focal_length]
 
 
 def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:

@@ -53,7 +53,9 @@ def main(
     from v3d_torch.errors import OutputError
     from v3d_torch.io.files import check_writable, write_text
     from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
-    from v3d_torch.runs.console import TrackingBar, compile_kernels, interrupts_between_frames, progress_bars
+    from v3d_torch.runs.interrupts import interrupts_between_frames
+    from v3d_torch.runs.kernel_compilation import compile_kernels
+    from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
     from v3d_torch.segmentation import make_segmenter
 
     console = Console(soft_wrap=True)

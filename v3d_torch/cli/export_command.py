@@ -23,7 +23,7 @@ from v3d_torch.io.files import check_empty_folder
 from v3d_torch.io.ply import read_ply_points
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.mapping.map_tables import MapTables
-from v3d_torch.runs.console import ProgressBar, progress_bars
+from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import RunRequest, read_request
 from v3d_torch.runs.run_images import LocatedFrames, located_frames, open_images, posed_images
 from v3d_torch.runs.stored_run import StoredRun, read_run

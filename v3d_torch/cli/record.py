@@ -49,7 +49,8 @@ def main(
     from v3d_torch.datasets import SourceOptions, open_source
     from v3d_torch.datasets.stored import StoredSequence
     from v3d_torch.errors import ConfigError, InputError
-    from v3d_torch.runs.console import interrupts_between_frames, print_assumptions
+    from v3d_torch.runs.interrupts import interrupts_between_frames
+    from v3d_torch.runs.open_sequences import print_assumptions
 
     console = Console(soft_wrap=True)
     with exit_on_error():

@@ -16,7 +16,8 @@ from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.export.static_recording import StaticRecording
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.runs.console import TrackingBar, compile_kernels, progress_bars
+from v3d_torch.runs.kernel_compilation import compile_kernels
+from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM

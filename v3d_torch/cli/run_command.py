@@ -24,9 +24,11 @@ from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
-from v3d_torch.runs.console import ProgressBar, print_assumptions, progress_bars, run_with_progress
+from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
+from v3d_torch.runs.open_sequences import print_assumptions
 from v3d_torch.runs.profile_table import profile_table
+from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run

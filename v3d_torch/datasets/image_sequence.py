@@ -13,7 +13,8 @@ from torch import Tensor
 
 from v3d_torch.datasets.stored import StoredSequence, max_broken_frames
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.depth_units import depth_to_metres, estimate_depth_scale
+from v3d_torch.geometry.depth_scale import estimate_depth_scale
+from v3d_torch.geometry.depth_units import depth_to_metres
 
 _MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
 """Plausible range of the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a

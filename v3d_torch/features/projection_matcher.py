@@ -10,7 +10,7 @@ from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, TrackingConfig
 from v3d_torch.features.features import Features
-from v3d_torch.features.matching import match_by_projection
+from v3d_torch.features.projection_search import match_by_projection
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import landmark_projection as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array

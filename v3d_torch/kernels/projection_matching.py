@@ -1,4 +1,4 @@
-"""Kernels of projection matching; see `v3d_torch.features.projection_matcher` and `v3d_torch.features.matching`."""
+"""Kernels of projection matching; see `v3d_torch.features.projection_search`."""
 
 from __future__ import annotations
 

@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE
-from v3d_torch.kernels import occupancy as kernels
+from v3d_torch.kernels import clearance as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.kernels.occupancy import UNKNOWN
+from v3d_torch.kernels.voxel_blocks import UNKNOWN
 from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
 
 _BATCH = 1 << 20

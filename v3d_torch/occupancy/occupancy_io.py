@@ -14,7 +14,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE
 from v3d_torch.io.array_file import open_array_file, write_array_file
 from v3d_torch.io.paths import StrPath
-from v3d_torch.kernels.occupancy import VOLUME
+from v3d_torch.kernels.voxel_blocks import VOLUME
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
-from v3d_torch.kernels.occupancy import SIDE, UNKNOWN
+from v3d_torch.kernels.voxel_blocks import SIDE, UNKNOWN
 from v3d_torch.occupancy.clearance import NearestVoxels, are_balls_free, cube_gap
 from v3d_torch.occupancy.ray_casting import observe_voxels
 from v3d_torch.occupancy.sensor_model import SensorModel

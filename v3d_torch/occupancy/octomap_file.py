@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from v3d_torch.errors import OutputError
 from v3d_torch.io.files import atomic_write
-from v3d_torch.kernels.occupancy import UNKNOWN
+from v3d_torch.kernels.voxel_blocks import UNKNOWN
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 
 _DEPTH = 16

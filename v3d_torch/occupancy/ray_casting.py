@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from v3d_torch.geometry.cell_keys import cell_keys, cells_of_keys
-from v3d_torch.kernels import occupancy as kernels
+from v3d_torch.kernels import ray_casting as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.kernels.occupancy import BITS, FREE, HIT, SIDE, VOLUME
+from v3d_torch.kernels.voxel_blocks import BITS, FREE, HIT, SIDE, VOLUME
 
 
 class Observations(NamedTuple):

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE, cell_keys
-from v3d_torch.kernels import occupancy as kernels
+from v3d_torch.kernels import voxel_blocks as kernels
 from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.kernels.occupancy import BITS, HIT, SIDE, UNKNOWN, VOLUME
+from v3d_torch.kernels.voxel_blocks import BITS, HIT, SIDE, UNKNOWN, VOLUME
 from v3d_torch.occupancy.ray_casting import Observations, index_in_block
 from v3d_torch.occupancy.sensor_model import SensorModel
 

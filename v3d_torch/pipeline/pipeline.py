@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import torch
 
 from v3d_torch.calibration.colour_order import check_colour_order
+from v3d_torch.calibration.people_size import apparent_sizes
 from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.datasets.readable_frames import ReadableFrames
@@ -294,6 +295,8 @@ class Pipeline:
         if keyframes and keyframes[-1].frame == frame.index:
             static = result.static_without_people
             self.views.add(keyframes[-1], frame.image, frame.depth, static, frame.depth_delay)
+            if not self.record.was_checked:
+                self.record.people_sizes += apparent_sizes(result.objects, frame.depth, self.slam.camera)
             is_due = self._live is None and not self.record.was_checked
             if is_due and self._own_view_count() >= _CHECKED_KEYFRAMES:
                 with self.slam.timer("plausibility"):
@@ -302,8 +305,8 @@ class Pipeline:
 
     def _check_plausibility(self) -> None:
         """Check whether camera and depth agree with the map so far, and record contradictions."""
-        slam = self.slam
-        self._warn(check_plausibility(slam.map, self.views, slam.poses.trajectory(), slam.camera, slam.config))
+        slam, sizes = self.slam, self.record.people_sizes
+        self._warn(check_plausibility(slam.map, self.views, sizes, slam.poses.trajectory(), slam.camera, slam.config))
         self.record.was_checked = True
 
     def _own_view_count(self) -> int:

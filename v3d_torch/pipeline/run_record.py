@@ -219,6 +219,7 @@ class RunRecord:
         mask_error: Reason why the masks were not evaluated although there are true masks; None if there was no error.
         save_error: Reason why a checkpoint could not be written; None if there was no error.
         warnings: Contradictions between the images and the camera, one sentence each.
+        people_sizes: Apparent sizes of people in the keyframes before the check, metres.
         was_checked: True if camera and depth were checked.
     """
 
@@ -237,4 +238,5 @@ class RunRecord:
     mask_error: str | None = None
     save_error: str | None = None
     warnings: list[str] = field(default_factory=list)
+    people_sizes: list[float] = field(default_factory=list)
     was_checked: bool = False

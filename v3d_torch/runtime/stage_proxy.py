@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
-"""Methods of stages with state, see `v3d_torch.types.Stateful`."""
+"""Methods of stages with state, see `v3d_torch.runtime.stateful.Stateful`."""
 
 
 class StageProxy:

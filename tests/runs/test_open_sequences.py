@@ -9,7 +9,7 @@ from helpers.corpus.base import write_base
 from rich.console import Console
 
 from v3d_torch.errors import InputError
-from v3d_torch.runs.console import open_sequences
+from v3d_torch.runs.open_sequences import open_sequences
 
 
 def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Kernels of the occupancy map; see `v3d_torch.occupancy.ray_casting` and `v3d_torch.occupancy.voxel_blocks`."""
+"""Kernel of ray casting through the occupancy map; see `v3d_torch.occupancy.ray_casting`."""
 
 from __future__ import annotations
 
@@ -9,25 +9,10 @@ from numpy.typing import NDArray
 
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.reprojection import Array
-
-BITS = 4
-"""Binary logarithm of `SIDE`."""
-
-SIDE = 1 << BITS
-"""Voxels along a side of a block."""
-
-VOLUME = SIDE**3
-"""Voxels in a block."""
-
-FREE, HIT = 1, 2
-"""Observations of a voxel in one view; 0 if it was not observed."""
-
-UNKNOWN = -128
-"""Log-odds of voxels that were never observed, different from those of all other voxels."""
+from v3d_torch.kernels.voxel_blocks import BITS, FREE, HIT, VOLUME, Ints, Marks, local_index
 
 Depth = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Marks = NDArray[np.uint8]
+
 Table = NDArray[np.int32]
 
 
@@ -52,12 +37,6 @@ def _enter(origin: float, direction: float) -> tuple[int, int, float, float]:
     if direction < 0:
         return voxel, -1, (voxel - origin) / direction, -1 / direction
     return voxel, 0, math.inf, math.inf
-
-
-@device
-def _local_index(x: int, y: int, z: int) -> int:
-    """Index of a voxel in its block, with z varying fastest."""
-    return (((x & (SIDE - 1)) << BITS | (y & (SIDE - 1))) << BITS) | (z & (SIDE - 1))
 
 
 @device
@@ -86,7 +65,7 @@ def _cast_ray(
     while min(exit_x, exit_y, exit_z) <= free_depth:  # Amanatides and Woo, 1987
         if row < 0:
             row, count = _block_row(x, y, z, first, table, blocks, count)
-        voxel = _local_index(x, y, z)
+        voxel = local_index(x, y, z)
         marks[row, voxel] = max(marks[row, voxel], FREE)
         if exit_x <= exit_y and exit_x <= exit_z:
             row = row if x >> BITS == (x + step_x) >> BITS else -1
@@ -102,7 +81,7 @@ def _cast_ray(
         y = math.floor(origin[1] + direction[1] * hit_depth)
         z = math.floor(origin[2] + direction[2] * hit_depth)
         row, count = _block_row(x, y, z, first, table, blocks, count)
-        marks[row, _local_index(x, y, z)] = HIT
+        marks[row, local_index(x, y, z)] = HIT
     return count
 
 
@@ -150,96 +129,3 @@ def observe_voxels(
             hit_depth = z if static[row, column] and z <= max_depth else 0.0
             count = _cast_ray(origin, direction, free_depth, hit_depth, first, table, blocks, marks, count)
     return blocks[:count], marks[:count]
-
-
-@kernel("(i1[:,::1], i8[::1], u1[:,::1], i8, i8, i8, i8)")
-def add_observations(
-    log_odds: NDArray[np.int8], slots: Ints, marks: Marks, hit: int, miss: int, minimum: int, maximum: int
-) -> None:
-    """Add the observations of one view to the log-odds of blocks.
-
-    Args:
-        log_odds: Log-odds of all blocks, steps, (N, 4096); changed in place.
-        slots: Row of each observed block, (B,).
-        marks: Observations, (B, 4096).
-        hit: Log-odds added to a voxel that was hit, steps.
-        miss: Log-odds added to a voxel that was observed as free, steps.
-        minimum: Smallest log-odds, steps.
-        maximum: Largest log-odds, steps.
-    """
-    for i in range(len(slots)):
-        row = log_odds[slots[i]]
-        for voxel in range(VOLUME):
-            mark = marks[i, voxel]
-            if mark:
-                before = 0 if row[voxel] == UNKNOWN else np.int64(row[voxel])
-                after = before + (hit if mark == HIT else miss)
-                row[voxel] = np.int8(min(max(after, minimum), maximum))
-
-
-@device
-def _find_block(x: int, y: int, z: int, keys: Ints, bound: int) -> int:
-    """Place of the key of a block among ascending keys; -1 if it is not there."""
-    if max(x, y, z) >= bound or min(x, y, z) < -bound:
-        return -1
-    key = ((x + bound) * 2 * bound + y + bound) * 2 * bound + z + bound
-    place = int(np.searchsorted(keys, key))
-    return place if place < len(keys) and keys[place] == key else -1
-
-
-@device
-def _squared_gap(point: float, voxel: int, size: float) -> float:
-    """Squared distance along one axis between a coordinate and a voxel; 0 inside."""
-    low = voxel * size
-    gap = max(low - point, point - (low + size), 0.0)
-    return gap * gap
-
-
-@device
-def _is_ball_free(
-    point: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
-) -> bool:
-    """Check whether all voxels that a ball touches are free."""
-    reach = math.ceil(radius / size)
-    i, j, k = math.floor(point[0] / size), math.floor(point[1] / size), math.floor(point[2] / size)
-    for x in range(i - reach, i + reach + 1):
-        gap_x = _squared_gap(point[0], x, size)
-        for y in range(j - reach, j + reach + 1):
-            gap_y = _squared_gap(point[1], y, size)
-            place, block_z = -1, 0
-            for z in range(k - reach, k + reach + 1):
-                if math.sqrt(gap_x + gap_y + _squared_gap(point[2], z, size)) > radius:
-                    continue
-                if place < 0 or z >> BITS != block_z:
-                    block_z = z >> BITS
-                    place = _find_block(x >> BITS, y >> BITS, block_z, keys, bound)
-                if place < 0:
-                    return False
-                value = log_odds[rows[place], _local_index(x, y, z)]
-                if value >= 0 or value == UNKNOWN:
-                    return False
-    return True
-
-
-@kernel("(f8[:,::1], f8, f8, i8[::1], i8[::1], i8, i1[:,::1])")
-def are_balls_free(
-    points: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
-) -> NDArray[np.bool_]:
-    """Check whether balls lie in free space.
-
-    Args:
-        points: Centres of the balls, metres, (P, 3).
-        radius: Radius of the balls, metres.
-        size: Side of a voxel, metres.
-        keys: Keys of the blocks, ascending, (N,).
-        rows: Row of each key's block, (N,).
-        bound: Bound of the coordinates of blocks.
-        log_odds: Log-odds of the blocks, steps, (N, 4096).
-
-    Returns:
-        True if all voxels that the ball touches are free, (P,).
-    """
-    free = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        free[i] = _is_ball_free(points[i], radius, size, keys, rows, bound, log_odds)
-    return free

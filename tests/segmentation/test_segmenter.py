@@ -1,0 +1,54 @@
+"""Segmenters that use the predicted pose, and the state of segmenters."""
+
+from __future__ import annotations
+
+import torch
+from helpers.tilted_frames import IDENTITY, Network, make_frame
+from torch import nn
+
+from v3d_torch.runtime.stateful import Stateful
+from v3d_torch.segmentation.segmenter import PoseAwareSegmenter, restore_segmenter, segment_frame, segmenter_state_of
+from v3d_torch.segmentation.upright import UprightSegmenter
+from v3d_torch.types import Instances, RGBDFrame
+
+
+def test_protocols_and_helper_functions_apply_to_upright_segmenters_only() -> None:
+    network = Network()
+    upright = UprightSegmenter(network)
+    assert isinstance(upright, PoseAwareSegmenter) and isinstance(upright, Stateful)
+    assert not isinstance(network, PoseAwareSegmenter) and not isinstance(network, Stateful)
+    assert segment_frame(upright, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
+    assert segment_frame(network, make_frame(0, 1), IDENTITY).labels.tolist() == [1]
+    state = segmenter_state_of(upright)
+    assert state is not None and state["calls"] == 1 and segmenter_state_of(network) is None
+    other = UprightSegmenter(Network())
+    restore_segmenter(other, None)
+    assert other.state_dict()["calls"] == 0
+    restore_segmenter(other, state)
+    restore_segmenter(network, state)
+    assert other.state_dict()["calls"] == 1 and torch.equal(other.state_dict()["up"], state["up"])
+
+
+def test_weights_of_a_torch_module_are_not_its_state() -> None:
+    class Module(nn.Module):
+        def forward(self, frame: RGBDFrame) -> Instances:
+            return Instances.empty(*frame.image.shape[1:])
+
+    assert segmenter_state_of(Module()) is None
+
+
+def test_methods_forwarded_by_a_proxy_are_used() -> None:
+    class Proxy:
+        def __init__(self, target: object) -> None:
+            self._target = target
+
+        def __call__(self, frame: RGBDFrame) -> Instances:
+            raise AssertionError("called without the pose")
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._target, name)
+
+    proxy = Proxy(UprightSegmenter(Network()))
+    assert segment_frame(proxy, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
+    state = segmenter_state_of(proxy)
+    assert state is not None and state["calls"] == 1

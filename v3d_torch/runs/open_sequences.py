@@ -1,0 +1,52 @@
+"""Sequences opened for a command, with a progress bar for downloads and notes on what is assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
+from v3d_torch.datasets.image_sequence import ImageSequence
+from v3d_torch.datasets.stored import StoredSequence
+from v3d_torch.errors import InputError
+from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
+
+
+def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
+    """Open a sequence as `load_sequence` does, with a progress bar for downloads."""
+    with progress_bars(console) as progress:
+        bar = ProgressBar(progress, "sequence")
+        sequence = load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)
+    print_assumptions(sequence, console)
+    return sequence
+
+
+def print_assumptions(source: RGBDStream, console: Console) -> None:
+    """Print the assumptions about a source that does not state everything: an estimated depth scale."""
+    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
+        console.print(f"note: {source.name}: {source.depth_scale_note}", markup=False, highlight=False)
+
+
+def open_sequences(
+    names: Sequence[str], data_root: Path | None, console: Console, *, skip_broken: bool = False
+) -> dict[str, RGBDSequence]:
+    """Open several sequences in the given order, before the first of them is run; see `load_sequence`.
+
+    Returns:
+        Sequences by their name in tables.
+
+    Raises:
+        InputError: If a sequence is not valid, or two sequences have the same name.
+        DownloadError: If a sequence is missing and cannot be downloaded.
+    """
+    sequences: dict[str, RGBDSequence] = {}
+    for name in dict.fromkeys(names):
+        sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
+        if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
+            raise sequence.groundtruth_error  # runs are compared by their scores, so all need readable ground truth
+        if sequence.name in sequences:
+            raise InputError(f"{name}: another sequence has the same name, {sequence.name}; run them separately")
+        sequences[sequence.name] = sequence
+    return sequences

@@ -1,0 +1,53 @@
+"""Segmenters that use the predicted pose of the camera, and the state of segmenters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, cast, runtime_checkable
+
+from torch import Tensor, nn
+
+from v3d_torch.runtime.stateful import Stateful, has_methods, is_stateful
+from v3d_torch.types import Instances, RGBDFrame, Segmenter
+
+
+@runtime_checkable
+class PoseAwareSegmenter(Protocol):
+    """A segmenter that uses the predicted pose of the camera, for example to rotate images upright."""
+
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+        """Find the instances in the colour image of a frame.
+
+        Args:
+            frame: Frame.
+            T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`; None if it is not known.
+        """
+
+
+def segment_frame(segmenter: Segmenter, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+    """Segment a frame; only a `PoseAwareSegmenter` receives the predicted pose.
+
+    Args:
+        segmenter: Segmenter.
+        frame: Frame.
+        T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`; None if it is not known.
+    """
+    if has_methods(segmenter, "segment_with_pose"):
+        return cast("PoseAwareSegmenter", segmenter).segment_with_pose(frame, T_cw)
+    return segmenter(frame)
+
+
+def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
+    """Return the state of a segmenter; None if it has no state.
+
+    A torch module counts as stateless: its state_dict holds its weights, which are constant and too large to copy in
+    each frame.
+    """
+    has_state = is_stateful(segmenter) and not isinstance(segmenter, nn.Module)
+    return cast("Stateful", segmenter).state_dict() if has_state else None
+
+
+def restore_segmenter(segmenter: object, state: Mapping[str, Any] | None) -> None:
+    """Restore a state that `segmenter_state_of` returned; do nothing if it is None."""
+    if state is not None and is_stateful(segmenter):
+        cast("Stateful", segmenter).load_state_dict(state)
