@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from scipy.stats import chi2
+from scipy.special import chdtrc  # scipy.stats would take half a second to import
 from torch import Tensor
 
 from v3d_torch.calibration.parameters import (
@@ -73,7 +73,7 @@ def decide(name: str, given: float, value: float, sigma: float, tolerance: float
     """
     if not sigma <= tolerance:
         return Estimate(name, given, value, sigma, accepted=False, reason=NOT_DETERMINED)
-    if chi2.sf(((value - given) / sigma) ** 2, 1) > MAX_P_VALUE:
+    if chdtrc(1, ((value - given) / sigma) ** 2) > MAX_P_VALUE:
         return Estimate(name, given, value, sigma, accepted=False, reason=AGREES)
     return Estimate(name, given, value, sigma, accepted=True, reason="")
 
@@ -181,7 +181,7 @@ class ParameterSelection:
         names = list(group.parameters)
         difference = torch.tensor([self.fit.values[name] for name in names]) - self._problem.given_values(names)
         statistic = difference @ torch.linalg.solve(self.fit.covariance_of(group), difference)
-        return float(chi2.sf(float(statistic), len(names)))
+        return float(chdtrc(len(names), max(float(statistic), 0.0)))
 
     def _reject(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
         for name in group.parameters:
