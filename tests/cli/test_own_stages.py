@@ -114,6 +114,7 @@ def test_saved_state_imports_only_the_stages_that_are_given(sequence: Path, own:
     del sys.modules[MODULE]
     with pytest.raises(ConfigError, match=rf"slam\.state: would import code, {SEGMENT}; give load_state the stages"):
         load_state(tmp_path / "slam.state")
+    load_state(tmp_path / "slam.state", slam.segment)  # replaces the segmenter of the configuration
     assert MODULE not in sys.modules
     loaded = load_state(tmp_path / "slam.state", stages=config.stages)
     assert loaded(source[1]).T_wc.equal(slam(source[1]).T_wc)

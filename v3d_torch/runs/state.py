@@ -74,7 +74,8 @@ def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesCo
     try:
         config = Config.model_validate(metadata["config"])
         camera = PinholeCamera(**{**metadata["camera"], "distortion": tuple(metadata["camera"]["distortion"])})
-        if (stage := first_not_given(config.stages, stages or StagesConfig())) is not None:
+        imported = config.stages if segment is None else config.stages.model_copy(update={"segment": None})
+        if (stage := first_not_given(imported, stages or StagesConfig())) is not None:
             raise ConfigError(f"{path}: would import code, {stage}; give load_state the stages that it may import")
         slam = V3DSLAM(camera, segment, config)
         slam.load_state_dict(state)
