@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -20,7 +21,7 @@ from helpers.batches import plan_seeds, repeat_sequence
 from helpers.own_stages import SEGMENT, write_own_stages
 from typer.testing import CliRunner
 
-from v3d_torch.batch.executor import JobFinished
+from v3d_torch.batch.executor import JobFinished, JobProgress, JobRepeated
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.batch.run_job import run_job
@@ -80,45 +81,49 @@ def test_worker_imports_the_stages_of_the_configuration(nodes: Nodes, own: Path,
     assert json.loads((job.folder / "metrics.json").read_text())["stages"] == config.stages.paths
 
 
-def find_process(job: Job) -> int:
-    """Return the id of the process, among those started by these tests, that has the log of a job open."""
+def find_process(job: Job) -> int | None:
+    """Return the id of the process, among those started by these tests, that has the log of a job open, if any."""
     for process in psutil.Process().children(recursive=True):
         with suppress(psutil.Error):
             if any(Path(file.path) == job.folder / "run.log" for file in process.open_files()):
                 return process.pid
-    raise AssertionError(f"no process runs {job}")
+    return None  # it has just been killed
 
 
-def test_killed_job_fails_and_stop_ends_running_jobs(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
-    """Kill the first of four jobs on two cores; stop the batch once a job has ended and another is running."""
-    planned = plan_seeds(repeat_sequence(moment, tmp_path / "long", frames=30), tmp_path / "out", seeds=4)
-    stop = Event()
-    started: set[int] = set()
+def test_killed_jobs_are_run_once_more(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
+    """Kill one of two jobs twice and the other one once."""
+    planned = plan_seeds(repeat_sequence(moment, tmp_path / "long", frames=30), tmp_path / "out", seeds=2)
+    limits = {0: 2, 1: 1}
+    kills: Counter[int] = Counter()
+    repeated: list[JobRepeated] = []
     ends: dict[int, str | None] = {}
-    killed = None
-    for event in RayExecutor(nodes.address)(planned, stop):
+    for event in RayExecutor(nodes.address)(planned, Event()):
         seed = event.job.config.seed
         if isinstance(event, JobFinished):
             ends[seed] = event.failure
-        else:
-            started.add(seed)
-            assert len(started - set(ends)) <= 2
-            if killed is None and event.frames:
-                killed = seed
-                os.kill(find_process(event.job), signal.SIGKILL)
-            elif event.frames and None in ends.values():
-                stop.set()
-    assert killed is not None and "died unexpectedly" in str(ends[killed])
-    (job,) = (job for job in planned if job.config.seed == killed)
-    assert (job.folder / "run.log").read_text().splitlines()[-1].endswith(f"ERROR {ends[killed]}")
-    succeeded = [seed for seed, failure in ends.items() if failure is None]
-    stopped = [seed for seed, failure in ends.items() if failure is not None and "interrupted after" in failure]
-    assert succeeded and stopped and len(succeeded) + len(stopped) == len(ends) - 1
-    for job in planned:
-        outcome = job.earlier_outcome()
-        assert (outcome is not None) == (job.config.seed in succeeded)
-        if job.config.seed in stopped:
-            assert (job.folder / "trajectory.txt").read_text() and (job.folder / "metrics.json").is_file()
+        elif isinstance(event, JobRepeated):
+            repeated.append(event)
+        elif event.frames and kills[seed] < limits[seed] and (process := find_process(event.job)) is not None:
+            kills[seed] += 1
+            os.kill(process, signal.SIGKILL)
+    assert kills == limits and ends[1] is None and "died unexpectedly" in str(ends[0])
+    assert sorted(event.job.config.seed for event in repeated) == [0, 1]
+    assert all(str(event).endswith("; it is run once more") for event in repeated)
+    assert (planned[0].folder / "run.log").read_text().splitlines()[-1].endswith(f"ERROR {ends[0]}")
+    assert [job.earlier_outcome() is not None for job in planned] == [False, True]
+
+
+def test_stop_ends_running_jobs(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
+    planned = plan_seeds(repeat_sequence(moment, tmp_path / "long", frames=120), tmp_path / "out", seeds=2)
+    stop, ends = Event(), []
+    for event in RayExecutor(nodes.address, workers=1)(planned, stop):
+        if isinstance(event, JobFinished):
+            ends.append(event)
+        elif isinstance(event, JobProgress) and event.frames:
+            stop.set()
+    (ended,) = ends
+    assert "interrupted after" in str(ended.failure) and all(job.earlier_outcome() is None for job in planned)
+    assert (ended.job.folder / "trajectory.txt").read_text() and (ended.job.folder / "metrics.json").is_file()
 
 
 @pytest.mark.parametrize("address", ["nonsense", "127.0.0.1:1", "ray://127.0.0.1:1"])

@@ -48,6 +48,22 @@ class JobFinished:
     failure: str | None
 
 
+@dataclass(frozen=True)
+class JobRepeated:
+    """A job whose process or machine died, and that is run once more.
+
+    Attributes:
+        job: The job.
+        reason: Reason of the end.
+    """
+
+    job: Job
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.job}: {self.reason}; it is run once more"
+
+
 def report_lost_process(job: Job, reason: str) -> JobFinished:
     """Write to the log of a job that its process died; the process itself cannot do it.
 
@@ -63,10 +79,14 @@ def report_lost_process(job: Job, reason: str) -> JobFinished:
     return JobFinished(job, reason)
 
 
+BatchEvent = JobProgress | JobFinished | JobRepeated
+"""Event of a batch."""
+
+
 class Executor(Protocol):
     """Runs each job in a process of its own, so that a crash affects one job only."""
 
-    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[JobProgress | JobFinished]:
+    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[BatchEvent]:
         """Run jobs and yield events as they happen. Closing the generator kills the running jobs.
 
         Args:

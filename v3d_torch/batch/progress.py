@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from v3d_torch.batch.executor import JobFinished, JobProgress
+from v3d_torch.batch.executor import BatchEvent, JobFinished, JobProgress
 from v3d_torch.batch.job import Job
 
 
@@ -29,7 +29,7 @@ class BatchProgress:
         self._all_jobs = progress.add_task("all runs", total=sum(job.frames for job in jobs), note="")
         self._update_total()
 
-    def __call__(self, event: JobProgress | JobFinished) -> None:
+    def __call__(self, event: BatchEvent) -> None:
         """Show an event."""
         job = event.job
         if isinstance(event, JobProgress):
@@ -40,8 +40,9 @@ class BatchProgress:
         else:
             if job.folder in self._running:
                 self._progress.remove_task(self._running.pop(job.folder))
-            self._frames[job.folder] = job.frames
-            self._ended += 1
+            has_ended = isinstance(event, JobFinished)
+            self._frames[job.folder] = job.frames if has_ended else 0
+            self._ended += has_ended
         self._update_total()
 
     def _update_total(self) -> None:

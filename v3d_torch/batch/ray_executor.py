@@ -5,12 +5,19 @@ from __future__ import annotations
 import logging
 import os
 import socket
+from collections import deque
 from collections.abc import Generator, Sequence
-from itertools import islice
 from threading import Event
 from typing import Any
 
-from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
+from v3d_torch.batch.executor import (
+    ONE_THREAD_ENVIRONMENT,
+    BatchEvent,
+    JobFinished,
+    JobProgress,
+    JobRepeated,
+    report_lost_process,
+)
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.errors import InputError
@@ -27,7 +34,8 @@ class RayExecutor:
     """An `Executor` that runs each job in a process of a Ray cluster, with one core and one thread.
 
     The package has to be installed on all machines, and they have to share the folders of the results and of the
-    sequences. A job whose process or machine dies is not run again.
+    sequences. A job whose process or machine dies is run once more, from its last checkpoint: machines of a cluster can
+    fail or be taken away, but a job that dies twice probably needs more memory than there is.
 
     Args:
         address: Address of the cluster for ``ray.init``: ``auto`` for the cluster of this machine, ``local`` for a new
@@ -56,7 +64,7 @@ class RayExecutor:
         self._ray = ray
         self.workers = workers
 
-    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[JobProgress | JobFinished]:
+    def __call__(self, jobs: Sequence[Job], stop: Event) -> Generator[BatchEvent]:
         """Run jobs; see `Executor`."""
         ray = self._ray
         this_machine = ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(
@@ -70,14 +78,16 @@ class RayExecutor:
             max_calls=1,  # a new process for each job
             runtime_env={"env_vars": ONE_THREAD_ENVIRONMENT},
         )(_task)
-        waiting = iter(range(len(jobs)))
+        waiting = deque(range(len(jobs)))
         pending: dict[Any, int] = {}
+        repeated: set[int] = set()
         cancelled = False
         try:
             while True:
                 if not stop.is_set():
-                    free = None if self.workers is None else self.workers - len(pending)
-                    pending |= {run.remote(jobs[index], index, board): index for index in islice(waiting, free)}
+                    while waiting and (self.workers is None or len(pending) < self.workers):
+                        index = waiting.popleft()
+                        pending[run.remote(jobs[index], index, board)] = index
                 elif not cancelled:
                     cancelled = True
                     for reference in pending:
@@ -89,13 +99,20 @@ class RayExecutor:
                     if index in pending.values():  # a report can arrive after the end of its job
                         yield JobProgress(jobs[index], frames)
                 for reference in ended:
-                    job = jobs[pending.pop(reference)]
+                    index = pending.pop(reference)
+                    job = jobs[index]
                     try:
                         yield JobFinished(job, ray.get(reference))
                     except ray.exceptions.TaskCancelledError:  # before it started
                         continue
                     except ray.exceptions.RayError as error:
-                        yield report_lost_process(job, f"its process or machine failed ({_first_line(error)})")
+                        reason = f"its process or machine failed ({_first_line(error)})"
+                        if index in repeated or stop.is_set():
+                            yield report_lost_process(job, reason)
+                        else:
+                            repeated.add(index)
+                            waiting.appendleft(index)
+                            yield JobRepeated(job, reason)
         except ray.exceptions.RayError as error:
             raise InputError(
                 f"connection to the Ray cluster lost ({_first_line(error)}); repeat the command with --resume to"

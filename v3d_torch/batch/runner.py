@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from v3d_torch.batch.batch_record import BatchRecord
-from v3d_torch.batch.executor import Executor, JobFinished
+from v3d_torch.batch.executor import Executor, JobFinished, JobRepeated
 from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
@@ -113,8 +113,11 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
             with closing(executor(record.missing, stop)) as events:
                 for event in events:
                     show(event)
+                    if isinstance(event, JobRepeated):
+                        progress.console.print(str(event), markup=False)
                     if isinstance(event, JobFinished):
                         progress.console.print(str(record.add(event)), markup=False)
+                        progress.table = next(iter(record.screen_tables()), None)
                         try:
                             record.write()
                         except OutputError as error:  # the running jobs can still finish

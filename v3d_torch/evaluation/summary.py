@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from statistics import median
 
 from rich.table import Table
 
+from v3d_torch.evaluation.comparison import compare_configurations
 from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
 from v3d_torch.evaluation.paper_tables import HEADINGS, find_paper_sequence, load_paper_scores
 from v3d_torch.evaluation.tables import (
@@ -30,6 +31,16 @@ LEGEND = "RMSE, median and [range] over the seeds; RPE over 1 s. The lowest valu
 
 LATEX_PACKAGES = "% \\usepackage{booktabs}"
 """First line of a LaTeX file of tables: the packages that it requires, as a comment."""
+
+_ERRORS = {"ate": "ATE", "rpe_trans": "RPE of the translation", "rpe_rot": "RPE of the rotation"}
+"""Name of each metric in tables of ratios, which have no unit."""
+
+RATIO_LEGEND = (
+    "Error divided by that of the first configuration with the same sequence and seed: geometric mean and [95 %"
+    " interval] over the seeds, or over the sequences. A ratio whose interval does not contain 1 is bold; without a"
+    " difference, one of twenty is."
+)
+"""Explanation of the tables of ratios."""
 
 _FORMAT = ".4f"
 _PAPER_SUFFIX = " (paper)"
@@ -55,13 +66,24 @@ def make_error_tables(
     return tables
 
 
+def make_ratio_tables(outcomes: Sequence[Outcome]) -> list[ErrorTable]:
+    """Return one table for each metric in which configurations can be compared; see `compare_configurations`."""
+    tables = (compare_configurations(outcomes, METRIC_KEYS[metric], name) for metric, name in _ERRORS.items())
+    return [table for table in tables if table is not None]
+
+
 def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return a Markdown document with all tables and the runs that failed; see `make_error_tables`."""
+    """Return a Markdown document with all tables and the runs that failed.
+
+    See `make_error_tables` and `make_ratio_tables`.
+    """
     lines = ["# Summary", "", LEGEND]
     tables = make_error_tables(outcomes, absent=absent)
     if any(method.endswith(_PAPER_SUFFIX) for table in tables for method in table.methods):
         lines += ["", _PAPER_NOTE]
     lines += [line for table in tables for line in format_markdown_table(table)]
+    for table in make_ratio_tables(outcomes):
+        lines += [*format_markdown_table(table), "", RATIO_LEGEND]
     failed = [f"- {outcome}" for outcome in outcomes if outcome.failure is not None]
     lines += ["", "## Failed", "", *failed] if failed else []
     return "\n".join(lines) + "\n"
@@ -97,8 +119,13 @@ def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
 
 
 def make_screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[Table]:
-    """Return the tables for the screen, with the first and the last method of the paper; see `make_error_tables`."""
-    return [make_screen_table(table) for table in make_error_tables(outcomes, _SCREEN_METHODS, absent)]
+    """Return the tables for the screen, with the first and the last method of the paper.
+
+    See `make_error_tables` and `make_ratio_tables`.
+    """
+    errors = make_error_tables(outcomes, _SCREEN_METHODS, absent)
+    tables = [replace(table, heading=f"{table.heading}, RMSE") for table in errors] + make_ratio_tables(outcomes)
+    return [make_screen_table(table) for table in tables]
 
 
 @dataclass(frozen=True)

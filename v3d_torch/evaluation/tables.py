@@ -91,7 +91,7 @@ def format_latex_table(table: ErrorTable, legend: str) -> list[str]:
 
 def make_screen_table(table: ErrorTable) -> Table:
     """Return the table for the screen, the best values in green."""
-    shown = Table(title=f"{table.heading}, RMSE", box=box.SIMPLE_HEAD)
+    shown = Table(title=table.heading, box=box.SIMPLE_HEAD)
     shown.add_column("sequence", no_wrap=True)
     for method in table.methods:
         shown.add_column(escape(method).replace(" (", "\n("), justify="right", overflow="fold")

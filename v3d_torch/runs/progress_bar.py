@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from threading import Event
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from v3d_torch.frame_result import FrameResult
@@ -13,9 +14,25 @@ from v3d_torch.runs.run import describe_motion
 from v3d_torch.types import RGBDFrame
 
 
-def progress_bars(console: Console) -> Progress:
+class ProgressBars(Progress):
+    """Progress bars above an optional table.
+
+    Attributes:
+        table: Table below the bars; None for none.
+    """
+
+    table: RenderableType | None = None
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Yield the bars, then the table: a table that is too long for the screen does not hide the bars."""
+        yield from super().get_renderables()
+        if self.table is not None:
+            yield self.table
+
+
+def progress_bars(console: Console) -> ProgressBars:
     """Return progress bars with counts, remaining time and a note; hidden if the console is not a terminal."""
-    return Progress(
+    return ProgressBars(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
