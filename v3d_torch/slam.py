@@ -43,6 +43,15 @@ from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.segmenter import restore_segmenter, segment_frame, segmenter_state_of
 from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stage_checks import ReplaceableStages
+from v3d_torch.stages import (
+    AppearanceStage,
+    BackProjectionStage,
+    CompensationStage,
+    DepthStage,
+    FeatureStage,
+    OdometryStage,
+    ProposalStage,
+)
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
@@ -106,18 +115,22 @@ class V3DSLAM(ReplaceableStages):
         self.motion_model = MotionModel()
         # Preprocessing
         self.segment = segment or make_segmenter(config, camera)
-        self.smooth_depth = DepthSmoother(config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio)
-        self.detect_features = ORB(config.features, camera)
+        self.smooth_depth: DepthStage = DepthSmoother(
+            config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio
+        )
+        self.detect_features: FeatureStage = ORB(config.features, camera)
         # Motion of the camera since the previous frame
-        self.compensate = TimeCompensation(config, camera)
+        self.compensate: CompensationStage = TimeCompensation(config, camera)
         self.estimate_motion = MotionEstimator(config.odometry, config.features, camera, config.seed)
-        self.odometry = Odometry(config, camera, self.estimate_motion)
+        self.odometry: OdometryStage = Odometry(config, camera, self.estimate_motion)
         # Objects
         free_space = config.objects.free_space
         self.free_space_check = FreeSpaceCheck(free_space, camera)
-        self.propose_unlabelled = partial(unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area)
-        self.back_project_instances = InstanceBackProjector(config.objects.clouds, camera)
-        self.describe_appearance = colour_histograms
+        self.propose_unlabelled: ProposalStage = partial(
+            unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area
+        )
+        self.back_project_instances: BackProjectionStage = InstanceBackProjector(config.objects.clouds, camera)
+        self.describe_appearance: AppearanceStage = colour_histograms
         self.classify_motion = MotionClassifier(config.objects, camera)
         # Camera pose and map
         local_keyframes = config.tracking.local_keyframes

@@ -33,6 +33,7 @@ LAYERS = (
     *(
         "calibration",
         "frame_result",
+        "stages",
         "stage_checks",
         "slam",
         "live",
