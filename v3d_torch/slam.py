@@ -42,8 +42,7 @@ from v3d_torch.runtime.stateful import Stateful, is_stateful
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.segmenter import restore_segmenter, segment_frame, segmenter_state_of
 from v3d_torch.segmentation.upright import up_votes
-from v3d_torch.stage_checks import ReplaceableStages
-from v3d_torch.stages import (
+from v3d_torch.stages.protocols import (
     AppearanceStage,
     BackProjectionStage,
     CompensationStage,
@@ -52,6 +51,7 @@ from v3d_torch.stages import (
     OdometryStage,
     ProposalStage,
 )
+from v3d_torch.stages.stage_checks import ReplaceableStages
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker

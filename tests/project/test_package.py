@@ -34,7 +34,6 @@ LAYERS = (
         "calibration",
         "frame_result",
         "stages",
-        "stage_checks",
         "slam",
         "live",
         "pipeline",

@@ -25,7 +25,7 @@ from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runtime.stage_hooks import HookedStage
 from v3d_torch.segmentation import UprightSegmenter
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.stage_checks import STAGES
+from v3d_torch.stages.stage_checks import STAGES
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, RGBDFrame
 

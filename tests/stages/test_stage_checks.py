@@ -21,7 +21,7 @@ from v3d_torch.odometry.odometry import Odometry
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.stage_checks import ReplacedStage
+from v3d_torch.stages.stage_checks import ReplacedStage
 from v3d_torch.types import Instances, RGBDFrame
 
 CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -120,7 +120,7 @@ def test_wrong_result_of_a_replaced_stage_is_named(stage: str, edit: Callable[[A
 
 
 def test_every_result_has_a_case() -> None:
-    from v3d_torch import stage_checks
+    from v3d_torch.stages import stage_checks
 
     checked = {name for name, result in stage_checks._RESULTS.items() if result is not None}
     assert {stage for stage, _, _ in WRONG} == checked
@@ -215,7 +215,7 @@ def configure(*overrides: str) -> Config:
 
 
 def test_configured_stages_are_checked_stages() -> None:
-    from v3d_torch import stage_checks
+    from v3d_torch.stages import stage_checks
 
     checked = {name for name, result in stage_checks._RESULTS.items() if result is not None}
     assert StagesConfig.model_fields.keys() == checked - {"track_camera"} | {"segment"}

@@ -1,0 +1,1 @@
+"""Stages of the system: their protocols, and the checks of stages of your own."""
