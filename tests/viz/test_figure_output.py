@@ -10,9 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from v3d_torch.errors import InputError
-from v3d_torch.viz.figure_output import embed_image, embed_svg
+from v3d_torch.viz.figure_output import embed_image, embed_svg, save_figure
 from v3d_torch.viz.stage_times import draw_stage_bars
 
 
@@ -23,6 +24,19 @@ def test_svg_has_colours_of_page_and_is_reproducible() -> None:
     assert "#000000" not in one and "currentColor" in one
     assert ">read</text>" in one  # text, not outlines
     assert "fill: #ffffff" not in one
+
+
+def test_png_file_has_the_pixels_of_savefig(tmp_path: Path) -> None:
+    for path, write in ((tmp_path / "a.png", save_figure), (tmp_path / "b.png", Figure.savefig)):
+        figure = Figure(figsize=(4, 3), dpi=100, layout="constrained")
+        axes = figure.add_subplot(projection="3d")
+        axes.scatter(range(5), range(5), range(5), label="points")
+        axes.set(title="title", xlabel="x [m]")
+        figure.add_subplot(1, 4, 4).imshow(np.arange(12).reshape(3, 4))
+        figure.legend(loc="outside lower center")
+        write(figure, path)
+    written, expected = (cv2.imread(str(tmp_path / name)) for name in ("a.png", "b.png"))
+    assert written.shape == (300, 400, 3) and np.array_equal(written, expected)
 
 
 def test_image_is_a_data_url_and_damaged_image_is_an_error(tmp_path: Path) -> None:
