@@ -29,6 +29,10 @@ from v3d_torch.optim.jackknife import MAX_BLOCKS, jackknife_covariance
 MAX_P_VALUE = 1e-3
 """Significance level: maximum probability of a difference by chance with which an estimate is accepted."""
 
+_FOCAL_ERROR = 0.015
+"""Relative standard deviation of focal lengths by what the model lacks: true lens distortion differs from its model,
+the readout is not constant, depth has errors. It is that of recordings whose focal lengths are known."""
+
 _LONG_BLOCKS = MAX_BLOCKS // 2
 """Number of the longer blocks with which standard deviations are compared."""
 
@@ -95,6 +99,14 @@ class _Fit:
         index = list(self.values).index(name)
         return math.sqrt(max(float(self.covariance[index, index]), 0.0))
 
+    def model_error(self, name: str) -> float:
+        """Standard deviation of a parameter by what the model lacks."""
+        return _FOCAL_ERROR * self.values[name] if name in ("fx", "fy") else 0.0
+
+    def total_sigma(self, name: str) -> float:
+        """Standard deviation of a parameter by noise and by what the model lacks."""
+        return math.hypot(self.sigma(name), self.model_error(name))
+
     def covariance_of(self, group: ParameterGroup) -> Tensor:
         """Covariance of the parameters of a group."""
         index = torch.tensor([list(self.values).index(name) for name in group.parameters])
@@ -129,7 +141,7 @@ class ParameterSelection:
     def estimates(self) -> list[Estimate]:
         """Estimates of all parameters, accepted estimates first."""
         accepted = [
-            Estimate(name, self._given(name), value, self.fit.sigma(name), accepted=True, reason="")
+            Estimate(name, self._given(name), value, self.fit.total_sigma(name), accepted=True, reason="")
             for name, value in self.fit.values.items()
         ]
         return accepted + self.rejected
@@ -180,13 +192,17 @@ class ParameterSelection:
         """Probability that a difference from the given values as large as this one occurs by chance (Wald test)."""
         names = list(group.parameters)
         difference = torch.tensor([self.fit.values[name] for name in names]) - self._problem.given_values(names)
-        statistic = difference @ torch.linalg.solve(self.fit.covariance_of(group), difference)
+        model_error = torch.tensor([self.fit.model_error(name) for name in names], dtype=torch.float64)
+        total = self.fit.covariance_of(group) + model_error.square().diag()
+        statistic = difference @ torch.linalg.solve(total, difference)
         return float(chdtrc(len(names), max(float(statistic), 0.0)))
 
     def _reject(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
         for name in group.parameters:
             self.rejected.append(
-                Estimate(name, self._given(name), fit.values[name], fit.sigma(name), accepted=False, reason=reason)
+                Estimate(
+                    name, self._given(name), fit.values[name], fit.total_sigma(name), accepted=False, reason=reason
+                )
             )
 
 
