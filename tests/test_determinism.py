@@ -18,10 +18,8 @@ from v3d_torch.pipeline import Pipeline
 FRAMES = 14
 RUNS = {
     "by default": (),
-    "without prefetching": ("prefetch=false",),
     "two threads for the network": ("segmentation.threads=2",),
     "without prefetching, two threads": ("prefetch=false", "threads=2"),
-    "two threads": ("threads=2",),
 }
 
 
