@@ -50,9 +50,9 @@ def empty_room() -> Scene:
 def frames() -> list[RGBDFrame]:
     """Frames of two laps, each with different sensor noise."""
     renderer = Renderer(empty_room(), CAMERA)
+    lap = [renderer(true_pose(index), 0.0) for index in range(FRAMES)]
     frames = []
-    for index in range(2 * FRAMES):
-        rendering = renderer(true_pose(index), 0.0)
+    for index, rendering in enumerate([*lap, *lap]):
         noise = torch.Generator().manual_seed(index)
         colour = simulate_colour(rendering.colour, noise).permute(2, 0, 1).contiguous()
         depth = simulate_depth(rendering.depth, CAMERA, noise).to(torch.float32)[None]

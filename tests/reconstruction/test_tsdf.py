@@ -166,7 +166,7 @@ def test_mesh_is_closed_except_at_its_boundary() -> None:
 def test_mesh_is_equal_for_any_tile_size(monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(looking_around(3), CRATE)
     whole = fuse_mesh(views, CONFIG)
-    monkeypatch.setattr(mesh_module, "_TILE", 3)
+    monkeypatch.setattr(mesh_module, "_TILE", 6)
     tiled = fuse_mesh(views, CONFIG)
     assert len(tiled.vertices) == len(whole.vertices) and len(tiled.faces) == len(whole.faces)
     nearest, same = torch.cdist(tiled.vertices.double(), whole.vertices.double()).min(dim=1)
