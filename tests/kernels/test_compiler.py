@@ -16,7 +16,7 @@ from torch import Tensor
 
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS, Twin, compiled_by
-from v3d_torch.runs import console
+from v3d_torch.runs import kernel_compilation
 
 needs_numba = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
 
@@ -117,9 +117,9 @@ def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest
         def kill(self) -> None:
             self.killed = True
 
-    monkeypatch.setattr(console, "_start_compiling_backwards", Helper)
+    monkeypatch.setattr(kernel_compilation, "_start_compiling_backwards", Helper)
     for steps, expected in (([(0, 2), (0, 1), (0, 0)], 0), ([(0, 2), (1, 1), (2, 0)], 1)):
         monkeypatch.setattr(compiler, "compile_kernels", lambda steps=steps: iter(steps))
         text = StringIO()
-        console.compile_kernels(Console(file=text))
+        kernel_compilation.compile_kernels(Console(file=text))
         assert text.getvalue().count("compiling kernels for this processor") == expected
