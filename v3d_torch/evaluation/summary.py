@@ -36,7 +36,7 @@ _ERRORS = {"ate": "ATE", "rpe_trans": "RPE of the translation", "rpe_rot": "RPE 
 """Name of each metric in tables of ratios, which have no unit."""
 
 RATIO_LEGEND = (
-    "Error divided by that of the first configuration with the same sequence and seed: geometric mean and [95 %"
+    "Ratios: error divided by that of the first configuration with the same sequence and seed: geometric mean and [95 %"
     " interval] over the seeds, or over the sequences. A ratio whose interval does not contain 1 is bold; without a"
     " difference, one of twenty is."
 )
@@ -82,8 +82,9 @@ def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> 
     if any(method.endswith(_PAPER_SUFFIX) for table in tables for method in table.methods):
         lines += ["", _PAPER_NOTE]
     lines += [line for table in tables for line in format_markdown_table(table)]
-    for table in make_ratio_tables(outcomes):
-        lines += [*format_markdown_table(table), "", RATIO_LEGEND]
+    if ratios := make_ratio_tables(outcomes):
+        lines += [line for table in ratios for line in format_markdown_table(table)]
+        lines += ["", RATIO_LEGEND]
     failed = [f"- {outcome}" for outcome in outcomes if outcome.failure is not None]
     lines += ["", "## Failed", "", *failed] if failed else []
     return "\n".join(lines) + "\n"
