@@ -34,9 +34,11 @@ def apparent_sizes(objects: Iterable[TrackedObject], depth: Tensor, camera: Pinh
     """
     sizes, metres = [], depth[0].numpy()
     for each in objects:
+        if each.label != PERSON or each.missed:
+            continue
         mask = each.mask.numpy()
         measured = metres[mask & (metres > 0)]
-        if each.label == PERSON and not each.missed and len(measured):
+        if len(measured):
             rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
             height, width = (rows[-1] - rows[0] + 1) / camera.fy, (columns[-1] - columns[0] + 1) / camera.fx
             sizes.append(float(np.median(measured) * max(height, width)))
