@@ -1,11 +1,14 @@
-"""Depth sampling, selection of features, and their readout Jacobian."""
+"""Depth sampling, selection of features, their readout Jacobian and their noise."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import torch
 from helpers.rolling_camera import CAMERA, KINECT, VELOCITY, observe_rolling, points_in_view
 
-from v3d_torch.features.features import sample_depth, select_evenly
+from v3d_torch.config import Config
+from v3d_torch.features.features import sample_depth, select_evenly, to_measurements
 from v3d_torch.odometry.rolling_shutter import compensate_features
 
 
@@ -37,3 +40,13 @@ def test_selected_features_keep_their_readout_jacobian() -> None:
 def test_readout_jacobian_is_zero_by_default() -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
     assert torch.equal(observed.readout_jacobian, torch.zeros_like(observed.uv))
+
+
+def test_sigma_ratio_multiplies_the_configured_noise() -> None:
+    config, observed = Config(), observe_rolling(points_in_view(), VELOCITY, 0.0)
+    ratio = torch.linspace(0.5, 4, 2 * len(observed), dtype=torch.float64).reshape(-1, 2)
+    given = to_measurements(observed, config.tracking, config.features)
+    scaled = to_measurements(replace(observed, sigma_ratio=ratio), config.tracking, config.features)
+    torch.testing.assert_close(scaled.pixel_sigma / given.pixel_sigma, ratio[:, 0])
+    torch.testing.assert_close(scaled.inverse_depth_sigma / config.tracking.inverse_depth_sigma, ratio[:, 1])
+    assert torch.equal(given.inverse_depth_sigma, torch.full_like(observed.depth, config.tracking.inverse_depth_sigma))

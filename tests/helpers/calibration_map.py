@@ -82,6 +82,7 @@ def make_map(
             readout_jacobian=jacobian[seen],
             inverse_depth=inverse_depth[seen],
             octave=torch.zeros_like(seen),
+            sigma_ratio=torch.ones(len(seen), 2, dtype=torch.float64),
             valid=torch.ones_like(seen, dtype=torch.bool),
         )
     return tables

@@ -54,11 +54,15 @@ def test_compensation_equals_its_twin(count: int, speed: float) -> None:
 
 
 @pytest.mark.parametrize("count", COUNTS)
-def test_whitening_equals_its_twin_to_the_bit(count: int) -> None:
+@pytest.mark.parametrize("is_number", [True, False], ids=["number", "tensor"])
+def test_whitening_equals_its_twin_to_the_bit(is_number: bool, count: int) -> None:
     given = features(count)
     sigma = torch.linspace(0.5, 4, count, dtype=torch.float64)
     measured = Measurements(
-        uv=given.uv, inverse_depth=given.inverse_depth, pixel_sigma=sigma, inverse_depth_sigma=0.007
+        uv=given.uv,
+        inverse_depth=given.inverse_depth,
+        pixel_sigma=sigma,
+        inverse_depth_sigma=0.007 if is_number else 0.007 * sigma.flip(0),
     )
     twin = TWINS["v3d_torch.optim.reprojection.whiten"]
     found, expected = twin.compiled(measured, CAMERA.K), twin.torch(measured, CAMERA.K)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import torch
 from helpers.sparse_maps import CAMERA, EYE, features, make_map, uniform
 from torch import Tensor
@@ -20,9 +23,13 @@ class Walk:
     Args:
         keyframes: Number of keyframes.
         error: Standard deviation of the initial poses, metres and radians.
+        change: Changes the observed features.
     """
 
-    def __init__(self, keyframes: int, error: float) -> None:
+    def __init__(
+        self, keyframes: int, error: float, change: Callable[[Features], Features] = lambda observed: observed
+    ) -> None:
+        self.change = change
         # Twice the width of the image: points enter and leave the image.
         self.points = CAMERA.back_project(features(300, seed=1).uv * torch.tensor([2, 1]), 2 + uniform(300, seed=2))
         self.map = make_map()
@@ -47,7 +54,7 @@ class Walk:
         zeros = torch.zeros(len(points), dtype=torch.int64)
         descriptors = torch.zeros(len(points), 32, dtype=torch.uint8)
         uv = uv[points] + noise
-        return Features(uv, uv.long(), in_camera[points, 2], zeros, descriptors), points
+        return self.change(Features(uv, uv.long(), in_camera[points, 2], zeros, descriptors)), points
 
     def errors(self) -> Tensor:
         """Position error of each keyframe, metres."""
@@ -112,3 +119,18 @@ def test_adjustment_removes_outlier_observations() -> None:
     assert walk.errors().max() < 0.006
     adjust(walk.map, Config())  # without the outliers
     assert walk.errors().max() < 0.003
+
+
+def test_features_of_large_uncertainty_have_little_influence() -> None:
+    def shift(observed: Features, ratio: float) -> Features:
+        """Shift every second feature by two pixels, which is no outlier, and give it a relative uncertainty."""
+        shifted = torch.arange(len(observed)) % 2 == 0
+        uv = torch.where(shifted[:, None], observed.uv + torch.tensor([2.0, 0.0]), observed.uv)
+        return replace(observed, uv=uv, sigma_ratio=torch.where(shifted[:, None], ratio, 1.0).double().expand(-1, 2))
+
+    errors = []
+    for ratio in (1.0, 30.0):
+        walk = Walk(5, error=0.01, change=lambda observed, ratio=ratio: shift(observed, ratio))
+        adjust(walk.map, Config())
+        errors.append(walk.errors().max())
+    assert errors[1] < 0.2 * errors[0]

@@ -40,6 +40,7 @@ def random_map(keyframes: int = 4, seed: int = 0) -> StoredMap:
             depth=1 + torch.rand(count, generator=generator, dtype=torch.float64),
             octave=torch.randint(0, 8, (count,), generator=generator),
             descriptors=torch.randint(0, 256, (count, 32), generator=generator, dtype=torch.uint8),
+            sigma_ratio=0.5 + torch.rand(count, 2, generator=generator, dtype=torch.float64),
         )
         landmarks = torch.full((count,), -1)
         matched = min(len(sparse_map.landmarks), count // 2)
@@ -90,6 +91,17 @@ def test_loaded_map_equals_the_saved_map(keyframes: int, tmp_path: Path) -> None
     assert loaded.map.readout == stored.map.readout
     assert [view.keyframe for view in loaded.views] == loaded.map.keyframes
     assert torch.equal(loaded.map.covisibility_edges(1), stored.map.covisibility_edges(1))
+
+
+def test_map_without_sigma_ratios_has_ones(tmp_path: Path) -> None:
+    stored = random_map()
+    for keyframe in stored.map.keyframes:
+        keyframe.features = replace(keyframe.features, sigma_ratio=torch.ones_like(keyframe.features.uv))
+    stored.map.observations["sigma_ratio"].fill_(1)
+    path = write_map(tmp_path, stored)
+    with np.load(path) as file:
+        assert not [name for name in file.files if "sigma_ratio" in name]
+    assert_same(stored, load_map(path, CAMERA, CONFIG))
 
 
 def test_equal_maps_give_identical_files(tmp_path: Path) -> None:
@@ -251,6 +263,8 @@ def test_map_with_other_settings_is_rejected(setting: str, tmp_path: Path) -> No
         ("observation/feature", 0, 20),
         ("feature/landmark", 3, -2),
         ("feature/pixel", 3, 320),
+        ("feature/sigma_ratio", 3, 0.0),
+        ("observation/sigma_ratio", 3, -1.0),
         ("landmark/keyframe", 2, 4),
         ("keyframe/feature_count", 1, 19),
         ("keyframe/reference", 1, 9),

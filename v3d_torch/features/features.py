@@ -29,6 +29,8 @@ class Features:
         descriptors: 256-bit descriptors, uint8, shape :math:`(N, 32)`.
         readout_jacobian: Derivative of ``uv`` by the readout time of a rolling shutter, pixels per second, float64,
             shape :math:`(N, 2)`; 0 if not given, as for a camera at rest.
+        sigma_ratio: Standard deviations of the pixel and of the inverse depth, relative to those of the configuration,
+            positive, float64, shape :math:`(N, 2)`; 1 if not given. A detector of your own can set it.
     """
 
     uv: Tensor
@@ -37,10 +39,13 @@ class Features:
     octave: Tensor
     descriptors: Tensor
     readout_jacobian: Tensor = _NOT_GIVEN
+    sigma_ratio: Tensor = _NOT_GIVEN
 
     def __post_init__(self) -> None:
         if self.readout_jacobian is _NOT_GIVEN:
             object.__setattr__(self, "readout_jacobian", torch.zeros_like(self.uv))
+        if self.sigma_ratio is _NOT_GIVEN:
+            object.__setattr__(self, "sigma_ratio", torch.ones_like(self.uv))
 
     def __len__(self) -> int:
         return self.uv.shape[0]
@@ -113,18 +118,31 @@ def select_evenly(pixel: Tensor, count: int, cell: int) -> Tensor:
     return torch.from_numpy(np.flatnonzero(selected))
 
 
-def pixel_sigma(octave: Tensor, config: TrackingConfig, pyramid: FeaturesConfig) -> Tensor:
-    """Standard deviation of feature positions: proportional to the pixel size of the feature's pyramid level.
+def make_measurements(
+    uv: Tensor,
+    inverse_depth: Tensor,
+    octave: Tensor,
+    sigma_ratio: Tensor,
+    config: TrackingConfig,
+    pyramid: FeaturesConfig,
+) -> Measurements:
+    """Add the noise of features: that of pixels is proportional to the pixel size of the feature's pyramid level.
 
     Args:
+        uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
+        inverse_depth: Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement.
         octave: Level of the scale pyramid of each feature, int64, shape :math:`(N,)`.
-        config: Configuration with the standard deviation at level 0.
+        sigma_ratio: See `Features`, float64, shape :math:`(N, 2)`.
+        config: Configuration with the standard deviations of pixels at level 0 and of inverse depth.
         pyramid: Scale factor between pyramid levels.
-
-    Returns:
-        Standard deviation of u and of v, pixels, float64, shape :math:`(N,)`.
     """
-    return config.pixel_sigma * pyramid.scale ** octave.to(torch.float64)
+    pixel_ratio, depth_ratio = sigma_ratio.unbind(dim=1)
+    return Measurements(
+        uv=uv,
+        inverse_depth=inverse_depth,
+        pixel_sigma=config.pixel_sigma * pyramid.scale ** octave.to(torch.float64) * pixel_ratio,
+        inverse_depth_sigma=config.inverse_depth_sigma * depth_ratio,
+    )
 
 
 def to_measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
@@ -135,9 +153,6 @@ def to_measurements(features: Features, config: TrackingConfig, pyramid: Feature
         config: Configuration with the standard deviations of pixels and inverse depth.
         pyramid: Scale factor between pyramid levels.
     """
-    return Measurements(
-        uv=features.uv,
-        inverse_depth=features.inverse_depth,
-        pixel_sigma=pixel_sigma(features.octave, config, pyramid),
-        inverse_depth_sigma=config.inverse_depth_sigma,
+    return make_measurements(
+        features.uv, features.inverse_depth, features.octave, features.sigma_ratio, config, pyramid
     )

@@ -50,6 +50,9 @@ class ArrayFile:
     about: dict[str, Any]
     _archive: zipfile.ZipFile
 
+    def __contains__(self, name: str) -> bool:
+        return f"{name}.npy" in self._archive.namelist()
+
     def read(self, name: str) -> NDArray[Any]:
         """Read an array; its checksum is verified.
 

@@ -18,6 +18,12 @@ from v3d_torch.mapping.tensor_table import TensorTable
 Columns = Mapping[str, Tensor]
 """Columns by ``group/name``. The columns of one group have the same number of rows."""
 
+OPTIONAL_COLUMNS = ("feature/sigma_ratio", "observation/sigma_ratio")
+"""Columns that are stored only if a value differs from one, which is the value of files without them."""
+
+_MIN_SIGMA_RATIO = torch.finfo(torch.float64).tiny
+"""Smallest positive number: standard deviations are not zero."""
+
 
 def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
     """Convert a map and its views to columns. An empty map gives empty columns of the right type and shape.
@@ -124,6 +130,8 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
         ("observation/landmark", 0, landmarks),
         ("observation/keyframe", 0, keyframes),
         ("observation/feature", 0, counts[owners.clamp(0, keyframes - 1)] if keyframes else 0),
+        ("feature/sigma_ratio", _MIN_SIGMA_RATIO, torch.inf),
+        ("observation/sigma_ratio", _MIN_SIGMA_RATIO, torch.inf),
         ("loop/i", 0, keyframes),
         ("loop/j", 0, keyframes),
         ("view/keyframe", 0, keyframes),
@@ -149,6 +157,7 @@ def _empty_tables() -> tuple[TensorTable, TensorTable]:
         pixel=((2,), torch.int64),
         depth=((), torch.float64),
         octave=((), torch.int64),
+        sigma_ratio=((2,), torch.float64),
         descriptors=((32,), torch.uint8),
         landmark=((), torch.int64),
     )

@@ -19,7 +19,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.array_file import open_array_file, write_array_file
 from v3d_torch.io.paths import StrPath
-from v3d_torch.mapping.map_columns import fill_from_columns, find_inconsistency, to_columns
+from v3d_torch.mapping.map_columns import OPTIONAL_COLUMNS, fill_from_columns, find_inconsistency, to_columns
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import Readout
@@ -73,7 +73,12 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
         },
     }
     columns = to_columns(sparse_map, views)
-    write_array_file(Path(path), about, {name: column.numpy() for name, column in columns.items()})
+    stored = {
+        name: column.numpy()
+        for name, column in columns.items()
+        if name not in OPTIONAL_COLUMNS or bool((column != 1).any())
+    }
+    write_array_file(Path(path), about, stored)
 
 
 def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
@@ -92,8 +97,11 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     with open_array_file(path, _FORMAT, "a map file", _FIX) as file:
         _check_compatibility(path, file.about, camera, config)
         stored.map.readout = Readout.from_dict(file.about["readout"])
-        names = to_columns(stored.map, stored.views)
+        names = [name for name in to_columns(stored.map, stored.views) if name in file or name not in OPTIONAL_COLUMNS]
         columns = {name: torch.from_numpy(file.read(name)) for name in names}
+        for name in OPTIONAL_COLUMNS:
+            uv = columns[f"{name.split('/')[0]}/uv"]
+            columns.setdefault(name, torch.ones_like(uv))
     if (problem := find_inconsistency(columns, stored.map, stored.views)) is not None:
         raise InputError(f"{path}: is a damaged map file ({problem}); {_FIX}")
     fill_from_columns(columns, stored.map, stored.views)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.features.features import pixel_sigma
+from v3d_torch.features.features import make_measurements
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.tensor_table import unique_ids
 from v3d_torch.optim.reprojection import Measurements
@@ -71,10 +71,7 @@ def select_observations(tables: MapTables, window: Tensor, config: Config, *, wi
     rows = torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))
     keyframes, pose = unique_ids(table["keyframe"][rows], len(tables.keyframes))
     landmarks, point = unique_ids(table["landmark"][rows], count)
-    measured = Measurements(
-        uv=table["uv"].index_select(0, rows),
-        inverse_depth=table["inverse_depth"][rows],
-        pixel_sigma=pixel_sigma(table["octave"][rows], config.tracking, config.features),
-        inverse_depth_sigma=config.tracking.inverse_depth_sigma,
-    )
+    names = ("uv", "inverse_depth", "octave", "sigma_ratio")
+    uv, inverse_depth, octave, sigma_ratio = (table[name].index_select(0, rows) for name in names)
+    measured = make_measurements(uv, inverse_depth, octave, sigma_ratio, config.tracking, config.features)
     return MapObservations(rows, keyframes, landmarks, pose, point, measured)

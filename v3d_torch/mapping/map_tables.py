@@ -40,6 +40,8 @@ class MapTables:
             - ``readout_jacobian``: Derivative of ``uv`` with respect to the readout, pixels/s, float64, :math:`(2,)`.
             - ``inverse_depth``: 1/m, float64; 0 without a depth measurement.
             - ``octave``: Pyramid level, int64.
+            - ``sigma_ratio``: Relative standard deviations of pixel and inverse depth, see `Features`, float64,
+              :math:`(2,)`.
             - ``valid``: False once the observation is removed as an outlier, bool.
         loops: Closed loops, oldest first.
         readout: Readout of the camera with which the stored features were compensated.
@@ -65,6 +67,7 @@ class MapTables:
             readout_jacobian=((2,), torch.float64),
             inverse_depth=((), torch.float64),
             octave=((), torch.int64),
+            sigma_ratio=((2,), torch.float64),
             valid=((), torch.bool),
         )
         self.loops: list[Loop] = []

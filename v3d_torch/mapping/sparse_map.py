@@ -271,5 +271,6 @@ class SparseMap(MapTables):
             readout_jacobian=features.readout_jacobian[indices],
             inverse_depth=features.inverse_depth[indices],
             octave=features.octave[indices],
+            sigma_ratio=features.sigma_ratio[indices],
             valid=torch.ones_like(indices, dtype=torch.bool),
         )

@@ -111,19 +111,19 @@ class WhitenedMeasurements(NamedTuple):
 
 
 def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
-    uv, inverse_depth, sigma = measured.uv, measured.inverse_depth, measured.pixel_sigma
-    if uv.ndim != 2 or K.shape != (3, 3) or isinstance(measured.inverse_depth_sigma, Tensor):
+    uv, inverse_depth = measured.uv, measured.inverse_depth
+    if uv.ndim != 2 or K.shape != (3, 3):
         return NotImplemented
-    if not isinstance(sigma, Tensor):
-        sigma = torch.full_like(inverse_depth, sigma)
-    if any(each.requires_grad or each.dtype != torch.float64 for each in (uv, inverse_depth, sigma, K)):
-        return NotImplemented
-    if not len(uv) == len(inverse_depth) == sigma.numel():
-        return NotImplemented
-    arrays = to_array(uv), to_array(inverse_depth), to_array(sigma)
-    return WhitenedMeasurements(
-        *map(torch.from_numpy, kernels.whiten(*arrays, measured.inverse_depth_sigma, to_array(K)))
+    sigmas = (
+        sigma if isinstance(sigma, Tensor) else torch.full_like(inverse_depth, sigma)
+        for sigma in (measured.pixel_sigma, measured.inverse_depth_sigma)
     )
+    columns = (inverse_depth, *sigmas)
+    if any(each.requires_grad or each.dtype != torch.float64 for each in (uv, *columns, K)):
+        return NotImplemented
+    if any(each.shape != (len(uv),) for each in columns):
+        return NotImplemented
+    return WhitenedMeasurements(*map(torch.from_numpy, kernels.whiten(*map(to_array, (uv, *columns, K)))))
 
 
 @compiled_by(_whiten_compiled)

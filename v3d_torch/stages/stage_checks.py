@@ -33,6 +33,7 @@ _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
         "octave": (torch.int64, ("N",)),
         "descriptors": (torch.uint8, ("N", 32)),
         "readout_jacobian": (torch.float64, ("N", 2)),
+        "sigma_ratio": (torch.float64, ("N", 2)),
     },
     CameraMotion: {
         "T_cp": (torch.float64, (4, 4)),
