@@ -152,3 +152,20 @@ TRACKS = {
     "nees": "normalised errors of position and velocity, expected 3",
     "positions": "positions",
 }
+
+FEATURE_UNCERTAINTY = {
+    "sequence": "sequence",
+    "frames": "frames",
+    "default": "equal uncertainties, ATE, m",
+    "learnt": "learnt uncertainties, ATE, m",
+    "ratios": "learnt / equal, each seed",
+}
+
+VOTING_THRESHOLDS = {
+    "sequence": "sequence",
+    "rule": "rule",
+    "numbers": "T_d and T_v",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+}

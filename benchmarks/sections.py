@@ -170,6 +170,28 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             key="sequence",
         ),
     ),
+    "Learnt parameters": (
+        Part(
+            "feature_uncertainty",
+            (
+                "A small network predicts the uncertainty of each feature from its patch of image and depth"
+                " (`notebooks/learn_feature_uncertainty.ipynb`). It is trained on other sequences. ATE RMSE with the"
+                " true masks of people: median and range over the seeds; each seed trains its own network."
+            ),
+            flat_table(columns.FEATURE_UNCERTAINTY),
+        ),
+        Part(
+            "voting_thresholds",
+            (
+                "Distance threshold and number of votes, learnt from tracked objects of other sequences"
+                ' (`notebooks/learn_voting_thresholds.ipynb`). Scores of "is dynamic" over all detected objects of all'
+                " frames, with the paper's rule, by which the vote alone decides, and with the free-space check of the"
+                " default configuration. The objects are found by the network; an object truly moves if more than half"
+                " of its pixels do."
+            ),
+            flat_table(columns.VOTING_THRESHOLDS),
+        ),
+    ),
     "Plausibility of camera and depth": (
         Part(
             "plausibility",

@@ -24,6 +24,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "calibration": ("sequence", "change", "parameter"),
     "consistency": ("sequence", "configuration"),
     "design_choices": ("choice", "sequence"),
+    "feature_uncertainty": ("sequence",),
     "growth": ("sequence", "frames"),
     "held_out": ("sequence", "change"),
     "keyframes": ("keyframes",),
@@ -39,6 +40,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "speed": ("sequence", "system"),
     "stages": ("sequence", "stage"),
     "tracks": ("sequence", "tracker"),
+    "voting_thresholds": ("sequence", "rule", "numbers"),
 }
 """Cells that identify a row, by the name of the file."""
 
