@@ -32,7 +32,7 @@ def uncertainty(options: argparse.Namespace) -> Iterator[Row]:
     settings = {
         "TRAIN": _parts(options.train, options, step=_PAIR_STEP),
         "TEST": _parts(options.test, options),
-        "STEPS": 400,
+        "STEPS": 250,
         "SEEDS": options.seeds,
     }
     rows = run_notebook("learn_feature_uncertainty", settings)["rows"]
