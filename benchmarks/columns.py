@@ -155,6 +155,7 @@ TRACKS = {
 
 FEATURE_UNCERTAINTY = {
     "sequence": "sequence",
+    "train": "learnt from",
     "frames": "frames",
     "default": "equal uncertainties, ATE, m",
     "learnt": "learnt uncertainties, ATE, m",
@@ -163,6 +164,7 @@ FEATURE_UNCERTAINTY = {
 
 VOTING_THRESHOLDS = {
     "sequence": "sequence",
+    "train": "learnt from",
     "rule": "rule",
     "numbers": "T_d and T_v",
     "precision": "precision",

@@ -40,6 +40,7 @@ def uncertainty(options: argparse.Namespace) -> Iterator[Row]:
         own = [row for row in rows if row["sequence"] == source]
         yield {
             "sequence": Path(source).name,
+            "train": ", ".join(options.train),
             "frames": str(len(frames)),
             **{name: format_median_and_range([row[name] for row in own], ".4f") for name in ("default", "learnt")},
             "ratios": " ".join(f"{row['learnt'] / row['default']:.2f}" for row in own),
@@ -58,6 +59,7 @@ def thresholds(options: argparse.Namespace) -> Iterator[Row]:
         numbers = found["learnt"] if row["numbers"] == "learnt" else vars(found["default"])
         yield {
             "sequence": Path(row["sequence"]).name,
+            "train": ", ".join(options.train),
             "rule": row["rule"],
             "numbers": f"{row['numbers']}: {numbers['distance_threshold']:g} m, {numbers['vote_threshold']}",
             **{name: f"{row[name]:.3f}" for name in ("precision", "recall", "f1")},
@@ -91,9 +93,7 @@ def main() -> None:
         rows = list(study(options))
     except V3DError as error:
         parser.error(str(error))
-    notes = [f"Learnt from {', '.join(options.train)}."]
-    lines = [*heading.lines(), "", *flat(rows, headings), "", *notes]
-    publish(lines, options, parser, {name: Measurement(heading, rows, notes)})
+    publish([*heading.lines(), "", *flat(rows, headings)], options, parser, {name: Measurement(heading, rows)})
 
 
 if __name__ == "__main__":
