@@ -52,6 +52,7 @@ def thresholds(options: argparse.Namespace) -> Iterator[Row]:
     settings = {
         "TRAIN": _parts(options.train, options),
         "TEST": _parts(options.test, options),
+        "STEPS": 150,
         "USE_NETWORK": True,
     }
     found = run_notebook("learn_voting_thresholds", settings)
