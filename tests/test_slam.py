@@ -14,6 +14,7 @@ from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_seque
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.features.features import Features
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.floor import Floor
@@ -64,6 +65,27 @@ def test_frames_from_opencv_arrays_give_the_same_poses(demo: RGBDSequence) -> No
         made = RGBDFrame.from_arrays(index, frame.stamp, image, metres, demo.camera)
         assert torch.equal(made.image, frame.image) and torch.equal(made.depth, frame.depth)
         assert torch.equal(stored(frame).T_wc, from_arrays(made).T_wc)
+
+
+def test_uncertainty_from_the_detector_equals_that_of_the_config(demo: RGBDSequence) -> None:
+    noise = {
+        f"tracking.{name}": 2 * getattr(NO_NETWORK.tracking, name) for name in ("pixel_sigma", "inverse_depth_sigma")
+    }
+    overrides = [f"{key}={value!r}" for key, value in noise.items()]
+    configured = V3DSLAM(demo.camera, config=load_config(None, ("segmentation.source=none", *overrides)))
+    given, unchanged = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, config=NO_NETWORK)
+    detect = given.detect_features
+
+    def detect_uncertain(image: torch.Tensor, depth: torch.Tensor) -> Features:
+        features = detect(image, depth)
+        return replace(features, sigma_ratio=torch.full_like(features.uv, 2.0))
+
+    given.detect_features = detect_uncertain
+    for index in range(0, 40, 5):
+        T_wc, expected, other = (slam(demo[index]).T_wc for slam in (given, configured, unchanged))
+        assert torch.equal(T_wc, expected)
+    assert len(given.map.keyframes) > 1 and not torch.equal(T_wc, other)
+    assert bool((given.map.observations["sigma_ratio"] == 2).all())
 
 
 def test_integer_depth_in_camera_units_becomes_metres(demo: RGBDSequence) -> None:
