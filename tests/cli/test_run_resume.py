@@ -93,6 +93,8 @@ def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
 FORKING_COMMAND = """
 import os, sys
 import v3d_torch.runs.run, v3d_torch.cli.run, v3d_torch.cli.run_command
+from v3d_torch.kernels.compiler import compile_kernels
+list(compile_kernels())
 for line in sys.stdin:
     child = os.fork()
     if child == 0:
@@ -105,7 +107,7 @@ for line in sys.stdin:
     print(child, flush=True)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""Program that runs the command in forked processes, so that torch is imported only once."""
+"""Program that runs the command in forked processes, so that torch is imported and the kernels are loaded only once."""
 
 
 @pytest.fixture
