@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from rich.console import Console
 
 from v3d_torch.io.download import cache_dir
 
@@ -18,18 +18,22 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "kernels"))
 from helpers.demo_frames import copy_frames
 
 import v3d_torch.slam  # noqa: F401 - registers the kernels
-from v3d_torch.kernels.compiler import compile_kernels
+from v3d_torch.runs.kernel_compilation import compile_kernels
 
 torch.set_num_threads(1)
 
-SLOWEST = ("test_real_sequences.py", "cli/test_run.py", "test_corpus.py", "cli/test_ablate.py")
+SLOWEST = (
+    *("test_real_sequences.py", "cli/test_batch.py", "test_corpus.py", "cli/test_run.py", "test_determinism.py"),
+    *("cli/test_run_resume.py", "project/test_notebooks.py", "cli/test_ablate.py", "project/test_module_table.py"),
+    *("cli/test_report.py", "objects/test_classified_scenes.py", "project/test_privacy.py"),
+)
 """Files that run first, so that several workers (``-n 2``) finish at about the same time."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Compile all kernels before the tests, whose time is limited; with ``-n``, once and not in each worker."""
     if not hasattr(config, "workerinput"):
-        deque(compile_kernels(), maxlen=0)
+        compile_kernels(Console(quiet=True))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
