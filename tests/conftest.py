@@ -23,8 +23,8 @@ from v3d_torch.runs.kernel_compilation import compile_kernels
 torch.set_num_threads(1)
 
 SLOWEST = (
-    *("test_real_sequences.py", "cli/test_batch.py", "test_corpus.py", "cli/test_run.py", "test_determinism.py"),
-    *("cli/test_run_resume.py", "project/test_notebooks.py", "cli/test_ablate.py", "project/test_module_table.py"),
+    *("test_real_sequences.py", "batch/test_ray_executor.py", "test_corpus.py", "cli/test_batch.py", "cli/test_run.py"),
+    *("project/test_notebooks.py", "cli/test_run_resume.py", "cli/test_ablate.py", "project/test_module_table.py"),
     *("cli/test_report.py", "objects/test_classified_scenes.py", "project/test_privacy.py"),
 )
 """Files that run first, so that several workers (``-n 2``) finish at about the same time."""
