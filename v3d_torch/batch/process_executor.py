@@ -9,33 +9,21 @@ import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_all_start_methods, get_context, resource_tracker
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING
 
 from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 
-if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext, SpawnContext
-
 _STOP_LATENCY = 0.2
 """Interval of the checks for a stop request, seconds: the delay is hardly noticeable, and the checks take no time."""
 
 _SPAWN = get_context("spawn")
-"""Start method of a process with threads: a new interpreter instead of a fork, which would copy their locks."""
-
-_FORKSERVER: ForkServerContext | SpawnContext = (
-    get_context("forkserver") if "forkserver" in get_all_start_methods() else _SPAWN
-)
-"""Start method of processes with one thread: forks of a server that has only imported the package, which takes seconds,
-and has no threads. Windows has no forks."""
-
-_FORKSERVER.set_forkserver_preload([run_job.__module__])
+"""Start method of processes: new interpreters instead of forks, which would copy threads and locks of libraries."""
 
 
 class ProcessExecutor:
@@ -78,11 +66,9 @@ class ProcessExecutor:
                 process.join()
 
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
-        context: ForkServerContext | SpawnContext = _FORKSERVER if self.workers > 1 else _SPAWN
-        parent_end, child_end = context.Pipe()
+        parent_end, child_end = _SPAWN.Pipe()
+        process = _SPAWN.Process(target=_process_main, args=(job, child_end), name=str(job))
         with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
-            arguments = job, child_end, dict(os.environ)
-            process = context.Process(target=_process_main, args=arguments, name=str(job))
             process.start()
         child_end.close()  # so that the pipe ends when the process ends
         return parent_end, process
@@ -110,10 +96,8 @@ def _describe_exit(process: BaseProcess) -> str:
     return f"its process was killed by {name}{hint}"
 
 
-def _process_main(job: Job, connection: Connection, environment: Mapping[str, str]) -> None:
+def _process_main(job: Job, connection: Connection) -> None:
     """Run a job and send its progress and outcome; main function of the process."""
-    os.environ.clear()  # the fork server has the environment of its start
-    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems on which `_block_interrupts` has no effect
     _redirect_output(job.folder / "run.log")
 
