@@ -57,7 +57,7 @@ def test_jacobian_of_depth_and_readout() -> None:
     problem = make_problem(TRUE)
     names = ("inverse_depth_offset", "readout")
     jacobian = problem.jacobian(names, problem.given_values(names), problem.T_cw, problem.points)
-    assert torch.allclose(jacobian[0, 2], torch.tensor(-1 / problem.observations.measured.inverse_depth_sigma).double())
+    assert torch.allclose(jacobian[0, 2], -1 / problem.observations.measured.inverse_depth_sigma)
     assert jacobian[0, :2].abs().max() < 1e-9 > jacobian[1, 2].abs().max()
 
 

@@ -126,7 +126,7 @@ def make_measurements(
     config: TrackingConfig,
     pyramid: FeaturesConfig,
 ) -> Measurements:
-    """Add the noise of features: that of pixels is proportional to the pixel size of the feature's pyramid level.
+    """Measurements and their noise; that of pixels is proportional to the pixel size of their pyramid level.
 
     Args:
         uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
