@@ -15,7 +15,7 @@ def usac_options(threshold: float, iterations: int, seed: int) -> cv2.UsacParams
     """Return options that give the same result on each call, without OpenCV's refinement.
 
     Args:
-        threshold: Maximum error of an inlier, pixels.
+        threshold: Maximum error of an inlier, in the unit of the points.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
     """

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
 from v3d_torch.kernels.reprojection import (
     Array,
     huber,
@@ -56,10 +57,9 @@ def _linearise(
 def _refine(
     T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
-    damping_schedule: tuple[float, float, float, float], inliers: Mask, active: Mask,
+    damping_schedule: DampingSchedule, inliers: Mask, active: Mask,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Refine one pose; write the masks, and return pose, squared residuals and information matrix."""
-    first_damping, min_damping, max_damping, factor = damping_schedule
     count = len(points)
     inliers[:], active[:], thresholds = valid, valid, chi2_thresholds.copy()
     H, g, chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
@@ -70,7 +70,7 @@ def _refine(
             thresholds[:] = np.inf
         active[:] = inliers
         cost = _linearise(T_cw, points, scale, offset, thresholds, weights, active, min_depth, H, g, chi2)
-        damping, converged, iteration = first_damping, False, 0
+        damping, converged, iteration = damping_schedule[0], False, 0
         while iteration < iterations and not converged:
             damped = H.copy()
             for k in range(6):
@@ -80,13 +80,11 @@ def _refine(
                 candidate, points, scale, offset, thresholds, weights, active, min_depth, new_H, new_g, new_chi2
             )
             iteration += 1
-            converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
+            converged = has_converged(cost, new_cost, damping, tolerance)
+            damping = next_damping(damping, new_cost < cost, damping_schedule)
             if new_cost < cost:
                 T_cw, cost = candidate, new_cost
                 H, new_H, g, new_g, chi2, new_chi2 = new_H, H, new_g, g, new_chi2, chi2
-                damping = max(damping / factor, min_damping)
-            else:
-                damping = min(damping * factor, max_damping)
         unchanged = True
         for i in range(count):
             is_inlier = valid[i] and chi2[i] <= chi2_thresholds[i]
@@ -107,7 +105,7 @@ def _refine(
 def refine_poses(
     T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
-    damping_schedule: tuple[float, float, float, float],
+    damping_schedule: DampingSchedule,
 ) -> tuple[Array, Mask, Mask, Array, Array]:  # fmt: skip
     """Refine B poses in rounds of Levenberg-Marquardt, each with N measurements.
 
