@@ -74,7 +74,7 @@ class ProcessExecutor:
                 process.join()
 
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
-        context = _context_for(self.workers)
+        context = _start_method()
         parent_end, child_end = context.Pipe()
         with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
             arguments = job, child_end, dict(os.environ)
@@ -97,14 +97,14 @@ def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> Jo
     return JobFinished(job, *message)
 
 
-def _context_for(workers: int) -> ForkServerContext | SpawnContext:
-    """Return the start method of jobs: with one thread each, forks of a server that has imported the package.
+def _start_method() -> ForkServerContext | SpawnContext:
+    """Return how jobs are started: as forks of a server that has only imported the package, which takes seconds.
 
-    The import takes seconds. A process with several threads is a new interpreter, because a fork would copy locks of libraries. So is every
-    process on Windows, which has no forks, and with a temporary folder whose path is too long for the server's socket.
+    Windows has no forks, and the path of the server's socket, in the temporary folder, has a maximum length. There,
+    jobs are new interpreters.
     """
-    too_long = len(tempfile.gettempdir()) + len(_SOCKET_NAME) > _MAX_SOCKET_PATH
-    if workers == 1 or too_long or "forkserver" not in get_all_start_methods():
+    is_short = len(tempfile.gettempdir()) + len(_SOCKET_NAME) <= _MAX_SOCKET_PATH
+    if not is_short or "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
     context.set_forkserver_preload([run_job.__module__])
