@@ -28,10 +28,7 @@ CASES = [
 WITH_FIGURES = {"image content", "sequence names", "results and permissions"}
 """Categories whose runs draw figures. Drawing takes most of the time of such short runs."""
 
-SHELL = {
-    "ground truth": "word instead of a number",
-    "sequence names": "folder name with a line break",
-}
+SHELL = {"sequence names": "folder name with a line break"}
 """Cases that are also run in a subprocess, as a user starts them."""
 
 _MEMORY = 2 << 30

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import tempfile
 from pathlib import Path
 from threading import Event
 
@@ -39,3 +40,15 @@ def test_death_of_a_process_fails_only_its_job_and_is_in_its_log(moment: Path, t
     assert planned[0].earlier_outcome() is None
     outcome = planned[1].earlier_outcome()
     assert outcome is not None and outcome.metrics["tracked"] == 20
+
+
+def test_jobs_run_where_the_path_of_the_temporary_folder_is_long(
+    moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fork server has a socket there, whose path is limited to some 100 characters."""
+    folder = tmp_path / ("t" * 100)
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    planned = plan_seeds(moment, tmp_path / "out", seeds=1)
+    *_, end = ProcessExecutor(1)(planned, Event())
+    assert isinstance(end, JobFinished) and end.failure is None

@@ -6,24 +6,32 @@ import faulthandler
 import os
 import signal
 import sys
+import tempfile
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import get_all_start_methods, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event
+from typing import TYPE_CHECKING
 
 from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
+
 _STOP_LATENCY = 0.2
 """Interval of the checks for a stop request, seconds: the delay is hardly noticeable, and the checks take no time."""
 
-_SPAWN = get_context("spawn")
-"""Start method of processes: new interpreters instead of forks, which would copy threads and locks of libraries."""
+_MAX_SOCKET_PATH = 103
+"""Maximum length of the path of a socket, on the system with the lowest limit (macOS)."""
+
+_SOCKET_NAME = "/pymp-01234567/listener-01234567"
+"""Form of the path of a fork server's socket in the temporary folder."""
 
 
 class ProcessExecutor:
@@ -66,9 +74,11 @@ class ProcessExecutor:
                 process.join()
 
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
-        parent_end, child_end = _SPAWN.Pipe()
-        process = _SPAWN.Process(target=_process_main, args=(job, child_end), name=str(job))
+        context = _start_method()
+        parent_end, child_end = context.Pipe()
         with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
+            arguments = job, child_end, dict(os.environ)
+            process = context.Process(target=_process_main, args=arguments, name=str(job))
             process.start()
         child_end.close()  # so that the pipe ends when the process ends
         return parent_end, process
@@ -87,6 +97,20 @@ def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> Jo
     return JobFinished(job, *message)
 
 
+def _start_method() -> ForkServerContext | SpawnContext:
+    """Return how jobs are started: as forks of a server that has only imported the package, which takes seconds.
+
+    Windows has no forks, and the path of the server's socket, in the temporary folder, has a maximum length. There,
+    jobs are new interpreters.
+    """
+    is_short = len(tempfile.gettempdir()) + len(_SOCKET_NAME) <= _MAX_SOCKET_PATH
+    if not is_short or "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([run_job.__module__])
+    return context
+
+
 def _describe_exit(process: BaseProcess) -> str:
     code = process.exitcode or 0
     if code >= 0:
@@ -96,8 +120,10 @@ def _describe_exit(process: BaseProcess) -> str:
     return f"its process was killed by {name}{hint}"
 
 
-def _process_main(job: Job, connection: Connection) -> None:
+def _process_main(job: Job, connection: Connection, environment: Mapping[str, str]) -> None:
     """Run a job and send its progress and outcome; main function of the process."""
+    os.environ.clear()  # the fork server has the environment of its start
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems on which `_block_interrupts` has no effect
     _redirect_output(job.folder / "run.log")
 
