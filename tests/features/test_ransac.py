@@ -130,6 +130,13 @@ def test_problems_of_a_batch_are_solved_as_alone() -> None:
         assert torch.equal(found.inliers[k, valid[k]], alone.inliers) and not found.inliers[k, ~valid[k]].any()
 
 
+@pytest.mark.parametrize("seed", [2**31, 2**63])
+def test_any_seed_is_accepted(seed: int) -> None:
+    a, b, T_ba = two_views(outliers=100)
+    found = pnp_ransac(CAMERA.back_project(a.uv, a.depth), b.uv, CAMERA.K, seed=seed)
+    torch.testing.assert_close(found.T_cw, T_ba, rtol=0, atol=1e-4)
+
+
 def test_pose_has_gradients() -> None:
     a, b, _ = two_views(noise=0.5)
     points, uv = CAMERA.back_project(a.uv, a.depth)[:40].requires_grad_(), b.uv[:40].clone().requires_grad_()

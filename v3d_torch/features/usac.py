@@ -21,7 +21,7 @@ def usac_options(threshold: float, iterations: int, seed: int) -> cv2.UsacParams
     """
     options = cv2.UsacParams()
     options.threshold, options.maxIterations, options.confidence = threshold, iterations, _CONFIDENCE
-    options.randomGeneratorState, options.isParallel = seed, False
+    options.randomGeneratorState, options.isParallel = seed % 2**31, False  # OpenCV takes 32 bits with a sign
     options.score = cv2.SCORE_METHOD_MSAC
     options.loMethod, options.final_polisher = cv2.LOCAL_OPTIM_NULL, cv2.NONE_POLISHER
     return options
