@@ -9,21 +9,29 @@ import sys
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import get_all_start_methods, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from threading import Event
+from typing import TYPE_CHECKING
 
 from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
+
 _STOP_LATENCY = 0.2
 """Interval of the checks for a stop request, seconds: the delay is hardly noticeable, and the checks take no time."""
 
 _SPAWN = get_context("spawn")
-"""Start method of processes: new interpreters instead of forks, which would copy threads and locks of libraries."""
+"""Start method of a process with threads: a new interpreter instead of a fork, which would copy their locks."""
+
+_SOCKET_PATH_LIMIT = 103
+"""Longest path of a Unix socket, bytes: macOS and BSD store 104 bytes with the zero at the end, Linux 108."""
 
 
 class ProcessExecutor:
@@ -66,12 +74,33 @@ class ProcessExecutor:
                 process.join()
 
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
-        parent_end, child_end = _SPAWN.Pipe()
-        process = _SPAWN.Process(target=_process_main, args=(job, child_end), name=str(job))
+        context = _choose_context(self.workers)
+        parent_end, child_end = context.Pipe()
         with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
+            arguments = job, child_end, dict(os.environ)
+            process = context.Process(target=_process_main, args=arguments, name=str(job))
             process.start()
         child_end.close()  # so that the pipe ends when the process ends
         return parent_end, process
+
+
+def _choose_context(workers: int) -> ForkServerContext | SpawnContext:
+    """Return the start method of jobs.
+
+    If they have one thread, they fork from a server, which has only imported the package and has no threads: an import
+    takes seconds. Windows has no forks. The server listens on a socket in the temporary folder, whose path can be too
+    long for a socket.
+    """
+    if workers == 1 or "forkserver" not in get_all_start_methods() or not _can_have_socket(Path(get_temp_dir())):
+        return _SPAWN
+    context = get_context("forkserver")
+    context.set_forkserver_preload([run_job.__module__])
+    return context
+
+
+def _can_have_socket(folder: Path) -> bool:
+    """Return whether the path of a socket with the name that Python gives it fits into a socket address."""
+    return len(os.fsencode(folder / "listener-12345678")) <= _SOCKET_PATH_LIMIT
 
 
 def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> JobProgress | JobFinished:
@@ -96,8 +125,10 @@ def _describe_exit(process: BaseProcess) -> str:
     return f"its process was killed by {name}{hint}"
 
 
-def _process_main(job: Job, connection: Connection) -> None:
+def _process_main(job: Job, connection: Connection, environment: Mapping[str, str]) -> None:
     """Run a job and send its progress and outcome; main function of the process."""
+    os.environ.clear()  # the fork server has the environment of its start
+    os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems on which `_block_interrupts` has no effect
     _redirect_output(job.folder / "run.log")
 
