@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from helpers.commands import assert_error_line, call_here
-from helpers.commands import call as run_command
+from helpers.forked_command import call_forked
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import ablation_study
@@ -95,7 +95,7 @@ def test_csv_matches_metrics_of_runs(done: tuple[Path, str]) -> None:
     assert moving["baseline"] == 0.0 and moving["full"] > 0.5
 
 
-@pytest.mark.parametrize(("variant", "run"), [("paper", run_command), ("no_prediction", call_here)])
+@pytest.mark.parametrize(("variant", "run"), [("paper", call_forked), ("no_prediction", call_here)])
 def test_results_are_identical_to_run_command(
     variant: str, run: Callable[..., object], done: tuple[Path, str], sequence: Path, tmp_path: Path
 ) -> None:
