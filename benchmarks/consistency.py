@@ -14,7 +14,6 @@ import columns
 import numpy as np
 import torch
 from command import add_sequences_option, make_parser, publish_rows
-from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2, norm
 from storage import Row
 from systems.ours import OPTIONS, Ours
@@ -91,11 +90,11 @@ def calibrated_errors(groundtruth: Trajectory, stamps: Tensor, T_wc: Tensor, cov
     stamps, T_cw, covariance = stamps[kept], invert(T_wc[kept]), covariance[kept]
     noise = groundtruth_noise(groundtruth).square().diag()
     T_cb, delay = torch.eye(4, dtype=torch.float64), 0.0
-    T_gw = interpolate(groundtruth, stamps[:1])[0] @ T_cw[0]
+    T_gw = groundtruth.poses_at(stamps[:1])[0] @ T_cw[0]
     for _ in range(ITERATIONS):
-        T_gb = interpolate(groundtruth, stamps + delay)
+        T_gb = groundtruth.poses_at(stamps + delay)
         xi = se3_log(T_cw @ invert(T_gw) @ T_gb @ invert(T_cb))
-        velocity = se3_log(invert(T_gb) @ interpolate(groundtruth, stamps + delay + STEP)) / STEP
+        velocity = se3_log(invert(T_gb) @ groundtruth.poses_at(stamps + delay + STEP)) / STEP
         J = torch.cat(
             [
                 -adjoint(T_cw),
@@ -108,7 +107,7 @@ def calibrated_errors(groundtruth: Trajectory, stamps: Tensor, T_wc: Tensor, cov
         weighted = J.mT @ torch.linalg.inv(covariance + known * (adjoint(T_cb) @ noise @ adjoint(T_cb).mT))
         step = -torch.linalg.lstsq((weighted @ J).sum(dim=0), (weighted @ xi[..., None]).sum(dim=0)).solution[:, 0]
         T_gw, T_cb, delay = T_gw @ se3_exp(step[:6]), se3_exp(step[6:12]) @ T_cb, delay + float(step[12])
-    T_gb = interpolate(groundtruth, stamps + delay)
+    T_gb = groundtruth.poses_at(stamps + delay)
     xi = se3_log(T_cw @ invert(T_gw) @ T_gb @ invert(T_cb))
     known = interpolated_variance(groundtruth, stamps + delay)[:, None, None]
     return Errors(xi, covariance + known * (adjoint(T_cb) @ noise @ adjoint(T_cb).mT))
@@ -145,17 +144,6 @@ def mean_bounds(nees: Tensor) -> tuple[float, float]:
     independent = count / float(2 * correlations[positive].sum() - 1)
     low, high = (chi2.ppf((1 + sign * CONFIDENCE) / 2, 6 * independent) / independent for sign in (-1, 1))
     return float(low), float(high)
-
-
-def interpolate(trajectory: Trajectory, stamps: Tensor) -> Tensor:
-    """Interpolate poses at times within a trajectory, float64, shape :math:`(N, 4, 4)`."""
-    known, times = trajectory.stamps.numpy(), stamps.numpy()
-    T = torch.eye(4, dtype=torch.float64).repeat(len(times), 1, 1)
-    rotation = Slerp(known, Rotation.from_matrix(trajectory.T_wc[:, :3, :3].numpy()))(times)
-    T[:, :3, :3] = torch.from_numpy(rotation.as_matrix())
-    for axis in range(3):
-        T[:, axis, 3] = torch.from_numpy(np.interp(times, known, trajectory.T_wc[:, axis, 3].numpy()))
-    return T
 
 
 def interpolated_variance(trajectory: Trajectory, stamps: Tensor) -> Tensor:

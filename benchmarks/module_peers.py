@@ -18,6 +18,13 @@ from v3d_torch.geometry.se3 import invert
 Solve = Callable[[], Tensor]
 
 
+def usac_options(threshold: float) -> cv2.UsacParams:
+    """OpenCV's default options of USAC, with 300 hypotheses."""
+    options = cv2.UsacParams()
+    options.threshold, options.maxIterations, options.confidence = threshold, 300, 0.999
+    return options
+
+
 def gtsam_camera(K: Tensor) -> gtsam.Cal3_S2:
     """Camera matrix in the type of GTSAM."""
     return gtsam.Cal3_S2(float(K[0, 0]), float(K[1, 1]), 0.0, float(K[0, 2]), float(K[1, 2]))

@@ -2,9 +2,9 @@
 
 ``python benchmarks/modules.py`` prints a table for batches of 1, 8 and 64 problems, with one thread. All
 implementations get the same problems and take turns in random order, so that a busy machine slows all of them. A time
-is the median over the turns; ``ratio`` is the median of the peer's time divided by ours in the same turn: above 1
-ours is faster. Peers without batches solve the problems one after the other. Factor graphs of GTSAM and theseus are
-built beforehand.
+is the median over the turns, in which calls shorter than 20 ms are repeated; ``ratio`` is the median of the peer's time
+divided by ours in the same turn: above 1 ours is faster. Peers without batches solve the problems one after the other.
+Factor graphs of GTSAM and theseus are built beforehand.
 """
 
 from __future__ import annotations

@@ -331,13 +331,15 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
         Part(
             "modules",
             (
-                "Median time of a batch with one thread; ratio: time of the implementation divided by ours in the same"
-                " turn, above 1 if ours is faster. Implementations without batches solve the problems one after the"
-                " other; factor graphs of GTSAM and theseus are built beforehand, outside of the time. Errors are"
-                " medians over the batch: of poses, millimetres and milliradians in one number; of essential matrices,"
-                " thousandths of their norm; of matches, the percentage that is missing; of gradients, the difference"
-                " to ours, %; of `umeyama`, the difference to evo, thousandths. A problem that kornia-rs's bundle"
-                " adjustment cannot solve keeps its initial poses: one of the batch of 8, none of the other batches."
+                "Median time of a batch with one thread; ratio: time of the implementation divided by ours in the"
+                " same turn, above 1 if ours is faster. Calls shorter than 20 ms are repeated within a turn."
+                " Implementations without batches solve the problems one after the other. Our RANSACs take their"
+                " samples from OpenCV's USAC and refine the result. Factor graphs of GTSAM and theseus are built"
+                " beforehand, outside of the time. Errors are medians over the batch: of poses, millimetres and"
+                " milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
+                " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to"
+                " evo, thousandths. A problem that kornia-rs's bundle adjustment cannot solve keeps its initial poses:"
+                " one of the batch of 8, none of the other batches."
             ),
             flat_table(columns.MODULES),
         ),

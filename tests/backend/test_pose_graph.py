@@ -16,6 +16,7 @@ from torch import Tensor
 
 from v3d_torch.backend.pose_graph import edge_errors, optimise_pose_graph
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.kernels import compiler
 
 SIGMA = torch.tensor([0.01] * 3 + [0.005] * 3, dtype=torch.float64)
 
@@ -207,6 +208,22 @@ def test_optimisation_is_deterministic() -> None:
     graph = Graph(50, 10)
     first, second = (optimise_pose_graph(graph.start, graph.edges, graph.T_ij).T_wc for _ in range(2))
     assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize(
+    ("poses", "loops", "fixed"), [(40, 60, [0]), (40, 2, [0, 7, 20]), (3, 0, [0, 1, 2]), (9, 30, [])]
+)
+def test_kernel_equals_its_twin(poses: int, loops: int, fixed: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Graphs with many loops and with few, repeated edges, no free pose, no fixed pose."""
+    graph, is_fixed = Graph(poses, loops), torch.isin(torch.arange(poses), torch.tensor(fixed, dtype=torch.int64))
+    given = graph.start, graph.edges, graph.T_ij, graph.information, is_fixed
+    compiled = optimise_pose_graph(*given, robust=2.0)
+    monkeypatch.setattr(compiler, "ENABLED", False)
+    twin = optimise_pose_graph(*given, robust=2.0)
+    assert compiled.iterations == twin.iterations and compiled.converged == twin.converged
+    torch.testing.assert_close(compiled.cost_before, twin.cost_before, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(compiled.cost_after, twin.cost_after, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(compiled.T_wc, twin.T_wc, rtol=0, atol=1e-5 if fixed == [] else 1e-8)
 
 
 # ---------------------------------------------------------------- batches, padding

@@ -7,14 +7,12 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from helpers.commands import assert_error_line, call_here
-from helpers.forked_command import call_forked
 from typer.testing import CliRunner, Result
 
 from v3d_torch.batch import ablation_study
@@ -95,12 +93,12 @@ def test_csv_matches_metrics_of_runs(done: tuple[Path, str]) -> None:
     assert moving["baseline"] == 0.0 and moving["full"] > 0.5
 
 
-@pytest.mark.parametrize(("variant", "run"), [("paper", call_forked), ("no_prediction", call_here)])
+@pytest.mark.parametrize("variant", ["paper", "no_prediction"])
 def test_results_are_identical_to_run_command(
-    variant: str, run: Callable[..., object], done: tuple[Path, str], sequence: Path, tmp_path: Path
+    variant: str, done: tuple[Path, str], sequence: Path, tmp_path: Path
 ) -> None:
     """The instances of ``no_prediction`` come from the cache that ``no_voting`` filled."""
-    run("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path, cwd=tmp_path)
+    call_here("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path, cwd=tmp_path)
     ours = done[0] / "moment" / variant / "seed0"
     for name in ("trajectory.txt", "dynamics.parquet", "map.ply", "config.yaml"):
         assert (ours / name).read_bytes() == (tmp_path / name).read_bytes(), name

@@ -288,7 +288,7 @@ def test_ctrl_c_keeps_partial_results_and_resume_finishes(moment: Path, tmp_path
     assert pd.read_parquet(out / "runs.parquet")["failure"].tolist() == [metrics["failure"]]
 
     repeat_sequence(moment, sequence, frames=4)  # the shortened sequence has the same frames
-    result = call(*arguments, "--resume", "--workers", "2")
+    result = call(*arguments, "--resume")
     assert result.exit_code == 0, result.output
     assert pd.read_parquet(out / "runs.parquet")["processed"].tolist() == [4]
 

@@ -131,7 +131,7 @@ def metrics_of(ate: float, frames: int = 6) -> dict[str, Any]:
 
 def test_missing_sequences_are_downloaded_run_and_tabulated(server: str, tmp_path: Path) -> None:
     data, out = tmp_path / "data", tmp_path / "out"
-    result = call("--data-root", data, "--configs", "baseline", "--workers", "2", "--out", out)
+    result = call("--data-root", data, "--configs", "baseline", "--out", out)
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in data.iterdir() if path.is_dir()) == sorted(SERVED)
     (note,) = [line for line in result.stdout.splitlines() if line.startswith("missing sequences: ")]

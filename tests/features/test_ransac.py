@@ -39,7 +39,7 @@ def test_initial_guess_that_explains_half_of_the_points_skips_sampling(monkeypat
     def fail(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("v3d_torch.features.ransac._sample_epnp", fail)
+    monkeypatch.setattr("v3d_torch.features.ransac._sample_opencv", fail)
     guess = _perturb(T_ba, 0.02, 0.02)
     guessed = pnp_ransac(points, b.uv, CAMERA.K, guess, threshold=2.0, iterations=100, seed=0)
     assert sampled.found and guessed.found
@@ -90,7 +90,21 @@ def test_pose_is_as_accurate_as_that_of_opencv() -> None:
     assert ours <= 1.1 * theirs < 0.005
 
 
-def test_p3p_gives_the_same_poses_as_epnp() -> None:
+@pytest.mark.parametrize("traced", [False, True])
+def test_two_thirds_of_outliers_on_one_side_do_not_move_the_pose(traced: bool) -> None:
+    a, b, T_ba = two_views(noise=0.5)
+    points, uv = CAMERA.back_project(a.uv, a.depth), b.uv.clone()
+    uv[130:] += 20 + 80 * torch.rand(270, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    if traced:
+        batch = torch.func.vmap(lambda u: pnp_ransac(points, u, CAMERA.K))(uv[None])
+        found = type(batch)(*(each[0] for each in batch))
+    else:
+        found = pnp_ransac(points, uv, CAMERA.K)
+    assert found.inliers[:130].all() and found.inliers[130:].sum() < 10
+    assert float(se3_log(found.T_cw @ invert(T_ba)).norm()) < 0.005
+
+
+def test_torch_gives_the_same_poses_as_opencv() -> None:
     """`torch.func.vmap` traces the function, so that torch finds the hypotheses."""
     a, b, _ = two_views(outliers=150, noise=1.0)
     points, uv = torch.stack([CAMERA.back_project(a.uv, a.depth)] * 2), torch.stack([b.uv, b.uv + 1.0])

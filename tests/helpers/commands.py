@@ -21,8 +21,8 @@ RUN_FILES = {
 
 
 def command(*arguments: str | Path) -> list[str]:
-    # One thread: several would wait for each other on shared cores, and the results are the same.
-    return [sys.executable, "-m", "v3d_torch.run", *map(str, arguments), "--set", "threads=1"]
+    # One thread by default: several would wait for each other on shared cores, and the results are the same.
+    return [sys.executable, "-m", "v3d_torch.run", "--set", "threads=1", *map(str, arguments)]
 
 
 def environment(**changes: str) -> dict[str, str]:

@@ -98,9 +98,10 @@ def test_single_rigid_motions_equal_their_twins(name: str, scale: float) -> None
         torch.testing.assert_close(twin.compiled(given), twin.torch(given), rtol=1e-13, atol=1e-13)
 
 
-def test_singular_matrices_and_batches_are_left_to_the_twin() -> None:
+def test_singular_matrices_are_left_to_the_twin() -> None:
     twin = TWINS["v3d_torch.geometry.se3.orthonormalise"]
-    assert twin.compiled(torch.zeros(4, 4, dtype=torch.float64)) is NotImplemented
-    assert twin.compiled(torch.eye(4, dtype=torch.float64).expand(2, 4, 4)) is NotImplemented
+    singular = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    singular[1] = 0.0
+    assert twin.compiled(singular) is NotImplemented and twin.compiled(singular[1]) is NotImplemented
     mirrored = torch.diag(torch.tensor([-1.0, 2.0, 0.5, 1.0], dtype=torch.float64))
     torch.testing.assert_close(twin.compiled(mirrored), twin.torch(mirrored))

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import camera_inputs
 from helpers.demo_frames import copy_frames
 from torch import Tensor
 
 from v3d_torch import V3DSLAM, load_sequence
+from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.config.loading import load_config
+from v3d_torch.features.essential import essential_ransac
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 from v3d_torch.segmentation import YOLOSegmenter
@@ -38,7 +41,7 @@ MAX_CALLS = 8
 
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
-    """Arguments of the functions with two implementations, recorded while the demo is tracked."""
+    """Arguments of the functions with two implementations, recorded while the demo is tracked, and random ones."""
     recorded: dict[str, list[Call]] = {name: [] for name in TWINS}
 
     def record(name: str) -> Callable[..., Any]:
@@ -65,6 +68,9 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         segmenter = YOLOSegmenter(SegmentationConfig())
         for frame in list(sequence)[::SEGMENTED]:
             segmenter(frame)
+        # A short run closes no loop, and does not need essential matrices.
+        optimise_pose_graph(**camera_inputs.graph(2, 15, torch.float64), robust=1.0)
+        essential_ransac(**camera_inputs.two_views(2, 60, torch.float64), threshold=0.5)
     return recorded
 
 

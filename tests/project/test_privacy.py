@@ -29,14 +29,11 @@ Call = Callable[..., subprocess.CompletedProcess[str]]
 SYSTEM = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH", "SYSTEMROOT") if name in os.environ}
 """Variables that programs need on some systems."""
 
-TEMPORARY = "tmp" + "_of_this_home" * 5
-"""Name of the temporary folder, too long for the socket of a fork server."""
-
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
     folder = tmp_path / "home"
-    for name in (".cache", TEMPORARY, "work"):
+    for name in (".cache", "tmp", "work"):
         (folder / name).mkdir(parents=True)
     return folder
 
@@ -46,7 +43,7 @@ def call(home: Path) -> Call:
     """Function that runs Python in an empty home; an internet socket ends the process with the return code `KILLED`."""
 
     def run(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
-        own = {"HOME": home, "USERPROFILE": home, "XDG_CACHE_HOME": home / ".cache", "TMPDIR": home / TEMPORARY}
+        own = {"HOME": home, "USERPROFILE": home, "XDG_CACHE_HOME": home / ".cache", "TMPDIR": home / "tmp"}
         # Without settings of the developer; kernels are not compiled again.
         kept = {"NUMBA_CACHE_DIR": os.environ["NUMBA_CACHE_DIR"], "PYTHONDONTWRITEBYTECODE": "1", "NO_COLOR": "1"}
         return subprocess.run(  # noqa: S603

@@ -61,6 +61,16 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
     ("detect_features", change(uv=torch.Tensor.float), r"detect_features\.uv is torch.float32 of shape \(\d+, 2\)"),
     ("detect_features", change(depth=lambda x: x[:1]), r"detect_features\.depth is .* \(1,\), expected .* \(\d\d+,\)$"),
     ("detect_features", change(sigma_ratio=lambda x: x[:, 0]), r"detect_features\.sigma_ratio .* expected .*, 2\)$"),
+    (
+        "detect_features",
+        change(sigma_ratio=torch.zeros_like),
+        r"detect_features\.sigma_ratio .* not positive and finite",
+    ),
+    (
+        "compensate",
+        change(sigma_ratio=lambda x: x / 0),
+        r"compensate\.sigma_ratio has values that are not positive and",
+    ),
     ("detect_features", change(descriptors=lambda x: x[:, :16]), r"detect_features\.descriptors .* shape \(\d+, 32\)"),
     ("compensate", lambda features: features[:3], r"compensate\.uv is .* \(3, 2\), expected .* shape \(\d\d+, 2\)"),
     ("odometry", lambda motion: motion.T_cp, "odometry returned a Tensor; it must return CameraMotion"),

@@ -17,10 +17,12 @@ from torch import Tensor
 
 from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
+from v3d_torch.kernels import pose_graph as kernels
+from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
-from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt
-from v3d_torch.runtime.batches import common_batch, fill_padding
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
+from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
 if TYPE_CHECKING:
     import pypose as pp
@@ -101,19 +103,16 @@ def optimise_pose_graph(
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
     KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
     graph, start = _prepare(initial, edges, measured, information, fixed, weights, valid, robust)
-    constant, steps = graph.detach(), None
     with torch.no_grad():
-        found = levenberg_marquardt(start.detach(), constant.linearise, constant.step, iterations, tolerance)
-    cost_after = found.cost_after
+        found = _minimise(start.detach(), *graph.detach(), iterations, tolerance)
+    cost_after, steps = found.cost_after, None
     if needs_gradient(start, *graph):
-        steps = graph.differentiate(found.state, start)
-        cost_after, _ = graph.linearise(torch.where(graph.is_fixed, start, found.state @ se3_exp(steps)))
-    return PoseGraphResult(
-        T_wc=_move(T_wc, found.state, steps, graph.is_fixed),
+        steps = graph.differentiate(found.T_wc, start)
+        cost_after, _ = graph.linearise(torch.where(graph.is_fixed, start, found.T_wc @ se3_exp(steps)))
+    return found._replace(
+        T_wc=_move(T_wc, found.T_wc, steps, graph.is_fixed),
         cost_before=found.cost_before.to(working_dtype(T_wc.dtype)),
         cost_after=cost_after.to(working_dtype(T_wc.dtype)),
-        iterations=found.iterations,
-        converged=found.converged,
     )
 
 
@@ -192,6 +191,42 @@ class _Graph(NamedTuple):
             ends = ends[0] @ se3_exp(xi[..., :6]), ends[1] @ se3_exp(xi[..., 6:])
         error, J, weights, _ = self._evaluate(ends)
         return (J.mT @ (weights[..., None, None] * self.information) @ error[..., None])[..., 0]
+
+
+def _minimise_compiled(
+    T_wc: Tensor,
+    edges: Tensor,
+    T_ji: Tensor,
+    information: Tensor,
+    weights: Tensor,
+    fixed: Tensor,
+    limit: Tensor,
+    iterations: int,
+    tolerance: float,
+) -> PoseGraphResult:
+    batch, settings = T_wc.shape[:-3], (float(limit), iterations, tolerance, _REGULARISATION, DAMPING_SCHEDULE)
+    if 0 in batch:
+        return NotImplemented
+    rows = zip(*(to_rows(each, batch) for each in (T_wc, edges, T_ji, information, weights, fixed)), strict=True)
+    return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*(*row, *settings)) for row in rows], batch))
+
+
+@compiled_by(_minimise_compiled)
+def _minimise(
+    T_wc: Tensor,
+    edges: Tensor,
+    T_ji: Tensor,
+    information: Tensor,
+    weights: Tensor,
+    fixed: Tensor,
+    limit: Tensor,
+    iterations: int,
+    tolerance: float,
+) -> PoseGraphResult:
+    """Optimise poses by Levenberg-Marquardt; the tensors are those of `_Graph`."""
+    graph = _Graph(edges, T_ji, information, weights, fixed, limit)
+    found = levenberg_marquardt(T_wc, graph.linearise, graph.step, iterations, tolerance)
+    return PoseGraphResult(found.state, found.cost_before, found.cost_after, found.iterations, found.converged)
 
 
 def _prepare(

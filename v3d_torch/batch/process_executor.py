@@ -6,13 +6,13 @@ import faulthandler
 import os
 import signal
 import sys
+import tempfile
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import get_all_start_methods, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 _STOP_LATENCY = 0.2
 """Interval of the checks for a stop request, seconds: the delay is hardly noticeable, and the checks take no time."""
 
-_SPAWN = get_context("spawn")
-"""Start method of a process with threads: a new interpreter instead of a fork, which would copy their locks."""
+_MAX_SOCKET_PATH = 103
+"""Maximum length of the path of a socket, on the system with the lowest limit (macOS)."""
 
-_SOCKET_PATH_LIMIT = 103
-"""Longest path of a Unix socket, bytes: macOS and BSD store 104 bytes with the zero at the end, Linux 108."""
+_SOCKET_NAME = "/pymp-01234567/listener-01234567"
+"""Form of the path of a fork server's socket in the temporary folder."""
 
 
 class ProcessExecutor:
@@ -74,7 +74,7 @@ class ProcessExecutor:
                 process.join()
 
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
-        context = _choose_context(self.workers)
+        context = _start_method()
         parent_end, child_end = context.Pipe()
         with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
             arguments = job, child_end, dict(os.environ)
@@ -82,25 +82,6 @@ class ProcessExecutor:
             process.start()
         child_end.close()  # so that the pipe ends when the process ends
         return parent_end, process
-
-
-def _choose_context(workers: int) -> ForkServerContext | SpawnContext:
-    """Return the start method of jobs.
-
-    If they have one thread, they fork from a server, which has only imported the package and has no threads: an import
-    takes seconds. Windows has no forks. The server listens on a socket in the temporary folder, whose path can be too
-    long for a socket.
-    """
-    if workers == 1 or "forkserver" not in get_all_start_methods() or not _can_have_socket(Path(get_temp_dir())):
-        return _SPAWN
-    context = get_context("forkserver")
-    context.set_forkserver_preload([run_job.__module__])
-    return context
-
-
-def _can_have_socket(folder: Path) -> bool:
-    """Return whether the path of a socket with the name that Python gives it fits into a socket address."""
-    return len(os.fsencode(folder / "listener-12345678")) <= _SOCKET_PATH_LIMIT
 
 
 def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> JobProgress | JobFinished:
@@ -114,6 +95,20 @@ def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> Jo
         return JobProgress(job, message)
     process.join()
     return JobFinished(job, *message)
+
+
+def _start_method() -> ForkServerContext | SpawnContext:
+    """Return how jobs are started: as forks of a server that has only imported the package, which takes seconds.
+
+    Windows has no forks, and the path of the server's socket, in the temporary folder, has a maximum length. There,
+    jobs are new interpreters.
+    """
+    is_short = len(tempfile.gettempdir()) + len(_SOCKET_NAME) <= _MAX_SOCKET_PATH
+    if not is_short or "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload([run_job.__module__])
+    return context
 
 
 def _describe_exit(process: BaseProcess) -> str:

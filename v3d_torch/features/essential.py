@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import kornia_rs
+import cv2
+import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
 from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
-from v3d_torch.kernels.compiler import can_read
+from v3d_torch.features.usac import usac_options
+from v3d_torch.kernels.compiler import can_read, to_array
 from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.runtime.batches import common_batch, fill_padding
 
@@ -51,7 +53,7 @@ def essential_ransac(
     """Estimate essential matrices from pairs of pixels: RANSAC, refined by the Sampson distance of all inliers.
 
     The matrices are differentiable in pixels, camera matrix and weights, by the implicit function theorem; the inliers
-    are constant. On the CPU, kornia-rs computes the hypotheses by the five-point algorithm, one problem of the batch
+    are constant. On the CPU, OpenCV computes the hypotheses by the five-point algorithm, one problem of the batch
     after the other. On other devices, and if `torch.func` traces the computation, torch computes them for the whole
     batch at once by the eight-point algorithm, which fails if all points lie in a plane.
 
@@ -101,25 +103,18 @@ def essential_ransac(
 def _sample_five_points(
     problem: EpipolarProblem, valid: Tensor, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Best essential matrices of kornia-rs, (..., 3, 3), and a mask of the problems with a matrix, (...)."""
+    """Best essential matrices of OpenCV, (..., 3, 3), and a mask of the problems with a matrix, (...)."""
     focal = 1 / problem.K_inverse.diagonal(dim1=-2, dim2=-1)[..., :2].prod(dim=-1).sqrt()
-    pairs = torch.cat([(each @ problem.K_inverse.mT)[..., :2] for each in (problem.a, problem.b)], dim=-1)
+    a, b = ((each @ problem.K_inverse.mT)[..., :2] for each in (problem.a, problem.b))
     E = torch.eye(3, dtype=torch.float64).repeat(*valid.shape[:-1], 1, 1)
-    found = torch.zeros(valid.shape[:-1], dtype=torch.bool)
+    found, identity = torch.zeros(valid.shape[:-1], dtype=torch.bool), np.eye(3)
     for row in (valid.sum(dim=-1) >= _MIN_PAIRS).nonzero().tolist():
         index = tuple(row)
-        try:
-            result = kornia_rs.ransac.essential(
-                pairs[index][valid[index]].numpy(),
-                threshold=(threshold / float(focal[index])) ** 2,  # kornia-rs compares squared distances
-                max_iters=iterations,
-                seed=seed,
-            )
-        except ValueError:  # raised by kornia-rs for some degenerate pairs
-            continue
-        if result.model is None:  # no sample gives a model
-            continue
-        E[index], found[index] = torch.tensor(result.model, dtype=torch.float64).reshape(3, 3), True
+        options = usac_options(threshold / float(focal[index]), iterations, seed)
+        pair = to_array(a[index][valid[index]]), to_array(b[index][valid[index]])
+        best, _ = cv2.findEssentialMat(*pair, identity, identity, None, None, options)
+        if best is not None and np.isfinite(best).all():
+            E[index], found[index] = torch.from_numpy(best[:3]), True
     return E, found
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import cv2
 import kornia_rs
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -13,8 +14,9 @@ from torch import Tensor
 
 from v3d_torch.features.p3p import solve_p3p
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
+from v3d_torch.features.usac import usac_options
 from v3d_torch.geometry.se3 import orthonormalise
-from v3d_torch.kernels.compiler import can_read, is_all_true
+from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
 from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
 from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
@@ -24,15 +26,7 @@ _MIN_EPIPOLAR_PAIRS = 8
 """Minimum number of pairs for a fundamental matrix (eight-point algorithm)."""
 
 _MIN_PNP_POINTS = 6
-"""Minimum number of points: a sample of 5, and one more point that can confirm its pose."""
-
-_SUBSET_SIZE = 100
-"""Number of points in the first run of RANSAC, spaced evenly over all points. The subset saves time, because each
-hypothesis is tested on every point. If no pose explains half of all points, a second run uses all of them, because the
-subset then has too few inliers."""
-
-_LOCAL_OPTIMISATION_INTERVAL = 5
-"""Interval of the local optimisation, ``lo_every`` of kornia-rs (LO-RANSAC; Chum et al., DAGM 2003)."""
+"""Minimum number of points: a sample of 3, a point that selects one of its four poses, and points that confirm it."""
 
 
 def epipolar_inliers(uv_a: Tensor, uv_b: Tensor, *, threshold: float, iterations: int, seed: int) -> Tensor:
@@ -87,11 +81,12 @@ def pnp_ransac(
     """Estimate camera poses from 3D points and their pixels: PnP in RANSAC, refined on all inliers.
 
     The poses are differentiable in points, pixels and camera matrix, as those of :func:`refine_pose`; the inliers are
-    constant. On the CPU, kornia-rs computes the hypotheses by EPnP, one problem of the batch after the other. On other
-    devices, and if `torch.func` traces the computation, torch computes them by P3P for the whole batch at once.
+    constant. Hypotheses come from three points each (P3P). On the CPU, OpenCV computes them, one problem of the batch
+    after the other. On other devices, and if `torch.func` traces the computation, torch computes them for the whole
+    batch at once.
 
-    Fischler and Bolles, Random Sample Consensus, CACM 1981; Lepetit et al., EPnP, IJCV 2009; Chum et al., Locally
-    Optimized RANSAC, DAGM 2003.
+    Fischler and Bolles, Random Sample Consensus, CACM 1981; Raguram et al., USAC: A Universal Framework for Random
+    Sample Consensus, PAMI 2013.
 
     Args:
         points: Points in a frame "w", metres, floating point, shape :math:`(*, N, 3)`.
@@ -113,24 +108,30 @@ def pnp_ransac(
     batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2])
     mask = uv.new_ones(*batch, uv.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
     count = mask.sum(dim=-1)
-    data = points.detach().expand(*batch, -1, 3), uv.detach().expand(*batch, -1, 2), K.detach().expand(*batch, 3, 3)
+    data = (
+        points.detach().to(torch.float64).expand(*batch, -1, 3),
+        uv.detach().to(torch.float64).expand(*batch, -1, 2),
+        K.detach().to(torch.float64).expand(*batch, 3, 3),
+    )
     settings = threshold, iterations, seed
     sigma = uv.new_full(uv.shape[:-1], threshold / math.sqrt(CHI2_THRESHOLD_2D))
     T_cw = torch.eye(4, dtype=points.dtype, device=points.device).expand(*batch, 4, 4)
     inliers, found, done = torch.zeros_like(mask), torch.zeros_like(count, dtype=torch.bool), count < _MIN_PNP_POINTS
 
-    def hypotheses() -> Iterator[tuple[Tensor, Tensor]]:
+    def hypotheses() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Poses, a mask of the problems with a pose, and a mask of the points that refine it, (..., N)."""
         if initial_guess is not None:
-            yield initial_guess.detach().expand(*batch, 4, 4), torch.ones_like(done)
-        if not can_read(data[1]):
-            yield _sample_p3p(*_to_float64(*data), mask, *settings)
-            return
-        yield _sample_epnp(*data, mask, ~done, _SUBSET_SIZE, *settings)
-        yield _sample_epnp(*data, mask, ~done & (count > _SUBSET_SIZE), None, *settings)
+            yield initial_guess.detach().expand(*batch, 4, 4), torch.ones_like(done), mask
+        if can_read(data[1]):
+            best, exists = _sample_opencv(*data, mask & ~done[..., None], *settings)
+        else:
+            best, exists = _sample_torch(*data, mask, *settings)
+        yield best, exists, _squared_errors(best, *data) <= threshold**2
 
-    for hypothesis, exists in hypotheses():
+    for hypothesis, exists, consensus in hypotheses():
         # Only pixels have residuals; the measured depth is already part of the points.
-        refined = refine_pose(hypothesis, points, uv, K, pixel_sigma=sigma, valid=valid, rounds=2)
+        weights = consensus.to(torch.float64)
+        refined = refine_pose(hypothesis, points, uv, K, None, sigma, weights=weights, valid=valid, rounds=2)
         is_new = exists & ~done
         T_cw, inliers = select(is_new, (refined.T_cw.to(points.dtype), refined.inliers), (T_cw, inliers))
         found = found | is_new
@@ -140,73 +141,52 @@ def pnp_ransac(
     return PnP(T_cw, inliers, found)
 
 
-def _to_float64(points: Tensor, uv: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return points.to(torch.float64), uv.to(torch.float64), K.to(torch.float64)
+def _squared_errors(T_cw: Tensor, points: Tensor, uv: Tensor, K: Tensor) -> Tensor:
+    """Squared reprojection errors, pixels, (..., N); infinite for points behind the camera."""
+    in_camera = points @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]
+    xy = in_camera[..., :2] / in_camera[..., 2:].clamp(min=MIN_DEPTH)
+    error = (xy * K.diagonal(dim1=-2, dim2=-1)[..., None, :2] + K[..., None, :2, 2] - uv).square().sum(dim=-1)
+    return torch.where(in_camera[..., 2] > MIN_DEPTH, error, torch.inf)
 
 
-def _sample_epnp(
-    points: Tensor,
-    uv: Tensor,
-    K: Tensor,
-    valid: Tensor,
-    wanted: Tensor,
-    size: int | None,
-    threshold: float,
-    iterations: int,
-    seed: int,
+def _sample_opencv(
+    points: Tensor, uv: Tensor, K: Tensor, valid: Tensor, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor]:
-    """Best poses ``T_cw``, (..., 4, 4), of one RANSAC run of kornia-rs, and a mask of the problems with a pose, (...).
+    """Best poses ``T_cw``, (..., 4, 4), of RANSAC in OpenCV, and a mask of the problems with a pose, (...).
 
-    Only the problems in the mask ``wanted`` are solved, each with ``size`` of its points; None for all points.
+    Problems with too few valid points are not solved.
     """
     poses = torch.eye(4, dtype=torch.float64).repeat(*valid.shape[:-1], 1, 1)
     found = torch.zeros(valid.shape[:-1], dtype=torch.bool)
-    for row in wanted.nonzero().tolist():
+    options = usac_options(threshold, iterations, seed)
+    for row in (valid.sum(dim=-1) >= _MIN_PNP_POINTS).nonzero().tolist():
         index = tuple(row)
-        chosen = valid[index].nonzero()[:, 0]
-        if size is not None and len(chosen) > size:
-            chosen = chosen[torch.linspace(0, len(chosen) - 1, size).round().to(torch.int64)]
-        try:
-            R, t, _, _ = kornia_rs.k3d.solve_pnp_ransac(
-                points[index][chosen].to(torch.float64).numpy(),
-                uv[index][chosen].to(torch.float64).numpy(),
-                K[index].to(torch.float64).contiguous().numpy(),
-                threshold=threshold,
-                max_iterations=iterations,
-                lo_every=_LOCAL_OPTIMISATION_INTERVAL,
-                seed=seed,
-            )
-        except ValueError:  # raised by kornia-rs if no sample gives a pose
-            continue
-        T_cw = torch.eye(4, dtype=torch.float64)
-        T_cw[:3, :3] = torch.from_numpy(R)
-        T_cw[:3, 3] = torch.from_numpy(t).reshape(3)
-        if bool(torch.isfinite(T_cw).all()):
-            poses[index], found[index] = orthonormalise(T_cw), True
+        X, x, matrix = (to_array(each) for each in (points[index][valid[index]], uv[index][valid[index]], K[index]))
+        has_pose, _, rotation, t, _ = cv2.solvePnPRansac(X, x, matrix, None, params=options)
+        if has_pose:
+            T_cw = torch.eye(4, dtype=torch.float64)
+            T_cw[:3, :3], T_cw[:3, 3:] = torch.from_numpy(cv2.Rodrigues(rotation)[0]), torch.from_numpy(t)
+            found[index] = T_cw.isfinite().all()
+            poses[index] = orthonormalise(T_cw) if found[index] else poses[index]
     return poses, found
 
 
-def _sample_p3p(
+def _sample_torch(
     points: Tensor, uv: Tensor, K: Tensor, valid: Tensor, threshold: float, iterations: int, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Best poses ``T_cw``, (..., 4, 4), of RANSAC in torch, and a mask of the problems with a pose, (...)."""
     focal, centre = K.diagonal(dim1=-2, dim2=-1)[..., None, :2], K[..., None, :2, 2]
     xy = (uv - centre) / focal
     rays = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
+    by_hypothesis = points[..., None, :, :], uv[..., None, :, :], K[..., None, :, :]
 
     def solve(samples: Tensor) -> Tensor:
         return solve_p3p(gather_samples(points, samples), gather_samples(rays, samples))
 
-    def squared_errors(T_cw: Tensor) -> Tensor:
-        x, y, z = (points[..., None, :, :] @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]).unbind(-1)
-        u, v = (xy * focal)[..., None, :, :].unbind(-1)
-        w = 1 / z.clamp(min=MIN_DEPTH)
-        error = (focal[..., 0, None] * x * w - u).square() + (focal[..., 1, None] * y * w - v).square()
-        return torch.where(z > MIN_DEPTH, error, torch.inf)
-
     return find_best_hypothesis(
-        solve, squared_errors, valid, size=3, threshold=threshold, iterations=iterations, seed=seed
-    )
+        *(solve, lambda T_cw: _squared_errors(T_cw, *by_hypothesis), valid),
+        size=3, threshold=threshold, iterations=iterations, seed=seed,
+    )  # fmt: skip
 
 
 class PnPRANSAC(torch.nn.Module):

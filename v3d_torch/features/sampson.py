@@ -10,15 +10,17 @@ Multiple View Geometry, 2004, Sec. 9.6 and 11.4.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import hat, se3_exp
-from v3d_torch.kernels.compiler import is_all_true
+from v3d_torch.kernels import sampson as kernels
+from v3d_torch.kernels.compiler import compiled_by, is_all_true
 from v3d_torch.optim.implicit import jacobian, zero_with_gradient
-from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt, select
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt, select
+from v3d_torch.runtime.batches import to_rows
 
 _ROUNDS = 3
 """Number of rounds of refinement on the inliers; all pairs are classified again after each round."""
@@ -42,11 +44,9 @@ def compose(U: Tensor, V: Tensor) -> Tensor:
 def decompose(E: Tensor) -> State:
     """Rotations U and V of the essential matrices nearest to E; the third columns do not matter."""
     U, _, Vh = torch.linalg.svd(E)
-    rotations = []
-    for Q in (U, Vh.mT):
-        signs = torch.stack([*torch.ones_like(Q[..., :2, 0]).unbind(-1), torch.linalg.det(Q)], dim=-1)
-        rotations.append(Q * signs[..., None, :])
-    return rotations[0], rotations[1]
+    u, v = U[..., :2], Vh.mT[..., :2]
+    U, V = (torch.cat([Q, torch.linalg.cross(Q[..., 0], Q[..., 1])[..., None]], dim=-1) for Q in (u, v))
+    return U, V
 
 
 def _move(state: State, x: Tensor) -> State:
@@ -130,19 +130,40 @@ def _step(state: State, system: State, damping: Tensor) -> State:
     return _move(state, -torch.linalg.solve(damped, gradient))
 
 
-def refine_essential(
-    E: Tensor, problem: EpipolarProblem, valid: Tensor, threshold: float
-) -> tuple[State, Tensor, Tensor]:
-    """Refine essential matrices; return the optimum, its inliers (..., N), and the pairs (..., N) of the last round."""
-    state, active = decompose(E), valid
+def _minimise_compiled(
+    U: Tensor, V: Tensor, K_inverse: Tensor, a: Tensor, b: Tensor, weights: Tensor, valid: Tensor, threshold: float
+) -> tuple[Tensor, ...]:
+    batch = U.shape[:-2]
+    settings = threshold, _ROUNDS, _ITERATIONS, _TOLERANCE, _REGULARISATION, DAMPING_SCHEDULE
+    columns = U, V, K_inverse, a, b, weights, valid
+    arguments: tuple[Any, ...] = (*(to_rows(column, batch) for column in columns), *settings)
+    results = kernels.refine_essential(*arguments)
+    return tuple(torch.from_numpy(each).reshape(*batch, *each.shape[1:]) for each in results)
+
+
+@compiled_by(_minimise_compiled)
+def _minimise(
+    U: Tensor, V: Tensor, K_inverse: Tensor, a: Tensor, b: Tensor, weights: Tensor, valid: Tensor, threshold: float
+) -> tuple[Tensor, ...]:
+    """Refine essential matrices; return U, V, their inliers (..., N), and the pairs (..., N) of the last round."""
+    problem, state, active = EpipolarProblem(a, b, K_inverse, weights), (U, V), valid
     inliers = valid & (problem.sampson(compose(*state)).abs() <= threshold)
-    finished = torch.zeros(E.shape[:-2], dtype=torch.bool, device=E.device)
+    finished = torch.zeros(U.shape[:-2], dtype=torch.bool, device=U.device)
     for _ in range(_ROUNDS):
         active = select(finished, active, inliers)
-        linearise = partial(problem.linearise, influence=problem.weights * active)
+        linearise = partial(problem.linearise, influence=weights * active)
         state = levenberg_marquardt(state, linearise, _step, _ITERATIONS, _TOLERANCE, finished).state
         inliers = valid & (problem.sampson(compose(*state)).abs() <= threshold)
         finished = finished | (inliers == active).all(dim=-1)
         if is_all_true(finished):
             break
-    return state, inliers, active
+    return *state, inliers, active
+
+
+def refine_essential(
+    E: Tensor, problem: EpipolarProblem, valid: Tensor, threshold: float
+) -> tuple[State, Tensor, Tensor]:
+    """Refine essential matrices; return the optimum, its inliers (..., N), and the pairs (..., N) of the last round."""
+    a, b, K_inverse, weights = problem
+    U, V, inliers, active = _minimise(*decompose(E), K_inverse, a, b, weights, valid, threshold)
+    return (U, V), inliers, active

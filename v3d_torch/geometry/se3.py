@@ -73,10 +73,10 @@ def invert(T: Tensor) -> Tensor:
 
 
 def _orthonormalise_compiled(T: Tensor) -> Tensor:
-    if not _is_single(T, 4, 4):
+    if T.dtype != torch.float64:
         return NotImplemented
-    converged, result = kernels.orthonormalise(to_array(T))
-    return torch.from_numpy(result) if converged else NotImplemented
+    converged, result = kernels.orthonormalise(to_array(T.reshape(-1, 4, 4)))
+    return torch.from_numpy(result).reshape(T.shape) if converged else NotImplemented
 
 
 @compiled_by(_orthonormalise_compiled)

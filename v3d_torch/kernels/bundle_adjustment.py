@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
 from v3d_torch.kernels.reprojection import Array, huber, multiply, perspective_jacobian, se3_exp, transform
 from v3d_torch.kernels.schur import solve_normal_equations
 
@@ -83,7 +84,7 @@ def _find_rows(pose: Index, free: Index, count: int) -> Index:
 def bundle_adjust(
     T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, influence: Array, pose: Index,
     first: Index, free: Index, iterations: int, tolerance: float, regularisation: float, min_depth: float,
-    damping_schedule: tuple[float, float, float, float],
+    damping_schedule: DampingSchedule,
 ) -> tuple[Array, Array, Array, float, float, int]:  # fmt: skip
     """Optimise poses and points by Levenberg-Marquardt.
 
@@ -106,7 +107,6 @@ def bundle_adjust(
     Returns:
         Poses (K, 4, 4), points (P, 3), squared residuals (M,), cost before and after, number of steps.
     """
-    damping, min_damping, max_damping, factor = damping_schedule
     F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
     U, V, W = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((M, 3, 6))
     r, weights, chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
@@ -114,7 +114,7 @@ def bundle_adjust(
     cost = _compute_residuals(
         T_cw, points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, r, weights, chi2
     )
-    cost_before, iteration, converged, is_linearised = cost, 0, False, False
+    damping, cost_before, iteration, converged, is_linearised = damping_schedule[0], cost, 0, False, False
     while iteration < iterations and not converged:
         if not is_linearised:
             _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
@@ -127,14 +127,12 @@ def bundle_adjust(
             new_chi2,
         )  # fmt: skip
         iteration += 1
-        converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
+        converged = has_converged(cost, new_cost, damping, tolerance)
+        damping = next_damping(damping, new_cost < cost, damping_schedule)
         is_linearised = not new_cost < cost
-        if is_linearised:
-            damping = min(damping * factor, max_damping)
-        else:
+        if not is_linearised:
             T_cw, points, cost = new_T, new_points, new_cost
             r, new_r, weights, new_weights, chi2, new_chi2 = new_r, r, new_weights, weights, new_chi2, chi2
-            damping = max(damping / factor, min_damping)
     return T_cw, points, chi2, cost_before, cost, iteration
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
 from v3d_torch.kernels.reprojection import (
     Array,
     huber,
@@ -52,36 +53,15 @@ def _linearise(
     return cost
 
 
-@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], b1[::1], i8, i8, f8, f8, f8, UniTuple(f8, 4))")
-def refine_pose(
+@device
+def _refine(
     T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
-    damping_schedule: tuple[float, float, float, float],
-) -> tuple[Array, Mask, Mask, Array, Array]:  # fmt: skip
-    """Refine a pose in rounds of Levenberg-Marquardt.
-
-    Args:
-        T_cw: Initial pose, (4, 4).
-        points: Landmarks, world frame, (N, 3).
-        scale: Scale of the whitened residuals, (3, N).
-        offset: Offset of the whitened residuals, (3, N).
-        chi2_thresholds: Squared residual up to which a measurement is an inlier, (N,).
-        weights: Weight of each measurement, (N,).
-        valid: Measurements that are not padding, (N,).
-        rounds: Maximum number of rounds; the first half of them is robust.
-        iterations: Maximum number of steps in a round.
-        tolerance: Relative change of the cost at convergence.
-        regularisation: Added to the diagonal of the normal equations.
-        min_depth: Smallest depth of a projected point, metres.
-        damping_schedule: First, smallest and largest damping, and the factor between two steps.
-
-    Returns:
-        Pose (4, 4), inliers (N,), mask of the measurements used in the last round (N,), squared residuals (N,),
-        information matrix (6, 6).
-    """
-    first_damping, min_damping, max_damping, factor = damping_schedule
+    damping_schedule: DampingSchedule, inliers: Mask, active: Mask,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Refine one pose; write the masks, and return pose, squared residuals and information matrix."""
     count = len(points)
-    inliers, active, thresholds = valid.copy(), valid.copy(), chi2_thresholds.copy()
+    inliers[:], active[:], thresholds = valid, valid, chi2_thresholds.copy()
     H, g, chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
     new_H, new_g, new_chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
     for index in range(rounds):
@@ -90,7 +70,7 @@ def refine_pose(
             thresholds[:] = np.inf
         active[:] = inliers
         cost = _linearise(T_cw, points, scale, offset, thresholds, weights, active, min_depth, H, g, chi2)
-        damping, converged, iteration = first_damping, False, 0
+        damping, converged, iteration = damping_schedule[0], False, 0
         while iteration < iterations and not converged:
             damped = H.copy()
             for k in range(6):
@@ -100,13 +80,11 @@ def refine_pose(
                 candidate, points, scale, offset, thresholds, weights, active, min_depth, new_H, new_g, new_chi2
             )
             iteration += 1
-            converged = damping < 1 and abs(cost - new_cost) <= tolerance * (cost + tolerance)
+            converged = has_converged(cost, new_cost, damping, tolerance)
+            damping = next_damping(damping, new_cost < cost, damping_schedule)
             if new_cost < cost:
                 T_cw, cost = candidate, new_cost
                 H, new_H, g, new_g, chi2, new_chi2 = new_H, H, new_g, g, new_chi2, chi2
-                damping = max(damping / factor, min_damping)
-            else:
-                damping = min(damping * factor, max_damping)
         unchanged = True
         for i in range(count):
             is_inlier = valid[i] and chi2[i] <= chi2_thresholds[i]
@@ -117,4 +95,44 @@ def refine_pose(
     for i in range(count):
         if not valid[i]:
             chi2[i] = np.inf
-    return T_cw, inliers, active, chi2, H
+    return T_cw, chi2, H
+
+
+@kernel(
+    "(f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,::1], f8[:,::1], b1[:,::1], i8, i8, f8, f8, f8,"
+    " UniTuple(f8, 4))"
+)
+def refine_poses(
+    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
+    rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
+    damping_schedule: DampingSchedule,
+) -> tuple[Array, Mask, Mask, Array, Array]:  # fmt: skip
+    """Refine B poses in rounds of Levenberg-Marquardt, each with N measurements.
+
+    Args:
+        T_cw: Initial poses, (B, 4, 4).
+        points: Landmarks, world frame, (B, N, 3).
+        scale: Scale of the whitened residuals, (B, 3, N).
+        offset: Offset of the whitened residuals, (B, 3, N).
+        chi2_thresholds: Squared residual up to which a measurement is an inlier, (B, N).
+        weights: Weight of each measurement, (B, N).
+        valid: Measurements that are not padding, (B, N).
+        rounds: Maximum number of rounds; the first half of them is robust.
+        iterations: Maximum number of steps in a round.
+        tolerance: Relative change of the cost at convergence.
+        regularisation: Added to the diagonal of the normal equations.
+        min_depth: Smallest depth of a projected point, metres.
+        damping_schedule: First, smallest and largest damping, and the factor between two steps.
+
+    Returns:
+        Poses (B, 4, 4), inliers (B, N), mask of the measurements used in the last round (B, N), squared residuals
+        (B, N), information matrices (B, 6, 6).
+    """
+    refined, inliers, active = np.empty(T_cw.shape), np.empty(valid.shape, np.bool_), np.empty(valid.shape, np.bool_)
+    chi2, information = np.empty(valid.shape), np.empty((len(T_cw), 6, 6))
+    for b in range(len(T_cw)):
+        refined[b], chi2[b], information[b] = _refine(
+            T_cw[b], points[b], scale[b], offset[b], chi2_thresholds[b], weights[b], valid[b], rounds, iterations,
+            tolerance, regularisation, min_depth, damping_schedule, inliers[b], active[b],
+        )  # fmt: skip
+    return refined, inliers, active, chi2, information

@@ -31,33 +31,43 @@ def invert(T: Array) -> Array:
     return inverse
 
 
-@kernel("(f8[:,::1],)")
+@device
+def _newton_step(R: Array) -> bool:
+    """Replace a matrix, the first 3x3 elements, by the mean of it and its inverse transpose; check for convergence."""
+    cofactors, converged = np.empty((3, 3)), True
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            c, d = (j + 1) % 3, (j + 2) % 3
+            cofactors[i, j] = R[a, c] * R[b, d] - R[a, d] * R[b, c]
+    determinant = R[0, 0] * cofactors[0, 0] + R[0, 1] * cofactors[0, 1] + R[0, 2] * cofactors[0, 2]
+    for i in range(3):
+        for j in range(3):
+            change = 0.5 * (cofactors[i, j] / determinant - R[i, j])
+            R[i, j] += change
+            converged &= abs(change) < _NEWTON_TOLERANCE
+    return converged
+
+
+@kernel("(f8[:,:,::1],)")
 def orthonormalise(T: Array) -> tuple[bool, Array]:
-    """Replace the rotation of a rigid motion, (4, 4), by the nearest rotation: polar decomposition by Newton's method.
+    """Replace the rotations of rigid motions, (B, 4, 4), by the nearest ones: polar decomposition by Newton's method.
 
     N. Higham, Computing the polar decomposition with applications, SIAM J. Sci. Stat. Comput., 1986.
 
     Returns:
-        True if the method converged, and the rigid motion.
+        True if the method converged for all, and the rigid motions.
     """
-    result, cofactors = T.copy(), np.empty((3, 3))
-    result[3, 0], result[3, 1], result[3, 2], result[3, 3] = 0.0, 0.0, 0.0, 1.0
-    for _ in range(_MAX_NEWTON_STEPS):
-        for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
-            for j in range(3):
-                c, d = (j + 1) % 3, (j + 2) % 3
-                cofactors[i, j] = result[a, c] * result[b, d] - result[a, d] * result[b, c]
-        determinant = result[0, 0] * cofactors[0, 0] + result[0, 1] * cofactors[0, 1] + result[0, 2] * cofactors[0, 2]
-        converged = True
-        for i in range(3):
-            for j in range(3):
-                change = 0.5 * (cofactors[i, j] / determinant - result[i, j])  # inverse transpose minus matrix
-                result[i, j] += change
-                converged &= abs(change) < _NEWTON_TOLERANCE
-        if converged:
-            return True, result
-    return False, result
+    result, all_converged = T.copy(), True
+    for b in range(len(T)):
+        result[b, 3, 0], result[b, 3, 1], result[b, 3, 2], result[b, 3, 3] = 0.0, 0.0, 0.0, 1.0
+        converged = False
+        for _ in range(_MAX_NEWTON_STEPS):
+            converged = _newton_step(result[b])
+            if converged:
+                break
+        all_converged &= converged
+    return all_converged, result
 
 
 @kernel("(f8[::1],)")

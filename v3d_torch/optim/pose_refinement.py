@@ -9,7 +9,7 @@ Convention: poses ``T_cw`` are perturbed on the left, ``exp(xi) @ T_cw``, with `
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
@@ -30,7 +30,7 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
-from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
+from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
 
 _TOLERANCE = 1e-3
 """Relative change of the cost at convergence. Convergence is quadratic, so the next step would change far less."""
@@ -251,12 +251,10 @@ def _minimise_compiled(
     tolerance: float,
 ) -> tuple[PoseRefinement, Tensor]:
     batch, problem = T_cw.shape[:-2], (points, scale, offset, thresholds, weights, valid)
-    if 0 in batch:
-        return NotImplemented
     settings = rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
-    rows = zip(*(to_rows(column, batch) for column in (T_cw, *problem)), strict=True)
-    results = [kernels.refine_pose(*(*row, *settings)) for row in rows]
-    T, inliers, active, chi2, H = from_rows(results, batch)
+    arguments: tuple[Any, ...] = (*(to_rows(column, batch) for column in (T_cw, *problem)), *settings)
+    results = kernels.refine_poses(*arguments)
+    T, inliers, active, chi2, H = (torch.from_numpy(each).reshape(*batch, *each.shape[1:]) for each in results)
     return PoseRefinement(orthonormalise(T), inliers, chi2, H), active
 
 

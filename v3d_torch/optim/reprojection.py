@@ -21,8 +21,8 @@ from torch import Tensor
 
 from v3d_torch.config import TrackingConfig
 from v3d_torch.kernels import whitening as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.runtime.batches import fill_padding
+from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
 
 CHI2_THRESHOLD_2D = 5.991
 """95 % quantile of the chi-square distribution with 2 degrees of freedom: inlier threshold for (u, v)."""
@@ -112,8 +112,6 @@ class WhitenedMeasurements(NamedTuple):
 
 def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
     uv, inverse_depth = measured.uv, measured.inverse_depth
-    if uv.ndim != 2 or K.shape != (3, 3):
-        return NotImplemented
     sigmas = (
         sigma if isinstance(sigma, Tensor) else torch.full_like(inverse_depth, sigma)
         for sigma in (measured.pixel_sigma, measured.inverse_depth_sigma)
@@ -121,9 +119,14 @@ def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
     columns = (inverse_depth, *sigmas)
     if any(each.requires_grad or each.dtype != torch.float64 for each in (uv, *columns, K)):
         return NotImplemented
-    if any(each.shape != (len(uv),) for each in columns):
-        return NotImplemented
-    return WhitenedMeasurements(*map(torch.from_numpy, kernels.whiten(*map(to_array, (uv, *columns, K)))))
+    batch = common_batch(uv.shape[:-2], K.shape[:-2], *(each.shape[:-1] for each in columns))
+    given = (
+        uv.expand(*batch, *uv.shape[-2:]),
+        *(each.expand(*batch, uv.shape[-2]) for each in columns),
+        K.expand(*batch, 3, 3),
+    )
+    parts = kernels.whiten(*(to_rows(each, batch) for each in given))
+    return WhitenedMeasurements(*(torch.from_numpy(each).reshape(*batch, *each.shape[1:]) for each in parts))
 
 
 @compiled_by(_whiten_compiled)

@@ -27,9 +27,9 @@ def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
 
 
 def common_batch(*batches: torch.Size) -> torch.Size:
-    """Return the broadcast shape of several batch shapes; faster than torch if they are equal."""
-    first, *others = batches
-    return first if all(other == first for other in others) else torch.broadcast_shapes(*batches)
+    """Return the broadcast shape of several batch shapes; faster than torch if those with dimensions are equal."""
+    first, *others = {batch for batch in batches if batch} or {torch.Size()}
+    return torch.broadcast_shapes(first, *others) if others else first
 
 
 def to_rows(tensor: Tensor, batch: torch.Size) -> NDArray[Any]:

@@ -197,6 +197,8 @@ class ReplacedStage(StageProxy):
         if isinstance(expected, type) and not isinstance(result, expected):
             raise ConfigError(f"{self._name} returned {describe_type(result)}; it must return {expected.__name__}")
         _check_value(self._name, result, expected, sizes(*args))
+        if isinstance(result, Features) and not ((result.sigma_ratio > 0) & result.sigma_ratio.isfinite()).all():
+            raise ConfigError(f"{self._name}.sigma_ratio has values that are not positive and finite")
 
 
 def _check_value(name: str, value: object, expected: type | TensorSpec, sizes: dict[str, int]) -> None:
