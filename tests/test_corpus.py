@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +13,7 @@ import pytest
 from helpers.corpus import CATEGORIES
 from helpers.corpus.base import write_base
 from helpers.corpus.case import Case, Fails, Succeeds, Workspace
+from helpers.forked_command import call_forked
 from typer.testing import CliRunner
 
 from v3d_torch.cli import report, run
@@ -28,8 +26,11 @@ CASES = [
 WITH_FIGURES = {"image content", "sequence names", "results and permissions"}
 """Categories whose runs draw figures. Drawing takes most of the time of such short runs."""
 
-SHELL = {"sequence names": "folder name with a line break"}
-"""Cases that are also run in a subprocess, as a user starts them."""
+SHELL = {
+    "ground truth": "word instead of a number",
+    "sequence names": "folder name with a line break",
+}
+"""Cases that are also run in a process of their own, whose output and exit code the user sees."""
 
 _MEMORY = 2 << 30
 """Memory limit of a case on top of the current use, bytes. A decompression bomb exceeds this limit."""
@@ -117,12 +118,10 @@ def test_damaged_input_ends_as_expected(
 
 
 @pytest.mark.parametrize(("category", "name"), SHELL.items(), ids=SHELL)
-def test_damaged_input_ends_as_expected_in_a_subprocess(category: str, name: str, place: Workspace) -> None:
+def test_damaged_input_ends_as_expected_in_a_process_of_its_own(category: str, name: str, place: Workspace) -> None:
     case = next(case for case in CATEGORIES[category] if case.name == name)
     case.damage(place)
-    command = [sys.executable, "-m", "v3d_torch.run", *arguments(place)]
-    environment = os.environ | {"PYTHONPATH": str(Path(run.__file__).parents[2]), "COLUMNS": "200", "NO_COLOR": "1"}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=100)  # noqa: S603
+    done = call_forked(*arguments(place), cwd=place.root, COLUMNS="200")
     assert_expected_end(place, case.expected, done.returncode, done.stdout, done.stderr)
 
 

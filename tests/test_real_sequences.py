@@ -15,13 +15,13 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 Run = Callable[..., dict[str, Any]]
 
 
-def first_frames(sequence: Path, folder: Path, count: int) -> Path:
-    """Make a folder with the first frames of a sequence, whose images stay where they are."""
+def select_frames(sequence: Path, folder: Path, frames: range) -> Path:
+    """Make a folder with some frames of a sequence, whose images stay where they are."""
     folder.mkdir()
     for name in ("rgb", "depth", "groundtruth.txt", "camera.yaml"):
         (folder / name).symlink_to(sequence / name)
     rows = (sequence / "associations.txt").read_text().splitlines(keepends=True)
-    (folder / "associations.txt").write_text("".join(rows[:count]))
+    (folder / "associations.txt").write_text("".join(rows[index] for index in frames))
     return folder
 
 
@@ -29,10 +29,10 @@ def first_frames(sequence: Path, folder: Path, count: int) -> Path:
 def run(real_sequence: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Function that runs a sequence with the command, in this process, and returns its metrics."""
 
-    def run_sequence(name: str, *options: str, frames: int | None = None) -> dict[str, Any]:
+    def run_sequence(name: str, *options: str, frames: range | None = None) -> dict[str, Any]:
         folder, out = real_sequence(name), tmp_path_factory.mktemp(name)
         if frames is not None:
-            folder = first_frames(folder, tmp_path_factory.mktemp("first") / name, frames)
+            folder = select_frames(folder, tmp_path_factory.mktemp("some") / name, frames)
         done = call_here("--seq", folder, "--out", out, *options, cwd=out)
         assert done.exit_code == 0, done.stderr
         metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())
@@ -45,24 +45,25 @@ def run(real_sequence: Callable[[str], Path], tmp_path_factory: pytest.TempPathF
 
 
 def test_static_camera_among_walkers_is_tracked_accurately(run: Run) -> None:
-    metrics = run("crowd_static", frames=40)
+    metrics = run("crowd_static", frames=range(40))
     assert metrics["frames"] == 40
     assert metrics["ate"]["rmse"] < 0.005
     assert metrics["lost"] + metrics["disconnected"] == 0
 
 
 def test_rotating_camera_among_walkers_is_more_accurate_with_masks(run: Run) -> None:
-    metrics, unmasked = run("crowd_rpy", frames=120), run("crowd_rpy", "--segmenter", "none", frames=120)
-    assert metrics["frames"] == 120
+    frames = range(80, 180)
+    metrics, unmasked = run("crowd_rpy", frames=frames), run("crowd_rpy", "--segmenter", "none", frames=frames)
+    assert metrics["frames"] == 100
     assert metrics["ate"]["rmse"] < 0.03
     assert abs(metrics["readout"]) < 0.002  # a rendered camera has no rolling shutter
-    assert metrics["ate"]["rmse"] < 0.8 * unmasked["ate"]["rmse"]
+    assert metrics["ate"]["rmse"] < 0.6 * unmasked["ate"]["rmse"]
     assert metrics["lost"] + metrics["disconnected"] == 0
 
 
 def test_fast_rotation_is_tracked_and_its_readout_calibrated(run: Run) -> None:
     """The first four seconds of TUM fr1_rpy: sensor noise, motion blur, strong lens distortion."""
-    metrics = run("fr1_rpy", frames=120)
+    metrics = run("fr1_rpy", frames=range(120))
     assert metrics["frames"] == 120
     assert metrics["ate"]["rmse"] < 0.015  # better than ORB-SLAM2 and 3, which do not model the rolling shutter
     assert 0.018 < metrics["readout"] < 0.032

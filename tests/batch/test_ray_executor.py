@@ -18,15 +18,15 @@ import pandas as pd
 import psutil
 import pytest
 from helpers.batches import plan_seeds, repeat_sequence
-from helpers.own_stages import SEGMENT, write_own_stages
+from helpers.own_stages import MODULE, write_own_stages
 from typer.testing import CliRunner
 
 from v3d_torch.batch.executor import JobFinished, JobProgress, JobRepeated
-from v3d_torch.batch.job import Job
+from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli.batch import app
-from v3d_torch.config.loading import override_config
+from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,25 +60,24 @@ def nodes(own: Path) -> Iterator[Nodes]:
         cluster.shutdown()
 
 
-def test_results_on_cluster_are_identical_to_local_results(nodes: Nodes, moment: Path, tmp_path: Path) -> None:
-    arguments = ["--seqs", str(moment), "--configs", "baseline", "--seeds", "2", "--out", str(tmp_path / "cluster")]
-    result = CliRunner().invoke(app, [*arguments, "--ray", nodes.address])
+def test_results_on_cluster_with_a_stage_of_the_configuration_are_identical_to_local_results(
+    nodes: Nodes, own: Path, moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(own)  # the processes of the cluster have the folder in PYTHONPATH
+    (tmp_path / "lab.yaml").write_text(f"stages:\n  segment: {MODULE}:Corner\n")
+    arguments = ["--seqs", moment, "--configs", tmp_path / "lab.yaml", "--out", tmp_path / "cluster"]
+    result = CliRunner().invoke(app, [*map(str, arguments), "--ray", nodes.address])
     assert result.exit_code == 0, result.output
     table = pd.read_parquet(tmp_path / "cluster" / "runs.parquet")
-    assert table["seed"].tolist() == [0, 1] and (table["tracked"] == 6).all()
+    assert table["seed"].tolist() == [0] and (table["tracked"] == 6).all()
     (job,) = plan_seeds(moment, tmp_path / "local", seeds=1)
-    assert run_job(job, lambda frames: None) is None
+    config = single_threaded(load_config(tmp_path / "lab.yaml"))
+    assert run_job(replace(job, config=config), lambda frames: None) is None
+    remote = tmp_path / "cluster" / "moment" / "lab" / "seed0"
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "config.yaml"):
-        remote = tmp_path / "cluster" / "moment" / "baseline" / "seed0" / name
-        assert remote.read_bytes() == (job.folder / name).read_bytes(), name
-
-
-def test_worker_imports_the_stages_of_the_configuration(nodes: Nodes, own: Path, moment: Path, tmp_path: Path) -> None:
-    (job,) = plan_seeds(moment, tmp_path / "out", seeds=1)
-    config = override_config(job.config, [SEGMENT, "segmentation.source=yolo"])
-    *_, end = RayExecutor(nodes.address)([replace(job, config=config)], Event())
-    assert isinstance(end, JobFinished) and end.failure is None
-    assert json.loads((job.folder / "metrics.json").read_text())["stages"] == config.stages.paths
+        assert (remote / name).read_bytes() == (job.folder / name).read_bytes(), name
+    assert json.loads((remote / "metrics.json").read_text())["stages"] == {"segment": f"{MODULE}:Corner"}
+    del sys.modules[MODULE]  # other tests import it from other folders
 
 
 def find_process(job: Job) -> int | None:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from helpers.commands import assert_error_line, command, environment
+from helpers.commands import assert_error_line, command
 from helpers.demo_frames import copy_frames
+from helpers.forked_command import start_forked
 from helpers.walker_folder import write_walker
 from helpers.walls import Slide
 from typer.testing import CliRunner, Result
@@ -90,14 +90,16 @@ def test_camera_is_tracked_again_within_a_second_after_the_process_was_stopped_f
         for index in range(len(slide)):
             writer.add(slide[index])
     options = ["--seq", folder, "--segmenter", "none", "--realtime", "--save-masks", "--out", out]
-    with subprocess.Popen(command(*options), env=environment(), stdout=subprocess.DEVNULL) as process:  # noqa: S603
-        while len(masks := sorted((out / "masks").glob("*.png"))) < 3:
-            assert process.poll() is None
-            time.sleep(0.05)
-        process.send_signal(signal.SIGSTOP)
-        time.sleep(1)
-        process.send_signal(signal.SIGCONT)
-        assert process.wait(timeout=300) == 0
+    process = start_forked(*options, cwd=tmp_path)
+    assert process.pid is not None
+    while len(masks := sorted((out / "masks").glob("*.png"))) < 3:
+        assert process.is_alive()
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGSTOP)
+    time.sleep(1)
+    os.kill(process.pid, signal.SIGCONT)
+    process.join(timeout=300)
+    assert process.exitcode == 0
     states, metrics = pd.read_parquet(out / "states.parquet"), json.loads((out / "metrics.json").read_text())
     assert metrics["failure"] is None and metrics["processed"] + metrics["dropped"] == metrics["frames"] == len(slide)
     later = states[states["stamp"] > float(masks[-1].stem) + 2]

@@ -20,6 +20,7 @@ import torch
 from helpers.commands import assert_error_line
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
+from helpers.forked_command import start_forked
 from helpers.walker_folder import write_walker
 from typer.testing import CliRunner, Result
 
@@ -168,14 +169,15 @@ def test_run_killed_at_six_frames_resumes_to_the_same_bytes(
 def test_killed_run_with_relative_paths_resumes_from_another_folder(
     sequence: Path, whole_run: Path, tmp_path: Path
 ) -> None:
-    out, command = tmp_path / "out", [sys.executable, "-m", "v3d_torch.run"]
+    out = tmp_path / "out"
     shutil.copytree(sequence, tmp_path / "seq", copy_function=os.link)
     arguments = run_arguments(Path("seq"), Path("out"), "--save-masks", *CHECKPOINT_EVERY_FRAME)
-    with subprocess.Popen([*command, *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL) as process:  # noqa: S603
-        deadline = time.monotonic() + 100
-        while count_frames(out / "run.log") < 9 and time.monotonic() < deadline:
-            time.sleep(0.005)
-        process.kill()
+    process, deadline = start_forked(*arguments, cwd=tmp_path), time.monotonic() + 100
+    while count_frames(out / "run.log") < 9 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
     done = call("--resume", out)
     assert (done.exit_code, done.stderr) == (0, "")
     assert f"of {FRAMES} frames" in done.stdout and f"results: {out}" in done.stdout
