@@ -109,10 +109,11 @@ class EdgeAlignment:
         self._pixel, depth, self._axis = (
             torch.cat([getattr(edges, name) for edges in self._edges]) for name in ("pixel", "depth", "axis")
         )
-        self._points = views.camera.back_project(self._pixel, depth)
-        counts = torch.tensor([len(edges.axis) for edges in self._edges])
-        self._view = torch.arange(len(counts)).repeat_interleave(counts)
+        counts = [len(edges.axis) for edges in self._edges]
+        self._points = views.camera.back_project(self._pixel, depth).split(counts)  # of each view
+        self._view = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
         self._gradients = torch.stack([edges.gradients for edges in self._edges])  # (K, 2, h, w)
+        self._first_pixel = (2 * self._view + self._axis) * self._gradients[0, 0].numel()  # in all gradients, flat
         longest = _DELAY_STEPS[1]
         motion = (self._at_time_of_colour(longest) - self._at_time_of_colour(0.0)).norm(dim=1).median()
         delay_step = longest * _STEP / max(float(motion) * views.stride, _STEP)
@@ -215,9 +216,9 @@ class EdgeAlignment:
         moved = moved.clamp(torch.zeros_like(limit), limit)
         corner = moved.long().clamp(max=limit.long() - 1)
         (a, b), (column, row) = (moved - corner).unbind(dim=1), corner.unbind(dim=1)
+        flat, first = self._gradients.flatten(), self._first_pixel + row * width + column
         top, bottom = (
-            (1 - a) * self._gradients[self._view, self._axis, row + k, column]
-            + a * self._gradients[self._view, self._axis, row + k, column + 1]
+            (1 - a) * flat.index_select(0, first + k * width) + a * flat.index_select(0, first + k * width + 1)
             for k in (0, 1)
         )
         return (1 - b) * top + b * bottom
@@ -225,8 +226,8 @@ class EdgeAlignment:
     def _at_time_of_colour(self, delay: float) -> Tensor:
         """Pixels of the boundaries at the time of the colour image, if depth has an additional delay, (E, 2)."""
         T_cd = self._T_cw @ self._trajectory.poses_at(self._depth_stamp + delay)
-        R, t = T_cd[self._view, :3, :3], T_cd[self._view, :3, 3]
-        return self._camera.project((R @ self._points[..., None])[..., 0] + t)
+        moved = [points @ T[:3, :3].T + T[:3, 3] for points, T in zip(self._points, T_cd, strict=True)]
+        return self._camera.project(torch.cat(moved))
 
     def _mean_motion(self, delay: float) -> Tensor:
         """Mean motion of the boundaries from depth to colour image, for each view, (K, 2)."""

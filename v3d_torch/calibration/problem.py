@@ -19,7 +19,7 @@ from torch import Tensor
 from v3d_torch.calibration.parameters import DERIVATIVE_STEPS, LIMITS, get_values, with_values
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.mapping.bundle_adjustment import bundle_adjust
+from v3d_torch.mapping.bundle_adjustment import BundleAdjustment, bundle_adjust
 from v3d_torch.mapping.bundle_problem import prepare_bundle
 from v3d_torch.mapping.map_observations import MapObservations, select_observations
 from v3d_torch.mapping.map_tables import MapTables
@@ -155,13 +155,32 @@ class SelfCalibration:
         Returns:
             Cost, shape :math:`()`, and the adjusted map.
         """
+        adjusted = self.adjust(names, values, T_cw, points)
+        return adjusted.cost_after, self.differentiate(names, values, adjusted.T_cw, adjusted.points)
+
+    def adjust(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> BundleAdjustment:
+        """Adjust poses and points for given values of parameters; the arguments are those of `linearise`."""
         observations, camera = self._measured_with(names, values)
         arguments = observations.arguments(camera.K, self._fixed)
-        adjusted = bundle_adjust(T_cw, points, **arguments, iterations=_INNER_STEPS, tolerance=_TOLERANCE)
-        T_cw, points = adjusted.T_cw, adjusted.points
+        return bundle_adjust(T_cw, points, **arguments, iterations=_INNER_STEPS, tolerance=_TOLERANCE)
+
+    def differentiate(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> AdjustedMap:
+        """Differentiate the minimum cost by parameters.
+
+        Args:
+            names: Free parameters.
+            values: Their values, float64, shape :math:`(C,)`.
+            T_cw: Poses by `adjust` for these values, float64, shape :math:`(K, 4, 4)`.
+            points: Points by `adjust`, float64, shape :math:`(P, 3)`.
+
+        Returns:
+            The map with the derivatives.
+        """
+        observations, camera = self._measured_with(names, values)
+        arguments = observations.arguments(camera.K, self._fixed)
         problem, state = prepare_bundle(T_cw, points, **arguments, weights=None, valid=None)
         derivatives = differentiate_minimum_cost(problem, state, self.jacobian(names, values, T_cw, points))
-        return adjusted.cost_after, AdjustedMap(T_cw, points, *derivatives)
+        return AdjustedMap(T_cw, points, *derivatives)
 
     def residuals(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
         """Whitened residuals of pixels and inverse depth, float64, shape :math:`(3, M)`."""
