@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from helpers.commands import environment
-from v3d_torch.batch.process_executor import _start_method
+from v3d_torch.batch.process_executor import start_method
 
 
 def start_forked(*arguments: str | Path, cwd: Path, output: Path = Path(os.devnull), **variables: str) -> BaseProcess:
@@ -24,7 +24,7 @@ def start_forked(*arguments: str | Path, cwd: Path, output: Path = Path(os.devnu
         variables: Changes of the environment.
     """
     given = list(map(str, arguments)), cwd, output, environment(**variables)
-    process = _start_method().Process(target=_run, args=given)
+    process = start_method().Process(target=_run, args=given)
     process.start()
     return process
 

@@ -10,7 +10,7 @@ import tempfile
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_all_start_methods, get_context, resource_tracker
+from multiprocessing import get_allstart_methods, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -74,7 +74,7 @@ class ProcessExecutor:
                 process.join()
 
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
-        context = _start_method()
+        context = start_method()
         parent_end, child_end = context.Pipe()
         with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
             arguments = job, child_end, dict(os.environ)
@@ -97,14 +97,14 @@ def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> Jo
     return JobFinished(job, *message)
 
 
-def _start_method() -> ForkServerContext | SpawnContext:
+def start_method() -> ForkServerContext | SpawnContext:
     """Return how jobs are started: as forks of a server that has only imported the package, which takes seconds.
 
     Windows has no forks, and the path of the server's socket, in the temporary folder, has a maximum length. There,
     jobs are new interpreters.
     """
     is_short = len(tempfile.gettempdir()) + len(_SOCKET_NAME) <= _MAX_SOCKET_PATH
-    if not is_short or "forkserver" not in get_all_start_methods():
+    if not is_short or "forkserver" not in get_allstart_methods():
         return get_context("spawn")
     context = get_context("forkserver")
     context.set_forkserver_preload([run_job.__module__])
