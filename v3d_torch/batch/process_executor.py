@@ -10,7 +10,7 @@ import tempfile
 from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from multiprocessing import get_allstart_methods, get_context, resource_tracker
+from multiprocessing import get_all_start_methods, get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -104,7 +104,7 @@ def start_method() -> ForkServerContext | SpawnContext:
     jobs are new interpreters.
     """
     is_short = len(tempfile.gettempdir()) + len(_SOCKET_NAME) <= _MAX_SOCKET_PATH
-    if not is_short or "forkserver" not in get_allstart_methods():
+    if not is_short or "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
     context.set_forkserver_preload([run_job.__module__])
