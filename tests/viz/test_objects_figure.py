@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import torch
+from matplotlib.axes import Axes
 
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
@@ -23,22 +26,30 @@ def object_at(stamp: float, number: int, x: float, state: MotionState) -> Tracke
     return TrackedObject(number, 0, MASK, motion, (), 0, torch.nan, state, False, CUBE + position.float())
 
 
-def table_of(*objects: tuple[int, MotionState], frames: int = 8) -> ObjectTable:
-    """Return a table in which each object stands at its number, or moves to the right with 1 m/s."""
+def table_of(*objects: tuple[int, MotionState], frames: int = 8, spacing: float = 1.0) -> ObjectTable:
+    """Return a table in which each object stands at its number times a spacing, or moves to the right with 1 m/s."""
     table, image = ObjectTable(), torch.zeros(3, 2, 2, dtype=torch.uint8)
     for index in range(frames):
         stamp = index / 10
-        shown = [object_at(stamp, n, n + (stamp if state is MotionState.DYNAMIC else 0), state) for n, state in objects]
+        shown = [
+            object_at(stamp, n, spacing * n + (stamp if state is MotionState.DYNAMIC else 0), state)
+            for n, state in objects
+        ]
         table.append_objects(
             RGBDFrame(index, stamp, image, torch.ones(1, 2, 2)), FrameObjects(shown, MASK, MASK, []), UP
         )
     return table
 
 
-def draw(table: ObjectTable) -> list[str]:
-    """Return the texts of the figure, with an empty one for each arrow."""
+def draw_axes(table: ObjectTable) -> Axes:
     trajectory = Trajectory(torch.arange(2.0), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
     (axes,) = draw_objects(table, trajectory, torch.rand(5, 3), UP, "room $1").axes
+    return axes
+
+
+def draw(table: ObjectTable) -> list[str]:
+    """Return the texts of the figure, with an empty one for each arrow."""
+    axes = draw_axes(table)
     assert axes.get_title() == "room $1"
     return [text.get_text() for text in axes.texts]
 
@@ -46,6 +57,13 @@ def draw(table: ObjectTable) -> list[str]:
 def test_objects_have_names_and_dynamic_ones_an_arrow() -> None:
     table = table_of((1, MotionState.STATIC), (2, MotionState.DYNAMIC))
     assert draw(table) == ["person 1", "person 2", ""]
+
+
+def test_names_of_objects_at_the_same_place_do_not_overlap() -> None:
+    axes = draw_axes(table_of(*((number, MotionState.STATIC) for number in range(1, 6)), spacing=0.01))
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert len(boxes) == 5 and all(box.x1 <= axes.bbox.x1 + 1 for box in boxes)
+    assert not any(a.overlaps(b.shrunk(0.99, 0.99)) for a, b in combinations(boxes, 2))
 
 
 def test_objects_of_few_frames_are_not_drawn() -> None:

@@ -9,6 +9,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -62,7 +63,22 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     axes.set_title(title, parse_math=False)  # the name of a folder may contain dollar signs
+    _separate_names(figure, axes)
     return figure
+
+
+def _separate_names(figure: Figure, axes: Axes) -> None:
+    """Move names into the axes, and down until none overlaps another."""
+    figure.draw_without_rendering()  # determines the size of the axes and of the texts
+    names, boxes = [text for text in axes.texts if text.get_text()], list[Bbox]()
+    for name in sorted(names, key=lambda text: text.get_window_extent().y0, reverse=True):
+        box = name.get_window_extent()
+        box = box.translated(min(axes.bbox.x1 - box.x1, 0.0), 0.0)
+        while any(box.overlaps(other) for other in boxes):
+            box = box.translated(0.0, -box.height)
+        boxes.append(box)
+        x, y = axes.transData.inverted().transform((box.x0, box.y0))
+        name.set_position((x, y))
 
 
 def _draw_object(axes: Axes, objects: ObjectTable, rows: NDArray[np.bool_], R_lw: Tensor) -> None:
