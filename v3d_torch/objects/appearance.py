@@ -59,9 +59,9 @@ def colour_histograms(image: Tensor, masks: Tensor) -> Tensor:
     lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(colours), cv2.COLOR_RGB2LAB), np.uint8)
     brightness, a, b = (bins.take(lab[..., axis]) for axis, bins in enumerate((_BRIGHTNESS, _CHROMA, _CHROMA)))
     bins = ((brightness * _BINS + a) * _BINS + b).reshape(-1)
-    instance, pixel = masks.numpy()[:, ::_STRIDE, ::_STRIDE].reshape(len(masks), bins.size).nonzero()
-    counts = np.bincount(instance * HISTOGRAM_SIZE + bins[pixel], minlength=len(masks) * HISTOGRAM_SIZE)
-    counted = torch.from_numpy(counts.astype(np.float32)).view(len(masks), HISTOGRAM_SIZE)
+    inside = masks.numpy()[:, ::_STRIDE, ::_STRIDE].reshape(len(masks), bins.size)
+    counts = [np.bincount(bins[mask], minlength=HISTOGRAM_SIZE) for mask in inside]
+    counted = torch.from_numpy(np.array(counts, np.float32).reshape(len(masks), HISTOGRAM_SIZE))
     total = counted.sum(dim=1, keepdim=True)
     return (counted @ _SMOOTHING / total).masked_fill(total < _MIN_PIXELS, torch.nan)
 
