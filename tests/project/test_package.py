@@ -63,7 +63,7 @@ def test_stub_lists_every_public_name() -> None:
 
 def test_import_of_package_loads_no_heavy_library() -> None:
     code = (
-        "import sys, v3d_torch, v3d_torch.cli.run, v3d_torch.cli.evaluate\n"
+        "import sys, v3d_torch, v3d_torch.cli.run, v3d_torch.cli.evaluate, v3d_torch.batch.progress_board\n"
         "print({'torch', 'cv2', 'scipy'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603

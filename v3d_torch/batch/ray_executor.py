@@ -19,6 +19,7 @@ from v3d_torch.batch.executor import (
     report_lost_process,
 )
 from v3d_torch.batch.job import Job
+from v3d_torch.batch.progress_board import ProgressBoard
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.errors import InputError
 from v3d_torch.runs.interrupts import interrupts_between_frames
@@ -71,7 +72,7 @@ class RayExecutor:
             ray.get_runtime_context().get_node_id(), soft=False
         )
         # The board is on this machine, so that it survives the end of any other machine.
-        board = ray.remote(num_cpus=0, scheduling_strategy=this_machine)(_ProgressBoard).remote()
+        board = ray.remote(num_cpus=0, scheduling_strategy=this_machine)(ProgressBoard).remote()
         run = ray.remote(
             num_cpus=1,
             max_retries=0,
@@ -133,22 +134,6 @@ def _first_line(error: Exception) -> str:
     """Return the first line of an error of Ray, whose message can fill pages."""
     message = str(getattr(error, "cause", None) or error).strip()
     return message.splitlines()[0] if message else type(error).__name__
-
-
-class _ProgressBoard:
-    """Ray actor that collects the progress of the running jobs."""
-
-    def __init__(self) -> None:
-        self._frames: dict[int, int] = {}
-
-    def report(self, index: int, frames: int) -> None:
-        """Store the number of frames that a job has processed."""
-        self._frames[index] = frames
-
-    def take(self) -> dict[int, int]:
-        """Return and clear the frames processed, by job, of the jobs that reported since the last call."""
-        reports, self._frames = self._frames, {}
-        return reports
 
 
 def _task(job: Job, index: int, board: Any) -> str | None:
