@@ -18,7 +18,7 @@ from v3d_torch.geometry.se3 import invert
 Solve = Callable[[], Tensor]
 
 
-def usac_options(threshold: float) -> cv2.UsacParams:
+def default_usac_options(threshold: float) -> cv2.UsacParams:
     """OpenCV's default options of USAC, with 300 hypotheses."""
     options = cv2.UsacParams()
     options.threshold, options.maxIterations, options.confidence = threshold, 300, 0.999

@@ -116,7 +116,8 @@ def essential(batch: int) -> tuple[Implementations, Error]:
         OURS: lambda: v3d.essential_ransac(uv_a, uv_b, K, threshold=1.5).E,
         "OpenCV": lambda: [cv2.findEssentialMat(x, y, K.numpy(), cv2.RANSAC, 0.999, 1.5)[0] for x, y in arrays],
         "OpenCV (USAC)": lambda: [
-            cv2.findEssentialMat(x, y, K.numpy(), K.numpy(), None, None, peers.usac_options(1.5))[0] for x, y in arrays
+            cv2.findEssentialMat(x, y, K.numpy(), K.numpy(), None, None, peers.default_usac_options(1.5))[0]
+            for x, y in arrays
         ],
         "kornia-rs (no refinement)": lambda: [
             kornia_rs.ransac.essential(each, threshold=threshold**2, max_iters=300, seed=0).model for each in pairs
@@ -150,7 +151,7 @@ def pnp(batch: int) -> tuple[Implementations, Error]:
             [cv2.solvePnPRansac(X, u, K.numpy(), None, **options)[1:3] for X, u in arrays]
         ),
         "OpenCV (USAC)": lambda: peers.to_poses(
-            [cv2.solvePnPRansac(X, u, K.numpy(), None, params=peers.usac_options(4.0))[2:4] for X, u in arrays]
+            [cv2.solvePnPRansac(X, u, K.numpy(), None, params=peers.default_usac_options(4.0))[2:4] for X, u in arrays]
         ),
         "kornia-rs": from_kornia_rs,
     }

@@ -7,8 +7,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -91,65 +89,27 @@ def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
 
 # --- killed runs
 
-FORKING_COMMAND = """
-import os, sys
-import v3d_torch.runs.run, v3d_torch.cli.run, v3d_torch.cli.run_command
-from v3d_torch.kernels.compiler import compile_kernels
-list(compile_kernels())
-for line in sys.stdin:
-    child = os.fork()
-    if child == 0:
-        null = os.open(os.devnull, os.O_RDWR)
-        os.dup2(null, 0), os.dup2(null, 1)
-        try:
-            v3d_torch.cli.run.app(eval(line))
-        except SystemExit as end:
-            os._exit(end.code or 0)  # a normal exit would wait for library threads that the fork did not copy
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
-"""Program that runs the command in forked processes, so that torch is imported and the kernels are loaded only once."""
-
-
-@pytest.fixture
-def start() -> Iterator[Callable[[list[str]], tuple[int, Callable[[], int]]]]:
-    """Function that starts the command and returns its process id and a function that waits for its exit code."""
-    with subprocess.Popen(  # noqa: S603
-        [sys.executable, "-c", FORKING_COMMAND], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdin is not None and process.stdout is not None
-        stdin, stdout = process.stdin, process.stdout
-
-        def begin(arguments: list[str]) -> tuple[int, Callable[[], int]]:
-            stdin.write(f"{arguments!r}\n")
-            stdin.flush()
-            return int(stdout.readline()), lambda: int(stdout.readline())
-
-        yield begin
-        stdin.close()
-
 
 def count_frames(log: Path) -> int:
     return log.read_text().count(" INFO frame ") if log.is_file() else 0
 
 
-@pytest.mark.skipif(os.name == "nt", reason="no SIGKILL, no fork")
-def test_run_killed_at_six_frames_resumes_to_the_same_bytes(
-    start: Callable[[list[str]], tuple[int, Callable[[], int]]], sequence: Path, whole_run: Path, tmp_path: Path
-) -> None:
+@pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
+def test_run_killed_at_ten_frames_resumes_to_the_same_bytes(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
     out, rng = tmp_path / "out", random.Random(0)  # noqa: S311
     arguments = run_arguments(
         sequence, out, "--save-masks", "--save-map", str(tmp_path / "room.map"), *CHECKPOINT_EVERY_FRAME
     )
-    for frame in sorted(rng.sample(range(1, FRAMES), 6)):
-        process, exit_code = start(arguments)
+    for frame in sorted(rng.sample(range(1, FRAMES), 10)):
+        process = start_forked(*arguments, cwd=tmp_path)
         logged, deadline = count_frames(out / "run.log"), time.monotonic() + 60
         done = json.loads((out / "metrics.json").read_text())["processed"] if (out / "metrics.json").exists() else 0
         while count_frames(out / "run.log") - logged < frame - done and time.monotonic() < deadline:
             time.sleep(0.001)
         time.sleep(0.05 * rng.random())  # kill within a frame, or while results are written
-        os.kill(process, signal.SIGKILL)
-        assert exit_code() == -signal.SIGKILL
+        process.kill()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
         # The results are readable. They can lack the frame that was being written, and one more if the previous kill
         # came between the results and their checkpoint, because the run then resumed from the frame before.
         partial = read_run(out)
@@ -157,8 +117,9 @@ def test_run_killed_at_six_frames_resumes_to_the_same_bytes(
         assert partial.metrics.failure is not None and partial.metrics.failure.startswith("killed or still running")
         assert (out / CHECKPOINT).is_file()
         arguments = ["--resume", str(out)]
-    process, exit_code = start(arguments)
-    assert exit_code() == 0
+    process = start_forked(*arguments, cwd=tmp_path)
+    process.join()
+    assert process.exitcode == 0
     assert_same_results(out, whole_run)
     for mask in (whole_run / "masks").iterdir():
         assert (out / "masks" / mask.name).read_bytes() == mask.read_bytes()

@@ -104,7 +104,7 @@ def optimise_pose_graph(
     KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
     graph, start = _prepare(initial, edges, measured, information, fixed, weights, valid, robust)
     with torch.no_grad():
-        found = _minimise(start.detach(), *graph.detach(), iterations, tolerance)
+        found = _minimise(start.detach(), *graph.detach(), iterations=iterations, tolerance=tolerance)
     cost_after, steps = found.cost_after, None
     if needs_gradient(start, *graph):
         steps = graph.differentiate(found.T_wc, start)
@@ -193,39 +193,20 @@ class _Graph(NamedTuple):
         return (J.mT @ (weights[..., None, None] * self.information) @ error[..., None])[..., 0]
 
 
-def _minimise_compiled(
-    T_wc: Tensor,
-    edges: Tensor,
-    T_ji: Tensor,
-    information: Tensor,
-    weights: Tensor,
-    fixed: Tensor,
-    limit: Tensor,
-    iterations: int,
-    tolerance: float,
-) -> PoseGraphResult:
-    batch, settings = T_wc.shape[:-3], (float(limit), iterations, tolerance, _REGULARISATION, DAMPING_SCHEDULE)
+def _minimise_compiled(T_wc: Tensor, *graph: Tensor, iterations: int, tolerance: float) -> PoseGraphResult:
+    batch, (*columns, limit) = T_wc.shape[:-3], graph
     if 0 in batch:
         return NotImplemented
-    rows = zip(*(to_rows(each, batch) for each in (T_wc, edges, T_ji, information, weights, fixed)), strict=True)
+    settings = float(limit), iterations, tolerance, _REGULARISATION, DAMPING_SCHEDULE
+    rows = zip(*(to_rows(each, batch) for each in (T_wc, *columns)), strict=True)
     return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*(*row, *settings)) for row in rows], batch))
 
 
 @compiled_by(_minimise_compiled)
-def _minimise(
-    T_wc: Tensor,
-    edges: Tensor,
-    T_ji: Tensor,
-    information: Tensor,
-    weights: Tensor,
-    fixed: Tensor,
-    limit: Tensor,
-    iterations: int,
-    tolerance: float,
-) -> PoseGraphResult:
+def _minimise(T_wc: Tensor, *graph: Tensor, iterations: int, tolerance: float) -> PoseGraphResult:
     """Optimise poses by Levenberg-Marquardt; the tensors are those of `_Graph`."""
-    graph = _Graph(edges, T_ji, information, weights, fixed, limit)
-    found = levenberg_marquardt(T_wc, graph.linearise, graph.step, iterations, tolerance)
+    at = _Graph(*graph)
+    found = levenberg_marquardt(T_wc, at.linearise, at.step, iterations, tolerance)
     return PoseGraphResult(found.state, found.cost_before, found.cost_after, found.iterations, found.converged)
 
 

@@ -207,14 +207,14 @@ def _check_focal_length(tables: MapTables, camera: PinholeCamera, config: Config
     given = problem.given_values(names)
     scales = torch.tensor([[factor, factor, 1.0, 1.0] for factor in _FOCAL_FACTORS], dtype=torch.float64)
     tried = [problem.adjust(names, given * scale, problem.T_cw, problem.points) for scale in scales]
-    best = min(range(len(tried)), key=lambda index: float(tried[index].cost_after))
-    at = problem.differentiate(names, given * scales[best], tried[best].T_cw, tried[best].points)
+    best = min(range(len(tried)), key=lambda index: float(tried[index].cost))
+    at = problem.differentiate(names, given * scales[best], tried[best])
     step = torch.linalg.pinv(at.hessian.sum(dim=0), hermitian=True) @ at.gradient.sum(dim=0)
     if not bool(((scales[best] - step / given - 1).abs()[:2] > _SUSPICION * _MIN_FOCAL_CHANGE).any()):
         return []
     starts = [given] if bool((scales[best] == 1).all()) else [given, given * scales[best]]
     minima = [problem.minimise(names, start) for start in starts]
-    values, at = min(minima, key=lambda found: float(problem.adjust(names, found[0], *found[1][:2]).cost_after))
+    values, at = min(minima, key=lambda found: float(problem.adjust(names, found[0], *found[1][:2]).cost))
     sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
     change = (values / given).log().abs() - _SIGNIFICANCE * sigma / values
     if not bool((change[:2] > _MIN_FOCAL_CHANGE).any()):

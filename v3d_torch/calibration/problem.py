@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,7 +19,7 @@ from torch import Tensor
 from v3d_torch.calibration.parameters import DERIVATIVE_STEPS, LIMITS, get_values, with_values
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.mapping.bundle_adjustment import BundleAdjustment, bundle_adjust
+from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.bundle_problem import prepare_bundle
 from v3d_torch.mapping.map_observations import MapObservations, select_observations
 from v3d_torch.mapping.map_tables import MapTables
@@ -41,6 +41,22 @@ _SCALE_STEP = 1.0
 
 _NORMAL_MAD = 0.6745
 """Median absolute value of a standard normal distribution."""
+
+
+class Adjustment(NamedTuple):
+    """Poses and points adjusted for given parameters.
+
+    Attributes:
+        cost: Minimum cost, shape :math:`()`.
+        T_cw: World-to-camera poses, float64, shape :math:`(K, 4, 4)`.
+        points: Landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
+        arguments: Observations with these parameters, as arguments of `bundle_adjust`.
+    """
+
+    cost: Tensor
+    T_cw: Tensor
+    points: Tensor
+    arguments: dict[str, Any]
 
 
 class AdjustedMap(NamedTuple):
@@ -156,29 +172,28 @@ class SelfCalibration:
             Cost, shape :math:`()`, and the adjusted map.
         """
         adjusted = self.adjust(names, values, T_cw, points)
-        return adjusted.cost_after, self.differentiate(names, values, adjusted.T_cw, adjusted.points)
+        return adjusted.cost, self.differentiate(names, values, adjusted)
 
-    def adjust(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> BundleAdjustment:
+    def adjust(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Adjustment:
         """Adjust poses and points for given values of parameters; the arguments are those of `linearise`."""
         observations, camera = self._measured_with(names, values)
         arguments = observations.arguments(camera.K, self._fixed)
-        return bundle_adjust(T_cw, points, **arguments, iterations=_INNER_STEPS, tolerance=_TOLERANCE)
+        adjusted = bundle_adjust(T_cw, points, **arguments, iterations=_INNER_STEPS, tolerance=_TOLERANCE)
+        return Adjustment(adjusted.cost_after, adjusted.T_cw, adjusted.points, arguments)
 
-    def differentiate(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> AdjustedMap:
+    def differentiate(self, names: Sequence[str], values: Tensor, adjusted: Adjustment) -> AdjustedMap:
         """Differentiate the minimum cost by parameters.
 
         Args:
             names: Free parameters.
             values: Their values, float64, shape :math:`(C,)`.
-            T_cw: Poses by `adjust` for these values, float64, shape :math:`(K, 4, 4)`.
-            points: Points by `adjust`, float64, shape :math:`(P, 3)`.
+            adjusted: Result of `adjust` for these values.
 
         Returns:
             The map with the derivatives.
         """
-        observations, camera = self._measured_with(names, values)
-        arguments = observations.arguments(camera.K, self._fixed)
-        problem, state = prepare_bundle(T_cw, points, **arguments, weights=None, valid=None)
+        T_cw, points = adjusted.T_cw, adjusted.points
+        problem, state = prepare_bundle(T_cw, points, **adjusted.arguments, weights=None, valid=None)
         derivatives = differentiate_minimum_cost(problem, state, self.jacobian(names, values, T_cw, points))
         return AdjustedMap(T_cw, points, *derivatives)
 

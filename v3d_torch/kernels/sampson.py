@@ -55,6 +55,12 @@ def _constraint(F: Array, a: Array, b: Array) -> tuple[float, float, float, floa
 
 
 @device
+def _length(a0: float, a1: float, b0: float, b1: float) -> float:
+    """Denominator of the Sampson distance, from the first two elements of both epipolar lines."""
+    return math.sqrt(max(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1, _MIN_SQUARE))
+
+
+@device
 def _linearise(
     U: Array, V: Array, K_inverse: Array, a: Array, b: Array, weights: Array, active: Mask, H: Array, g: Array
 ) -> float:
@@ -65,7 +71,7 @@ def _linearise(
         if not active[i]:
             continue
         product, b0, b1, a0, a1 = _constraint(F, a[i], b[i])
-        length = math.sqrt(max(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1, _MIN_SQUARE))
+        length = _length(a0, a1, b0, b1)
         r = product / length
         cost += weights[i] * r * r
         for k in range(5):
@@ -86,7 +92,7 @@ def _classify(
     F, unchanged = _compose(U, V, K_inverse), True
     for i in range(len(a)):
         product, b0, b1, a0, a1 = _constraint(F, a[i], b[i])
-        length = math.sqrt(max(a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1, _MIN_SQUARE))
+        length = _length(a0, a1, b0, b1)
         is_inlier = valid[i] and abs(product) <= threshold * length
         unchanged &= is_inlier == inliers[i]
         inliers[i] = is_inlier

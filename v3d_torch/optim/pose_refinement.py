@@ -217,9 +217,10 @@ def refine_pose(
     batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2])
     if batch:
         initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
+    minimise = partial(_minimise, initial, rounds=rounds, iterations=iterations, tolerance=tolerance)
     if not needs_gradient(*problem):
-        return _cast(_minimise(initial, *problem, rounds, iterations, tolerance)[0], T_cw.dtype)
-    found, active = _minimise(initial, *problem.detach(), rounds, iterations, tolerance)
+        return _cast(minimise(*problem)[0], T_cw.dtype)
+    found, active = minimise(*problem.detach())
     robust = _is_robust(rounds - 1, rounds)
     at = problem.residuals_at(problem.differentiate(found.T_cw, active, robust=robust))
     information, _ = problem.normal_equations(at, problem.robust_cost(at, active, robust=robust)[1])
@@ -239,19 +240,9 @@ def _cast(refined: PoseRefinement, dtype: torch.dtype) -> PoseRefinement:
 
 
 def _minimise_compiled(
-    T_cw: Tensor,
-    points: Tensor,
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    valid: Tensor,
-    rounds: int,
-    iterations: int,
-    tolerance: float,
+    T_cw: Tensor, *problem: Tensor, rounds: int, iterations: int, tolerance: float
 ) -> tuple[PoseRefinement, Tensor]:
-    batch, problem = T_cw.shape[:-2], (points, scale, offset, thresholds, weights, valid)
-    settings = rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
+    batch, settings = T_cw.shape[:-2], (rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE)
     arguments: tuple[Any, ...] = (*(to_rows(column, batch) for column in (T_cw, *problem)), *settings)
     results = kernels.refine_poses(*arguments)
     T, inliers, active, chi2, H = (torch.from_numpy(each).reshape(*batch, *each.shape[1:]) for each in results)
@@ -261,26 +252,17 @@ def _minimise_compiled(
 @torch.no_grad()
 @compiled_by(_minimise_compiled)
 def _minimise(
-    T_cw: Tensor,
-    points: Tensor,
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    valid: Tensor,
-    rounds: int,
-    iterations: int,
-    tolerance: float,
+    T_cw: Tensor, *columns: Tensor, rounds: int, iterations: int, tolerance: float
 ) -> tuple[PoseRefinement, Tensor]:
-    """Refine poses; return them and the mask of the measurements used in the last round, bool, (..., N)."""
-    problem = _Problem(points, scale, offset, thresholds, weights, valid)
-    at, inliers, active = problem.residuals_at(T_cw), valid, valid
+    """Refine poses of a `_Problem`; return them and the mask of measurements used in the last round, bool, (..., N)."""
+    problem = _Problem(*columns)
+    at, inliers, active = problem.residuals_at(T_cw), problem.valid, problem.valid
     finished = torch.zeros(T_cw.shape[:-2], dtype=torch.bool, device=T_cw.device)
     for index in range(rounds):
         active, robust = select(finished, active, inliers), _is_robust(index, rounds)
         cost = partial(problem.robust_cost, active=active, robust=robust)
         result = levenberg_marquardt(at, cost, problem.step, iterations, tolerance, finished)
-        at, previous, inliers = result.state, inliers, problem.chi2(result.state) <= thresholds
+        at, previous, inliers = result.state, inliers, problem.chi2(result.state) <= problem.thresholds
         if not robust:
             finished = finished | (inliers == previous).all(dim=-1)
         if is_all_true(finished):
