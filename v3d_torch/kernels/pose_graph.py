@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from v3d_torch.kernels import se3
@@ -11,52 +9,6 @@ from v3d_torch.kernels.block_cholesky import Index, Mask, factorise, find_block,
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
 from v3d_torch.kernels.reprojection import Array, huber, multiply, se3_exp
-
-_SERIES_ANGLE_SQUARED = 1e-4
-"""Squared rotation angle below which the Jacobian is computed from its power series, to avoid cancellation."""
-
-
-@device
-def _write_skew(x: float, y: float, z: float, matrix: Array, row: int, column: int) -> None:
-    """Write the matrix of the cross product with a vector to a block of a matrix of zeros."""
-    matrix[row, column + 1], matrix[row, column + 2], matrix[row + 1, column + 2] = -z, y, -x
-    matrix[row + 1, column], matrix[row + 2, column], matrix[row + 2, column + 1] = z, -y, x
-
-
-@device
-def _right_jacobian_inverse(xi: Array) -> Array:
-    """Derivative of a logarithm by a perturbation on the right, (6, 6); see `left_jacobian_inverse` of ``-xi``."""
-    A, J = np.zeros((6, 6)), np.eye(6)
-    _write_skew(xi[3], xi[4], xi[5], A, 0, 0)
-    _write_skew(xi[3], xi[4], xi[5], A, 3, 3)
-    _write_skew(xi[0], xi[1], xi[2], A, 0, 3)
-    square = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
-    if square < _SERIES_ANGLE_SQUARED:
-        b, a = -1 / 720 - square / 15120, 1 / 12 - square * square / 30240
-    else:
-        angle = math.sqrt(square)
-        cotangent = 1 / math.tan(angle / 2)
-        slope = cotangent / 2 - angle / (4 * math.sin(angle / 2) ** 2)
-        b = (1 + angle * slope / 2 - angle / 2 * cotangent) / (square * square)
-        a = 2 * b * square - slope / (2 * angle)
-    A2 = multiply(A, A)
-    A4 = multiply(A2, A2)
-    for i in range(6):
-        for k in range(6):
-            J[i, k] += 0.5 * A[i, k] + a * A2[i, k] + b * A4[i, k]
-    return J
-
-
-@device
-def _adjoint(T: Array) -> Array:
-    """Adjoint of a rigid motion, (6, 6)."""
-    A, skew = np.zeros((6, 6)), np.zeros((3, 3))
-    _write_skew(T[0, 3], T[1, 3], T[2, 3], skew, 0, 0)
-    B = multiply(skew, T[:3, :3])
-    for i in range(3):
-        for k in range(3):
-            A[i, k], A[3 + i, 3 + k], A[i, 3 + k] = T[i, k], T[i, k], B[i, k]
-    return A
 
 
 @device
@@ -77,8 +29,8 @@ def _linearise(
         robust, weight = huber(squared, limit)
         cost += weights[e] * robust
         weight *= weights[e]
-        J_j = _right_jacobian_inverse(error)
-        J = (-multiply(J_j, _adjoint(se3.invert(T_ij))), J_j)
+        J_j = se3.right_jacobian_inverse(error)
+        J = (-multiply(J_j, se3.adjoint(se3.invert(T_ij))), J_j)
         omega_J = (multiply(information[e], J[0]), multiply(information[e], J[1]))
         for end in range(2):
             row = place[edges[e, end]]

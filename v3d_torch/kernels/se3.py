@@ -19,6 +19,9 @@ _MAX_NEWTON_STEPS = 8
 _NEWTON_TOLERANCE = 1e-8
 """Change of the elements in the last step. Newton's method squares the error in each step."""
 
+_SERIES_ANGLE_SQUARED = 1e-4
+"""Squared rotation angle below which the Jacobian is computed from its power series, to avoid cancellation."""
+
 
 @kernel("(f8[:,::1],)")
 def invert(T: Array) -> Array:
@@ -120,3 +123,46 @@ def log(T: Array) -> Array:
             c,
         ]
     )
+
+
+@device
+def _write_skew(x: float, y: float, z: float, matrix: Array, row: int, column: int) -> None:
+    """Write the matrix of the cross product with a vector to a block of a matrix of zeros."""
+    matrix[row, column + 1], matrix[row, column + 2], matrix[row + 1, column + 2] = -z, y, -x
+    matrix[row + 1, column], matrix[row + 2, column], matrix[row + 2, column + 1] = z, -y, x
+
+
+@device
+def right_jacobian_inverse(xi: Array) -> Array:
+    """Derivative of a logarithm by a perturbation on the right, (6, 6); see `left_jacobian_inverse` of ``-xi``."""
+    A, J = np.zeros((6, 6)), np.eye(6)
+    _write_skew(xi[3], xi[4], xi[5], A, 0, 0)
+    _write_skew(xi[3], xi[4], xi[5], A, 3, 3)
+    _write_skew(xi[0], xi[1], xi[2], A, 0, 3)
+    square = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
+    if square < _SERIES_ANGLE_SQUARED:
+        b, a = -1 / 720 - square / 15120, 1 / 12 - square * square / 30240
+    else:
+        angle = math.sqrt(square)
+        cotangent = 1 / math.tan(angle / 2)
+        slope = cotangent / 2 - angle / (4 * math.sin(angle / 2) ** 2)
+        b = (1 + angle * slope / 2 - angle / 2 * cotangent) / (square * square)
+        a = 2 * b * square - slope / (2 * angle)
+    A2 = reprojection.multiply(A, A)
+    A4 = reprojection.multiply(A2, A2)
+    for i in range(6):
+        for k in range(6):
+            J[i, k] += 0.5 * A[i, k] + a * A2[i, k] + b * A4[i, k]
+    return J
+
+
+@device
+def adjoint(T: Array) -> Array:
+    """Adjoint of a rigid motion, (6, 6)."""
+    A, skew = np.zeros((6, 6)), np.zeros((3, 3))
+    _write_skew(T[0, 3], T[1, 3], T[2, 3], skew, 0, 0)
+    B = reprojection.multiply(skew, T[:3, :3])
+    for i in range(3):
+        for k in range(3):
+            A[i, k], A[3 + i, 3 + k], A[i, 3 + k] = T[i, k], T[i, k], B[i, k]
+    return A
