@@ -2,7 +2,8 @@
 
 The contours of a network are coarse, and its mask of a person who is partly in the image often misses an arm. Depth
 corrects both. Pixels around a mask belong to the object if their depth agrees with the object's points. A surface that
-continues from there without a depth edge also belongs to the object, unless the surface was there before the object.
+continues from there without a depth edge or a concave edge also belongs to the object, unless the surface was there
+before the object.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from v3d_torch.config import StaticMaskConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.objects.free_space_check import DepthView, erode_measured
+from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.mask_ops import dilate, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
+from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
 from v3d_torch.objects.track import Track
 
 _TOLERANCE_GROWTH = 0.01
@@ -53,9 +55,11 @@ class MaskRefiner:
         self._view = view
         self._config = config
         self._stride = newly_occupied.stride
-        # Pixels that a surface can grow over: no depth edge, and not occupied before the object appeared.
-        smooth = _smooth_pixels(view.depth[0].numpy(), self._stride, config.edge_ratio)
-        self._growable = smooth & ~newly_occupied.previously_occupied.numpy()
+        depth = view.depth[0].numpy()
+        self._concave = find_concave_edges(depth[:: self._stride, :: self._stride])
+        # Pixels that a surface can grow over: no edge, and not occupied before the object appeared.
+        self._growable = find_smooth_pixels(depth, self._stride, config.edge_ratio)
+        self._growable &= ~(self._concave | newly_occupied.previously_occupied.numpy())
         located = [track for track in tracks if track.newest.has_centroid]
         R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
         clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in located]
@@ -83,7 +87,7 @@ class MaskRefiner:
         return torch.from_numpy(mask)
 
     def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
-        """Grow an object's pixels within the reachable ones up to the next depth edge, bool, shape (H, W)."""
+        """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (H, W)."""
         if self._config.surface_margin == 0:
             return track.cloud_pixels & reachable
         step = self._stride
@@ -91,7 +95,7 @@ class MaskRefiner:
         near = dilate(track.mask[::step, ::step].contiguous(), self._config.surface_margin // step).numpy()
         near &= reachable.numpy()[::step, ::step]
         near &= self._growable
-        near |= seeds
+        near |= seeds & ~self._concave
         return _fill_surfaces(
             torch.from_numpy(near), track.cloud_pixels, reachable, step, self._config.min_surface_fraction
         )
@@ -146,20 +150,3 @@ def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int,
     cells = dilate(torch.from_numpy(selected[components]), 1).numpy()
     surface[crop] = upsample_nearest(cells, step, in_crop.shape) & in_crop
     return surface
-
-
-def _smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> NDArray[np.bool_]:
-    """Check at every n-th pixel whether the depth within half the step of it varies by less than ``edge_ratio``.
-
-    Args:
-        depth: Depth, metres, shape (H, W); 0 = no measurement.
-        step: Step n between the pixels.
-        edge_ratio: Largest variation of the depth, as a fraction of the depth.
-
-    Returns:
-        Bool, shape (h, w).
-    """
-    size, centre = step + 1, depth[::step, ::step]
-    nearest = erode_measured(depth, size)[::step, ::step]
-    farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::step, ::step]
-    return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)

@@ -1,0 +1,58 @@
+"""Edges at which a surface ends: depth edges, and concave edges.
+
+Where two objects touch, the depth has no step, but the surface bends towards the camera, as where a foot stands on the
+floor. The surface of one body is mostly convex (Stein et al., "Object Partitioning using Local Convexity", CVPR 2014).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from v3d_torch.objects.free_space_check import erode_measured
+
+_REACH = 3
+"""Distance at which a bend is measured, cells: over a shorter distance the depth noise is larger than the bend."""
+
+_MIN_BEND = 0.012
+"""Second difference of the inverse depth at a concave edge, 1/m. A foot on the floor, 1.4 m below a camera with a focal
+length of 525 pixels, has 0.016 at any distance; the standard deviation on smoothed images of a Kinect is 0.005."""
+
+
+def find_smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> NDArray[np.bool_]:
+    """Check at every n-th pixel whether the depth within half the step of it varies by less than ``edge_ratio``.
+
+    Args:
+        depth: Depth, metres, shape :math:`(H, W)`; 0 = no measurement.
+        step: Step n between the pixels.
+        edge_ratio: Largest variation of the depth, as a fraction of the depth.
+
+    Returns:
+        Bool, shape :math:`(h, w)`.
+    """
+    size, centre = step + 1, depth[::step, ::step]
+    nearest = erode_measured(depth, size)[::step, ::step]
+    farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::step, ::step]
+    return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)
+
+
+def find_concave_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Find the cells at which the depth bends towards the camera along rows or columns.
+
+    The inverse depth of a plane is linear in the image, so its second difference is 0 on a plane at any tilt, and
+    positive at a concave edge, and behind the contour of a nearer object.
+
+    Args:
+        depth: Depth of each cell, metres, shape :math:`(h, w)`; 0 = no measurement.
+
+    Returns:
+        Bool, shape :math:`(h, w)`; false near the border of the image and at a distance of 3 cells from a cell without
+        depth.
+    """
+    inverse = 1 / np.where(depth > 0, depth, np.float32(np.nan))
+    edges = np.zeros(depth.shape, np.bool_)
+    for w, along_axis in ((inverse, edges), (inverse.T, edges.T)):
+        before, centre, after = w[: -2 * _REACH], w[_REACH:-_REACH], w[2 * _REACH :]
+        along_axis[_REACH:-_REACH] |= before + after - 2 * centre > _MIN_BEND
+    return edges
