@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -123,3 +124,21 @@ def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest
         text = StringIO()
         kernel_compilation.compile_kernels(Console(file=text))
         assert text.getvalue().count("compiling kernels for this processor") == expected
+
+
+@needs_numba
+def test_code_is_shared_by_copies_of_a_file_and_not_by_other_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiler, "_code_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiler, "_TO_COMPILE", compiler.deque())
+    source = "from v3d_torch.kernels.compiler import kernel\n@kernel('f8(f8)')\ndef scale(x):\n    return {} * x\n"
+    compiled = []
+    for folder, factor in (("one", 2), ("copy", 2), ("other", 3)):
+        (tmp_path / folder).mkdir()
+        path = tmp_path / folder / "scaling.py"
+        path.write_text(source.format(factor))
+        scale = runpy.run_path(str(path), run_name="scaling")["scale"]
+        compiled += [count for count, _ in compiler.compile_kernels()]
+        assert scale(5.0) == factor * 5
+    assert compiled == [1, 0, 1]
