@@ -6,6 +6,7 @@ import os
 import runpy
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
@@ -87,11 +88,16 @@ def test_variable_turns_kernels_off() -> None:
         ({"V3D_CACHE": "{}/file/cache", "TMPDIR": "{}/tmp"}, "{}/tmp"),
     ],
 )
-def test_code_is_kept_in_a_private_folder(tmp_path: Path, variables: dict[str, str], parent: str) -> None:
+def test_code_is_kept_in_a_private_folder(
+    tmp_path: Path, variables: dict[str, str], parent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "tmp").mkdir()
-    given = {name: value.format(tmp_path) for name, value in variables.items()}
-    folder = Path(python("from v3d_torch.kernels.compiler import _code_folder; print(_code_folder())", **given))
+    monkeypatch.delenv("NUMBA_CACHE_DIR")  # of the tests
+    monkeypatch.setattr(tempfile, "tempdir", None)  # which the module remembers
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.format(tmp_path))
+    folder = compiler._code_folder.__wrapped__()  # without the folder found earlier
     assert folder.is_relative_to(parent.format(tmp_path)) and folder.is_dir()
     assert folder.stat().st_mode & 0o022 == 0
 
