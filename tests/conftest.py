@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+import typer.testing
 from rich.console import Console
 
 from v3d_torch.io.download import cache_dir
@@ -22,10 +24,14 @@ from v3d_torch.runs.kernel_compilation import compile_kernels
 
 torch.set_num_threads(1)
 
+# A call of a command in a test would build the command from its signature, which takes longer than many a command.
+typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[attr-defined]
+
 SLOWEST = (
     *("test_real_sequences.py", "batch/test_ray_executor.py", "test_corpus.py", "cli/test_batch.py", "cli/test_run.py"),
     *("project/test_notebooks.py", "cli/test_run_resume.py", "cli/test_ablate.py", "project/test_module_table.py"),
-    *("cli/test_report.py", "objects/test_classified_scenes.py", "project/test_privacy.py"),
+    *("cli/test_report.py", "objects/test_classified_scenes.py", "project/test_privacy.py", "test_determinism.py"),
+    *("tracking/test_lost_camera.py", "backend/test_closed_loop.py", "test_slam.py", "viz/test_rerun_viewer.py"),
 )
 """Files that run first, so that several workers (``-n 2``) finish at about the same time."""
 

@@ -54,6 +54,7 @@ def nodes(own: Path) -> Iterator[Nodes]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(own), prepend=os.pathsep)
+        patch.setenv("RAY_worker_niceness", "0")  # by default, jobs wait for the other tests
         cluster = Nodes(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         cluster.add_node(num_cpus=1)
         yield cluster

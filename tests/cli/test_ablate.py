@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,8 +22,11 @@ from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation.ablation import VARIANTS
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runs.request import RunRequest
-from v3d_torch.types import RGBDFrame
+from v3d_torch.types import RGBDFrame, Trajectory
+from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 
 FRAMES = 6
 
@@ -35,6 +39,19 @@ def call(*arguments: str | Path) -> Result:
 def rows_of(folder: Path) -> list[dict[str, str]]:
     with (folder / "ablation.csv").open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def only_trajectories_are_drawn() -> Iterator[None]:
+    """Draw one figure of each run. All figures would take most of the time of runs of six frames."""
+
+    def draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory, _: PointMap) -> None:
+        path = folder / "trajectory.png"
+        save_trajectory_figure(pipeline.sequence.groundtruth, trajectory, path, pipeline.sequence.name)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("v3d_torch.runs.results.draw_run", draw)
+        yield
 
 
 @pytest.fixture(scope="module")

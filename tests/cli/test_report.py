@@ -181,7 +181,8 @@ def test_help_takes_little_processor_time() -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_page_reports_run_that_ended_early(tmp_path: Path) -> None:
+def test_page_reports_run_that_ended_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
     for broken, poses in ((0, 0), (1, 1), (6, 6)):
         run_into(tmp_path / str(broken), Wall(broken=broken), square)
         page = page_of(tmp_path / str(broken))

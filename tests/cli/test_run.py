@@ -21,6 +21,7 @@ import pytest
 from helpers.bag_messages import read_with_mcap
 from helpers.commands import RUN_FILES, assert_error_line, call, call_here, command, environment, files_in
 from helpers.demo_frames import copy_frames
+from helpers.forked_command import call_forked
 from typer.testing import Result
 
 from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
@@ -68,6 +69,12 @@ def copy(sequence: Path, tmp_path: Path) -> Path:
     folder = tmp_path / "copy"
     shutil.copytree(sequence, folder, copy_function=os.link)
     return folder
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs without figures, which take half of the time of short runs."""
+    monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
 
 
 def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
@@ -156,7 +163,7 @@ def test_saved_masks_are_binary_and_named_by_timestamp(first_out: Path, sequence
 
 def test_results_are_the_same_bytes_with_two_threads(first_out: Path, sequence: Path, tmp_path: Path) -> None:
     """The first run had one thread. This run has two, in another process."""
-    done = call(*with_masks(sequence), "--out", tmp_path, "--set", "threads=2", cwd=tmp_path)
+    done = call_forked(*with_masks(sequence), "--out", tmp_path, "--set", "threads=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
         assert (tmp_path / name).read_bytes() == (first_out / name).read_bytes(), name
@@ -179,6 +186,7 @@ def test_run_without_segmenter_and_out_writes_a_folder_by_time(moment: Path, tmp
     assert {path.name for path in runs.iterdir()} == {"latest", *(path.name for path in newest)}
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: Path) -> None:
     (tmp_path / "own.yaml").write_text("mapping: {max_keyframe_interval: 4, min_tracked: 90}\n")
     arguments = (
@@ -196,6 +204,7 @@ def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: P
         assert line in written
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_estimated_depth_scale_is_a_warning_in_the_record(moment: Path, tmp_path: Path) -> None:
     folder = tmp_path / "seq"
     shutil.copytree(moment, folder)
@@ -430,6 +439,7 @@ def test_demo_moving_people_are_not_in_the_map(demo: tuple[Path, str]) -> None:
     assert corridor.sum() < 0.002 * len(points)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_estimated_depth_scale_is_reported_on_the_console_and_in_the_log(moment: Path, tmp_path: Path) -> None:
     folder = tmp_path / "millimetres"
     shutil.copytree(moment, folder)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import runpy
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
@@ -86,11 +88,16 @@ def test_variable_turns_kernels_off() -> None:
         ({"V3D_CACHE": "{}/file/cache", "TMPDIR": "{}/tmp"}, "{}/tmp"),
     ],
 )
-def test_code_is_kept_in_a_private_folder(tmp_path: Path, variables: dict[str, str], parent: str) -> None:
+def test_code_is_kept_in_a_private_folder(
+    tmp_path: Path, variables: dict[str, str], parent: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "tmp").mkdir()
-    given = {name: value.format(tmp_path) for name, value in variables.items()}
-    folder = Path(python("from v3d_torch.kernels.compiler import _code_folder; print(_code_folder())", **given))
+    monkeypatch.delenv("NUMBA_CACHE_DIR")  # of the tests
+    monkeypatch.setattr(tempfile, "tempdir", None)  # which the module remembers
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value.format(tmp_path))
+    folder = compiler._code_folder.__wrapped__()  # without the folder found earlier
     assert folder.is_relative_to(parent.format(tmp_path)) and folder.is_dir()
     assert folder.stat().st_mode & 0o022 == 0
 
@@ -123,3 +130,21 @@ def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest
         text = StringIO()
         kernel_compilation.compile_kernels(Console(file=text))
         assert text.getvalue().count("compiling kernels for this processor") == expected
+
+
+@needs_numba
+def test_code_is_shared_by_copies_of_a_file_and_not_by_other_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compiler, "_code_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiler, "_TO_COMPILE", compiler.deque())
+    source = "from v3d_torch.kernels.compiler import kernel\n@kernel('f8(f8)')\ndef scale(x):\n    return {} * x\n"
+    compiled = []
+    for folder, factor in (("one", 2), ("copy", 2), ("other", 3)):
+        (tmp_path / folder).mkdir()
+        path = tmp_path / folder / "scaling.py"
+        path.write_text(source.format(factor))
+        scale = runpy.run_path(str(path), run_name="scaling")["scale"]
+        compiled += [count for count, _ in compiler.compile_kernels()]
+        assert scale(5.0) == factor * 5
+    assert compiled == [1, 0, 1]

@@ -131,24 +131,24 @@ def test_closing_stops_source_and_thread() -> None:
     assert set(threading.enumerate()) <= before
 
 
-def test_hour_without_a_consumer_keeps_only_the_newest_frame() -> None:
-    """108,000 frames at 30 Hz arrive, and no thread takes any; every hundredth is late."""
+def test_ten_minutes_without_a_consumer_keep_only_the_newest_frame() -> None:
+    """18,000 frames at 30 Hz arrive, and no thread takes any; every hundredth is late."""
     references: list[weakref.ref[RGBDFrame]] = []
 
-    def hour() -> Iterator[RGBDFrame]:
-        for index in range(108_000):
+    def ten_minutes() -> Iterator[RGBDFrame]:
+        for index in range(18_000):
             frame = replace(FRAME, index=index, stamp=(index - 5 * (index % 100 == 99)) / 30)
             references.append(weakref.ref(frame))
             yield frame
 
-    captured = FrameCapture(hour(), accept, MONOTONIC_CLOCK)
+    captured = FrameCapture(ten_minutes(), accept, MONOTONIC_CLOCK)
     logging.disable(logging.WARNING)
     try:
         captured.start()
         captured._thread.join(60)
     finally:
         logging.disable(logging.NOTSET)
-    assert captured.rejected == 1080
-    assert [index for index, reference in enumerate(references) if reference() is not None] == [107_998]
+    assert captured.rejected == 180
+    assert [index for index, reference in enumerate(references) if reference() is not None] == [17_998]
     item = captured.frames.take()
-    assert item is not None and (item.frame.index, item.number) == (107_998, 108_000 - 1080)
+    assert item is not None and (item.frame.index, item.number) == (17_998, 18_000 - 180)

@@ -13,11 +13,12 @@ from nbclient import NotebookClient
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
 FEWER_FRAMES = {
+    "quickstart": {"FRAMES": 36},
     "correct_depth_bias": {"TEST": ("demo", range(60, 120, 4))},
     "learn_feature_uncertainty": {"TEST": [("demo", range(60, 120, 6))]},
     "learn_voting_thresholds": {"TEST": [("demo", range(60, 100, 4))]},
 }
-"""Settings of notebooks that replace those for readers: half as many frames are tracked after the training."""
+"""Settings of notebooks that replace those for readers: half as many frames are tracked."""
 
 
 @pytest.fixture(scope="module")

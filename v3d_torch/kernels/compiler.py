@@ -62,15 +62,51 @@ def kernel(signature: str) -> Callable[[_F], _F]:
 
         njit: Any = numba.njit  # its type lacks some options
         settings = vars(numba.config)
-        before, settings["CACHE_DIR"] = settings["CACHE_DIR"], str(_code_folder())
+        # numba before 0.62 does not know the second setting, and uses a subfolder of the first for each source folder.
+        changes = {"CACHE_DIR": str(_code_folder()), "CACHE_LOCATOR_CLASSES": f"{__name__}.{CodeLocator.__name__}"}
+        before = {name: settings.get(name, "") for name in changes}
+        settings.update(changes)
         try:
             compiled = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
         finally:
-            settings["CACHE_DIR"] = before
+            settings.update(before)
         _TO_COMPILE.append((compiled, signature))
         return cast("_F", compiled)
 
     return decorate
+
+
+class CodeLocator:
+    """Place of the compiled code of a function, for numba: the same for all copies of a source file.
+
+    numba's own locators depend on the path of the source file, so that each checkout and each environment would compile
+    the same kernels again. The methods are those of numba's cache locators.
+    """
+
+    def __init__(self, function: Callable[..., Any], source: str) -> None:
+        self._line = function.__code__.co_firstlineno
+        self._source = Path(source)
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], source: str) -> CodeLocator:
+        """Return the place of the code of a function."""
+        return cls(function, source)
+
+    def get_cache_path(self) -> str:
+        """Return the folder of the code."""
+        return str(_code_folder())
+
+    def ensure_cache_path(self) -> None:
+        """Create the folder, if something has deleted it."""
+        _code_folder().mkdir(parents=True, exist_ok=True)
+
+    def get_source_stamp(self) -> str:
+        """Return the hash of the source file; code of another version of the file is not used."""
+        return hashlib.sha256(self._source.read_bytes()).hexdigest()
+
+    def get_disambiguator(self) -> str:
+        """Return the line of the function, which distinguishes functions of the same name."""
+        return str(self._line)
 
 
 def device(function: _F) -> _F:
