@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -78,3 +80,33 @@ def test_state_is_transformed_with_the_world() -> None:
     torch.testing.assert_close(moved.position, T[:3, :3] @ later.position + T[:3, 3])
     assert moved.variances == later.variances
     assert torch.equal(state.covariance, state.covariance.T) and state.sigmas == (1.0, math.sqrt(2.0))
+
+
+def make_state() -> ObjectState:
+    position, velocity = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return ObjectState(1.0, position, velocity, (1.0, 0.1, 2.0), 1.5)
+
+
+def test_prediction_with_decay_is_the_same_in_one_step_and_in_two() -> None:
+    once = make_state().predict_with_decay(4.0, 0.7)
+    twice = make_state().predict_with_decay(1.4, 0.7).predict_with_decay(4.0, 0.7)
+    torch.testing.assert_close(once.position, twice.position)
+    torch.testing.assert_close(once.covariance, twice.covariance)
+
+
+def test_prediction_with_slow_decay_has_constant_velocity() -> None:
+    slow, constant = make_state().predict_with_decay(1.5, 1e4), make_state().predict(1.5)
+    torch.testing.assert_close(slow.position, constant.position, rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(slow.covariance, constant.covariance, rtol=1e-4, atol=0.0)
+
+
+def test_prediction_with_decay_stops_within_the_time_constant() -> None:
+    state = make_state()
+    later = state.predict_with_decay(100.0, 0.7)
+    torch.testing.assert_close(later.position, state.position + 0.7 * state.velocity)
+    assert later.sigmas[1] == pytest.approx(1.5 * math.sqrt(0.7 / 2))  # speed of a person
+
+
+def test_variance_of_the_motion_is_that_of_a_prediction_from_a_known_position() -> None:
+    state = replace(make_state(), variances=(0.0, 0.0, 2.0))
+    assert state.motion_variance(0.4) == pytest.approx(state.predict(1.4).variances[0])

@@ -230,7 +230,7 @@ class InstanceTracker(torch.nn.Module):
                 continue
             seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
-                track.vacant_time += stamp - self._last_stamp
+                track.add_vacancy(stamp, stamp - self._last_stamp)
             if track.vacant_time > _MAX_VACANT_TIME:
                 continue
             if stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:

@@ -33,21 +33,6 @@ class ConstantVelocityKalmanFilter:
         velocity = torch.zeros_like(position)
         self.state = ObjectState(0.0, position, velocity, (1.0, 0.0, 1.0), config.acceleration_noise)
 
-    def innovation(self, stamp: float, position: Tensor, sigma: float) -> tuple[Tensor, float]:
-        """Compare a measured position with its prediction, without an update.
-
-        Args:
-            stamp: Timestamp, seconds, not before the last one.
-            position: Measured position, world frame, metres, float64, shape :math:`(3,)`.
-            sigma: Standard deviation of each coordinate, metres.
-
-        Returns:
-            Measured minus predicted position, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
-            square metres.
-        """
-        predicted = self.state.predict(stamp)
-        return position - predicted.position, predicted.variances[0] + sigma**2
-
     def update(self, stamp: float, position: Tensor, sigma: float) -> None:
         """Update the state with a measured position.
 

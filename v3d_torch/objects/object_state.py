@@ -62,6 +62,32 @@ class ObjectState:
         variances = pp, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
         return replace(self, stamp=stamp, position=self.position + self.velocity * dt, variances=variances)
 
+    def motion_variance(self, seconds: float) -> float:
+        """Return the variance of each coordinate of the motion in a time, relative to the prediction, square metres."""
+        return seconds**2 * self.variances[2] + self.acceleration_noise**2 * seconds**3 / 3
+
+    def predict_with_decay(self, stamp: float, time_constant: float) -> ObjectState:
+        """Predict the state with a velocity that decays to zero, for longer times than `predict`.
+
+        The velocity is an Ornstein-Uhlenbeck process, as in the target model of Singer (1970), but one derivative
+        lower: the expected position converges, and its variance increases linearly instead of with the third power.
+
+        Args:
+            stamp: Timestamp, not earlier than that of the state, seconds.
+            time_constant: Time in which the expected velocity decays to 1/e, seconds.
+        """
+        dt, (pp, pv, vv) = stamp - self.stamp, self.variances
+        decay, noise = math.exp(-dt / time_constant), self.acceleration_noise**2
+        reach = time_constant * (1 - decay)
+        spread = time_constant * (time_constant * (dt - reach) - reach**2 / 2)
+        variances = (
+            pp + 2 * reach * pv + reach**2 * vv + noise * spread,
+            decay * (pv + reach * vv) + noise * reach**2 / 2,
+            decay**2 * vv + noise * time_constant * (1 - decay**2) / 2,
+        )
+        position, velocity = self.position + self.velocity * reach, self.velocity * decay
+        return replace(self, stamp=stamp, position=position, velocity=velocity, variances=variances)
+
     def transform(self, T_new_old: Tensor) -> ObjectState:
         """Transform the state into another world frame; the covariance is the same in all of them.
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
+from v3d_torch.objects.association import vacancy_log_ratio
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
@@ -21,6 +22,10 @@ mask contour is smaller."""
 _PARTIAL_SIGMA = 0.45
 """Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
 the hidden part: the centroid of a person who is cut off at the waist is off by a quarter of the body height."""
+
+_VELOCITY_TIME = 0.7
+"""Time constant of the velocity of an object that is not observed, seconds: most people stop or turn within a second.
+Together with the acceleration noise it implies a speed of about 1 m/s."""
 
 _MIN_CONFIRMED_SCORE = 0.75
 """Sum of the scores of the detections from which an object is confirmed: one strong detection or some weak ones."""
@@ -87,6 +92,7 @@ class Track:
         total_score: Sum of the scores of all detections.
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
         vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
+        vacancy: Evidence of this, see `vacancy_log_ratio`.
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
@@ -108,6 +114,7 @@ class Track:
     total_score: float = 0.0
     appearance: Tensor | None = None
     vacant_time: float = 0.0
+    vacancy: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
@@ -166,17 +173,18 @@ class Track:
         """
         return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
 
-    def innovation(self, detection: Detection3D) -> tuple[Tensor, float]:
-        """Compare the centroid of a detection with its prediction.
+    def predict_return(self, stamp: float) -> ObjectState:
+        """Predict the state of an object that is not observed any more, see `ObjectState.predict_with_decay`.
 
         Args:
-            detection: Detection, not older than the newest one.
-
-        Returns:
-            Measured minus predicted centroid, metres, float64, shape :math:`(3,)`, and the variance of each coordinate,
-            square metres.
+            stamp: Timestamp, seconds.
         """
-        return self._filter.innovation(detection.stamp, detection.centroid, self._centroid_sigma(detection))
+        return self._filter.state.predict_with_decay(stamp, _VELOCITY_TIME)
+
+    def centroid_sigma(self, detection: Detection3D) -> float:
+        """Return the standard deviation of each coordinate of the centroid of a detection, metres."""
+        fewer, more = sorted((len(detection.cloud), self._max_points))
+        return _CENTROID_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)
 
     def add_detection(self, detection: Detection3D) -> None:
         """Add a detection, update the Kalman filter, and drop detections older than the history.
@@ -185,13 +193,24 @@ class Track:
             detection: Detection, not older than the newest one.
         """
         self._max_points = max(self._max_points, len(detection.cloud))
-        self._filter.update(detection.stamp, detection.centroid, self._centroid_sigma(detection))
-        self.vacant_time = 0.0
+        self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
+        self.vacant_time = self.vacancy = 0.0
         self._remember_state()
         self.detections.append(detection)
         oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
+
+    def add_vacancy(self, stamp: float, seconds: float) -> None:
+        """Record that the predicted place was observed to be empty.
+
+        Args:
+            stamp: Timestamp of the observation, seconds.
+            seconds: Time since the observation before.
+        """
+        self.vacant_time += seconds
+        evidence = vacancy_log_ratio(self.vacant_time, self._filter.state.motion_variance(stamp - self.newest.stamp))
+        self.vacancy = min(self.vacancy, evidence)
 
     def drop_masks(self) -> None:
         """Drop the masks: the object is not detected, and not predicted either."""
@@ -276,8 +295,3 @@ class Track:
         if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
             oldest = state.stamp - _STATE_HISTORY
             self.history = [each for each in self.history if each.stamp >= oldest] + [state]
-
-    def _centroid_sigma(self, detection: Detection3D) -> float:
-        """Return the standard deviation of each coordinate of the centroid of a detection, metres."""
-        fewer, more = sorted((len(detection.cloud), self._max_points))
-        return _CENTROID_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)

@@ -17,9 +17,10 @@ from v3d_torch.objects.association import (
     class_log_ratio,
     overlap_log_ratio,
     position_log_ratio,
-    vacancy_log_ratio,
+    score_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.types import Instances
@@ -45,6 +46,7 @@ class DetectedInstances:
     Attributes:
         stamp: Timestamp, seconds.
         labels: Class of each of N instances, int64, shape :math:`(N,)`.
+        scores: Score of each instance, 0 if it has none, float32, shape :math:`(N,)`.
         detections: Detections of the instances.
         masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
         appearance: Colour histograms, float32, shape :math:`(N, D)`; NaN if unknown.
@@ -52,6 +54,7 @@ class DetectedInstances:
 
     stamp: float
     labels: Tensor
+    scores: Tensor
     detections: Sequence[Detection3D]
     masks: Tensor
     appearance: Tensor
@@ -109,6 +112,7 @@ def detect_instances(
     return DetectedInstances(
         stamp,
         instances.labels,
+        instances.scores,
         detections,
         pack_masks(instances.masks, stride),
         torch.full((len(detections), HISTOGRAM_SIZE), torch.nan) if appearance is None else appearance,
@@ -175,13 +179,16 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     )
     same_class = _same_class(predicted.tracks, detected)
     beside = predicted.visible[:, None] & (coverage < _MAX_BESIDE_COVERAGE)
-    near = _within_gate(predicted.tracks, detected, config) & ~beside
+    states = [track.predict_state(detected.stamp) for track in predicted.tracks]
+    near = _within_gate(predicted.tracks, states, detected, config) & ~beside
     possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
     visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
     evidence = (
-        _position_evidence(predicted.tracks, detected, possible)
+        _position_evidence(predicted.tracks, states, detected, possible)
         + overlap_log_ratio(coverage, overlap, visible)
-        + _other_evidence(predicted.tracks, detected, same_class)
+        + _appearance_evidence(predicted.tracks, detected)
+        + class_log_ratio(same_class)
+        + torch.tensor([[track.vacancy] for track in predicted.tracks], dtype=torch.float64)
     )
     return evidence.masked_fill(~possible, -torch.inf)
 
@@ -198,37 +205,50 @@ def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, 
         Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
     """
     same_class = _same_class(tracks, detected)
-    possible = same_class & _within_gate(tracks, detected, config)
-    evidence = _position_evidence(tracks, detected, possible) + _other_evidence(tracks, detected, same_class)
+    states = [track.predict_return(detected.stamp) for track in tracks]
+    possible = same_class & _within_gate(tracks, states, detected, config)
+    evidence = (
+        _position_evidence(tracks, states, detected, possible)
+        + _appearance_evidence(tracks, detected)
+        + class_log_ratio(same_class)
+        + score_log_ratio(detected.scores)
+    )
     return evidence.masked_fill(~possible, -torch.inf)
 
 
-def _position_evidence(tracks: Sequence[Track], detected: DetectedInstances, possible: Tensor) -> Tensor:
-    """Evidence of the positions of possible pairs, 0 for other pairs, shape (T, N)."""
+def _position_evidence(
+    tracks: Sequence[Track], states: Sequence[ObjectState], detected: DetectedInstances, possible: Tensor
+) -> Tensor:
+    """Evidence of the positions of possible pairs with the predicted states, 0 for other pairs, shape (T, N)."""
     squared_distance = torch.full(possible.shape, torch.nan, dtype=torch.float64)
     variance = torch.ones_like(squared_distance)
     for i, j in possible.nonzero().tolist():
-        difference, variance[i, j] = tracks[i].innovation(detected.detections[j])
-        squared_distance[i, j] = difference.square().sum()
+        detection = detected.detections[j]
+        squared_distance[i, j] = (detection.centroid - states[i].position).square().sum()
+        variance[i, j] = states[i].variances[0] + tracks[i].centroid_sigma(detection) ** 2
     return position_log_ratio(squared_distance, variance)
 
 
-def _other_evidence(tracks: Sequence[Track], detected: DetectedInstances, same_class: Tensor) -> Tensor:
-    """Evidence of appearance, class and vacancy, shape (T, N)."""
+def _appearance_evidence(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
+    """Evidence of appearance, shape (T, N)."""
     unknown = torch.full((HISTOGRAM_SIZE,), torch.nan)
     appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
     similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
-    vacant_time = torch.tensor([[track.vacant_time] for track in tracks], dtype=torch.float64)
-    return appearance_log_ratio(similarity) + class_log_ratio(same_class) + vacancy_log_ratio(vacant_time)
+    elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
+    tracked = torch.tensor([[len(track.newest.cloud)] for track in tracks], dtype=torch.float64)
+    points = torch.tensor([len(detection.cloud) for detection in detected.detections], dtype=torch.float64)
+    return appearance_log_ratio(similarity, elapsed, torch.minimum(tracked, points), torch.maximum(tracked, points))
 
 
 def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
     return torch.tensor([track.label for track in tracks])[:, None] == detected.labels
 
 
-def _within_gate(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+def _within_gate(
+    tracks: Sequence[Track], states: Sequence[ObjectState], detected: DetectedInstances, config: TrackerConfig
+) -> Tensor:
     """Mask of the pairs whose distance is within the maximum motion of the track, bool, shape (T, N)."""
-    predicted = torch.stack([track.predict_state(detected.stamp).position for track in tracks])
+    predicted = torch.stack([state.position for state in states])
     observed = torch.stack([detection.centroid for detection in detected.detections])
     elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
     return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * elapsed
