@@ -28,8 +28,8 @@ class TrackedObject:
     Attributes:
         id: Number of the object.
         label: COCO class index; see `name` for the class name.
-        mask: Pixels of the object, bool, shape :math:`(H, W)`; empty if it is hidden, or missed for more than 0.1 s: later
-            predictions are seldom right. ``static_mask`` of `FrameObjects` leaves these out nevertheless.
+        mask: Pixels of the object, bool, shape :math:`(H, W)`; empty if it is hidden, or missed for more than 0.1 s,
+            because later predictions are seldom right. ``static_mask`` of `FrameObjects` leaves these out nevertheless.
         state: Position and velocity with their covariance at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the baselines.

@@ -31,10 +31,11 @@ _COARSE_COLUMNS = 160
 """Number of columns of the coarse masks that are compared: the resolution of the network's own masks."""
 
 _DUPLICATE_COVERAGE = 0.7
-"""An unmatched instance of which a larger fraction lies within a matched one of its class is a part of that object."""
+"""An unmatched instance is a second detection of an object if the mask of a matched instance of the class and its own
+have more than this fraction of the smaller one in common: the network finds a part of a person, or all and a part."""
 
 _DUPLICATE_DISTANCE = 0.5
-"""Maximum distance of the centroids of an object and a part of it, metres."""
+"""Maximum distance of the centroids of two detections of an object, metres."""
 
 _MIN_FREE_FRACTION = 0.5
 """The predicted place of a missed object is empty if the camera sees through more than this fraction of its points."""
@@ -123,11 +124,11 @@ class InstanceTracker(torch.nn.Module):
         predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._voxel_size, stride)
         matches = self._match(predicted, detected)
 
-        # Update matched tracks, and start a track for each instance without a match that is not a part of another one.
+        # Update matched tracks, and start a track for each instance without a match, unless it shows a matched object.
         updated: list[Track] = []
         for i, detection in enumerate(detected.detections):
             track = matches.get(i)
-            if track is None and self._is_part(i, matches, detected):
+            if track is None and self._is_duplicate(i, matches, detected):
                 continue
             masks = instances.masks[i], clouds.cloud_pixels[i], detected.masks[i]
             track = track or self._start_track(stamp, masks)
@@ -195,14 +196,15 @@ class InstanceTracker(torch.nn.Module):
             self.tracks.append(track)
         return found
 
-    def _is_part(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
-        """Check whether most of an instance lies within a matched instance of the same class and place."""
-        centroid = detected.detections[i].centroid
-        mask = detected.masks[i : i + 1]
-        minimum = _DUPLICATE_COVERAGE * int(count_pixels(mask))
+    def _is_duplicate(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
+        """Check whether an instance shows the object of a matched instance of the same class, or a part of it."""
+        centroid, mask = detected.detections[i].centroid, detected.masks[i : i + 1]
+        common = count_common_pixels(mask, detected.masks)[0]
+        smaller = torch.minimum(count_pixels(mask), count_pixels(detected.masks))
+        contained = common > _DUPLICATE_COVERAGE * smaller
         return any(
-            detected.labels[j] == detected.labels[i]
-            and int(count_common_pixels(mask, detected.masks[j : j + 1])) > minimum
+            bool(contained[j])
+            and detected.labels[j] == detected.labels[i]
             and not float((centroid - detected.detections[j].centroid).norm()) > _DUPLICATE_DISTANCE
             for j in matches
         )
