@@ -32,6 +32,7 @@ VARIANTS = {
     "no_voting": "no votes",
     "no_chamfer": "no Chamfer distance",
     "no_prediction": "no prediction of missed objects",
+    "no_appearance": "no colours in the assignment of ids",
     "no_unlabelled": "no unlabelled instances",
     "not_upright": "images not rotated upright",
     "global_shutter": "no model of the rolling shutter",

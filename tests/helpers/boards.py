@@ -70,7 +70,7 @@ def render_turned(boards: list[Board], T_wc: Tensor) -> tuple[Tensor, Instances]
 class BoardTracker:
     """Tracker that processes one set of boards after another."""
 
-    def __init__(self, rate: float = 30.0, **config: float) -> None:
+    def __init__(self, rate: float = 30.0, **config: float | bool) -> None:
         self.rate = rate
         self.frame = -1
         self.tracker = InstanceTracker(TrackerConfig(**config), CAMERA, CLOUDS.voxel_size)
@@ -79,5 +79,17 @@ class BoardTracker:
     def __call__(self, *boards: Board, T_wc: Tensor = HERE, stamp: float | None = None) -> list[Track]:
         self.frame += 1
         stamp = self.frame / self.rate if stamp is None else stamp
-        depth, instances = render(list(boards), T_wc)
-        return self.tracker(stamp, instances, self._back_project(depth, instances), depth, T_wc)
+        return self.track(*render(list(boards), T_wc), stamp, T_wc=T_wc)
+
+    def track(
+        self,
+        depth: Tensor,
+        instances: Instances,
+        stamp: float,
+        *,
+        T_wc: Tensor = HERE,
+        appearance: Tensor | None = None,
+    ) -> list[Track]:
+        """Process a depth image with its instances."""
+        clouds = self._back_project(depth, instances)
+        return self.tracker(stamp, instances, clouds, depth, T_wc, appearance)

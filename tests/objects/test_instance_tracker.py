@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.objects.appearance import HISTOGRAM_SIZE
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.track import Track
 from v3d_torch.types import Instances
@@ -72,6 +73,33 @@ def test_ids_are_kept_under_flickering_class_and_label_is_the_most_frequent() ->
         assert at(tracks, Board(0.7)).id == 2
     assert tracks[0].label == PERSON
     assert tracks[0].labels == {PERSON: 4, DOG: 2, CHAIR: 1}
+
+
+@pytest.mark.parametrize("visible", [slice(40), slice(60)], ids=["upper part", "all but the feet"])
+def test_second_detection_of_an_object_starts_no_track(visible: slice) -> None:
+    """The network finds a part of a person, and in some frames the whole person as well."""
+    track_boards = BoardTracker()
+    depth, whole = render([Board(0.0, height=1.2)])
+    part = replace(whole, masks=torch.zeros_like(whole.masks))
+    part.masks[:, visible] = whole.masks[:, visible]
+    both = part.concatenate(whole)
+    for frame in range(6):
+        tracks = track_boards.track(depth, both if frame % 2 else part, frame / 30)
+        assert [track.id for track in tracks] == [1]
+
+
+@pytest.mark.parametrize("compared", [True, False])
+def test_colours_decide_between_two_people_who_return(compared: bool) -> None:
+    """A curtain hides both for a second; then each one is at the place of the other one."""
+    track_boards = BoardTracker(compare_appearance=compared)
+    colours = torch.eye(HISTOGRAM_SIZE)[:2]
+    left, right = Board(-0.3), Board(0.3)
+    curtain = Board(0.0, z=1.5, width=2.0, height=2.0, detected=False)
+    for boards, first, last in (((left, right), 0, 6), ((curtain,), 6, 36), ((right, left), 36, 37)):
+        depth, instances = render(list(boards))
+        for frame in range(first, last):
+            tracks = track_boards.track(depth, instances, frame / 30, appearance=colours[: len(instances)])
+    assert [at(tracks, board).id for board in (right, left)] == ([1, 2] if compared else [2, 1])
 
 
 def test_class_decides_between_two_equally_distant_instances() -> None:

@@ -102,6 +102,8 @@ class TrackerConfig(Section):
     max_lost_time: float = Field(5.0, ge=0)
     """Time after `max_missed_time` in which an object that reappears keeps its id, seconds: people walk behind others,
     or leave the view of a camera that turns. Appearance and position have to match. 0 in the ablation."""
+    compare_appearance: bool = True
+    """Compare the colours of instances with those of objects. False in the ablation."""
 
 
 class VotingConfig(Section):

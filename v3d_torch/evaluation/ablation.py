@@ -22,6 +22,7 @@ VARIANTS = (
     "no_voting",
     "no_chamfer",
     "no_prediction",
+    "no_appearance",
     "no_unlabelled",
     "not_upright",
     "global_shutter",

@@ -120,7 +120,8 @@ class InstanceTracker(torch.nn.Module):
             Tracks that were detected, or may move and were missed for at most the maximum time, sorted by id.
         """
         camera, stride = self._camera, self._stride
-        detected = detect_instances(stamp, instances, clouds, appearance, T_wc, stride)
+        compared = appearance if self._config.compare_appearance else None
+        detected = detect_instances(stamp, instances, clouds, compared, T_wc, stride)
         predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._voxel_size, stride)
         matches = self._match(predicted, detected)
 
