@@ -485,7 +485,7 @@ def test_missed_object_that_stopped_is_static_at_once() -> None:
 
 
 def test_static_mask_excludes_moving_and_unknown_objects_only() -> None:
-    """The background is metres behind the objects: only the dilation of 2 pixels masks a part of it."""
+    """The background is metres behind the objects: only the dilation of 1 pixel masks a part of it."""
     things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)), swaying_person((1.0, 0.0, 2.0)))
     frame = simulate(*things, seconds=0.9)[-1]
     assert [frame[number].motion_state for number in (4, 5)] == [MotionState.DYNAMIC, MotionState.DEFORMING]
@@ -493,10 +493,10 @@ def test_static_mask_excludes_moving_and_unknown_objects_only() -> None:
     assert [late[number].motion_state for number in (4, 5)] == [MotionState.UNKNOWN, MotionState.UNKNOWN]
     for shown in (frame, late):
         distance = distance_to(shown.owner >= 3)
-        assert not shown.result.static_mask[distance <= 1].any()  # a side seen at a grazing angle is not in the cloud
-        assert shown.result.static_mask[distance >= 3].all()
+        assert not shown.result.static_mask[distance == 0].any()
+        assert shown.result.static_mask[distance >= 2].all()
         # Chairs stay in the static mask.
-        assert int(((shown.owner >= 0) & (shown.owner < 3) & (distance >= 3)).sum()) > 500
+        assert int(((shown.owner >= 0) & (shown.owner < 3) & (distance >= 2)).sum()) > 500
 
 
 @pytest.mark.parametrize("mask_growth", [-3, 4])
@@ -507,8 +507,9 @@ def test_refined_mask_follows_the_depth(mask_growth: int) -> None:
         assert frame[3].motion_state is not MotionState.STATIC
         assert int((frame[3].mask ^ (frame.owner == 2)).sum()) > 250  # the mask is wrong
         distance = distance_to(frame.owner == 2)
-        assert not frame.result.static_mask[distance <= 1].any()  # a side seen at a grazing angle is not in the cloud
-        assert frame.result.static_mask[distance >= 3].all()
+        # A side seen at a grazing angle is not in the cloud.
+        assert not frame.result.static_mask[distance_to(frame.owner != 2) > 1].any()
+        assert frame.result.static_mask[distance >= 2].all()
 
 
 def test_depth_margin_limits_the_refined_mask() -> None:
@@ -569,8 +570,8 @@ def test_static_person_is_in_static_mask_but_not_in_mask_without_people() -> Non
     assert frame[2].motion_state is MotionState.STATIC
     assert result.static_mask.all()
     distance = distance_to(frame.owner == 1)
-    assert not result.static_without_people[distance <= 2].any()
-    assert result.static_without_people[distance >= 3].all()
+    assert not result.static_without_people[distance <= 3].any()
+    assert result.static_without_people[distance >= 5].all()
 
 
 def test_missed_walker_continues_as_unlabelled_instance() -> None:

@@ -179,8 +179,12 @@ class StaticMaskConfig(Section):
     between steps. An object other than a person becomes static as soon as it is observed at rest."""
     confirm_dynamic_frames: int = Field(2, gt=0)
     """Number of frames with evidence before a dynamic state is held: evidence in a single frame can be depth noise."""
-    dilation: int = Field(2, ge=0, le=100)
-    """Dilation of masks regardless of depth, pixels: the alignment error of colour and depth."""
+    dilation: int = Field(1, ge=0, le=100)
+    """Dilation of masks regardless of depth, pixels: the alignment error of colour and depth. One more pixel takes
+    a large part of the static pixels in a dense crowd."""
+    map_dilation: int = Field(4, ge=0, le=100)
+    """Dilation of the masks of moving objects and people for the map, pixels: depth is wrong at their edges, and the
+    map can take the pixels beside them from another frame."""
     depth_margin: int = Field(8, ge=0, le=100)
     """Dilation of masks over pixels with the depth of the object or without depth, pixels: a network mask at a quarter
     of the resolution is off by about two of its pixels."""

@@ -69,7 +69,7 @@ class FrameObjects:
     Attributes:
         objects: Objects, sorted by id.
         static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
-        static_without_people: Pixels of ``static_mask`` that show no person, not even a static one, for the coloured
+        static_without_people: Pixels farther from moving objects and from people, static ones too, for the coloured
             map; bool, shape :math:`(H, W)`.
         vote_pairs: Votes that counted over any baseline: id of the voting object and id of the object voted for,
             sorted.

@@ -23,7 +23,8 @@ class StaticMasks(NamedTuple):
 
     Attributes:
         static: Pixels outside of all excluded objects, bool, shape :math:`(H, W)`.
-        without_people: Pixels of ``static`` outside of all people, bool, shape :math:`(H, W)`.
+        without_people: Pixels outside of all excluded objects and people, at a larger distance, bool, shape
+            :math:`(H, W)`.
     """
 
     static: Tensor
@@ -52,11 +53,11 @@ def static_masks(
     tracks = list(dict.fromkeys([*excluded, *people]))
     refiner = MaskRefiner(tracks, view, newly_occupied, config.static_mask, camera, config.clouds.voxel_size)
     masks = {track: refiner.refine(track) for track in tracks}
-    size, dilation = view.depth.shape[-2:], config.static_mask.dilation
-    static = _outside([masks[track] for track in excluded], size, dilation)
-    is_excluded = set(excluded)
-    others = [masks[track] for track in people if track not in is_excluded]
-    return StaticMasks(static, static & _outside(others, size, dilation) if others else static.clone())
+    size, margins = view.depth.shape[-2:], config.static_mask
+    return StaticMasks(
+        static=_outside([masks[track] for track in excluded], size, margins.dilation),
+        without_people=_outside(list(masks.values()), size, margins.map_dilation),
+    )
 
 
 def _outside(masks: list[Tensor], size: torch.Size, dilation: int) -> Tensor:
