@@ -42,8 +42,8 @@ _MIN_MISSED_SCORE = 0.3
 or one strong one: the network labels rotated furniture as people in single frames."""
 
 _MAX_SHOWN_TIME = 0.1
-"""A missed object is shown for this long, seconds. Half of the predicted masks of people are right (IoU with the true
-mask at least 0.5) until then, one of fourteen later. Tracking leaves out the pixels of all predicted masks."""
+"""A missed object is shown for this long, seconds: who is missed for longer mostly is hidden or has turned, so that the
+predicted mask is wrong. Tracking leaves out the pixels of all predicted masks nevertheless."""
 
 
 class MotionClassifier:
