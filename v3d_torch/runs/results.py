@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Sized
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -216,12 +217,18 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "peak_memory_mb": _peak_memory_mb(),
         "seed": slam.config.seed,
         "stages": slam.config.stages.paths,
-        "versions": {
-            "v3d-torch": version("v3d-torch"),
-            "python": platform.python_version(),
-            **{name: version(name) for name in _LIBRARIES},
-        },
+        "versions": _versions(),
         "machine": {"processor": platform.machine(), "system": platform.system(), "threads": slam.config.threads},
+    }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Return the versions of the package, of Python and of the libraries."""
+    return {
+        "v3d-torch": version("v3d-torch"),
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
     }
 
 
