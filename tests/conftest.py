@@ -8,9 +8,13 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-import torch
 import typer.testing
 from rich.console import Console
+
+# Threads that wait for each other would keep cores busy that other workers of the tests need. Read by torch's OpenMP.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import torch
 
 from v3d_torch.io.download import cache_dir
 
