@@ -27,7 +27,7 @@ def select_frames(sequence: Path, folder: Path, frames: range) -> Path:
 
 @pytest.fixture(scope="module")
 def run(real_sequence: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Function that runs frames of a sequence with the command in this process, without figures; returns the metrics."""
+    """Function that runs frames of a sequence with the command, here and without figures, and returns its metrics."""
 
     def run_sequence(name: str, *options: str, frames: range) -> dict[str, Any]:
         out = tmp_path_factory.mktemp(name)
