@@ -12,6 +12,8 @@ from helpers.commands import call_here
 
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 Run = Callable[..., dict[str, Any]]
 
 
@@ -27,14 +29,12 @@ def select_frames(sequence: Path, folder: Path, frames: range) -> Path:
 
 @pytest.fixture(scope="module")
 def run(real_sequence: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Function that runs frames of a sequence with the command, here and without figures, and returns its metrics."""
+    """Function that runs frames of a sequence with the command, in this process, and returns its metrics."""
 
     def run_sequence(name: str, *options: str, frames: range) -> dict[str, Any]:
         out = tmp_path_factory.mktemp(name)
         folder = select_frames(real_sequence(name), tmp_path_factory.mktemp("some") / name, frames)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
-            done = call_here("--seq", folder, "--out", out, *options, cwd=out)
+        done = call_here("--seq", folder, "--out", out, *options, cwd=out)
         assert done.exit_code == 0, done.stderr
         metrics: dict[str, Any] = json.loads((out / "metrics.json").read_text())
         associated = (folder / "associations.txt").read_text().splitlines()
