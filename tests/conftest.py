@@ -23,10 +23,13 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "kernels"))
 typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[attr-defined]
 
 SLOWEST = (
-    *("test_real_sequences.py", "batch/test_ray_executor.py", "test_corpus.py", "cli/test_batch.py", "cli/test_run.py"),
-    *("project/test_notebooks.py", "cli/test_run_resume.py", "cli/test_ablate.py", "project/test_module_table.py"),
-    *("cli/test_report.py", "objects/test_classified_scenes.py", "project/test_privacy.py", "test_determinism.py"),
-    *("tracking/test_lost_camera.py", "backend/test_closed_loop.py", "test_slam.py", "viz/test_rerun_viewer.py"),
+    *("batch/test_ray_executor.py", "test_corpus.py", "cli/test_run.py", "project/test_notebooks.py"),
+    *("project/test_module_table.py", "objects/test_classified_scenes.py", "project/test_privacy.py"),
+    *("cli/test_batch.py", "test_real_sequences.py", "cli/test_run_resume.py", "cli/test_report.py"),
+    *("objects/test_motion_classifier.py", "cli/test_ablate.py", "tracking/test_lost_camera.py"),
+    *("backend/test_closed_loop.py", "project/test_docs.py", "live/test_interruptions.py", "cli/test_own_stages.py"),
+    *("test_determinism.py", "test_modules.py", "project/test_any_bytes.py", "project/test_benchmarks.py"),
+    *("segmentation/test_yolo.py", "odometry/test_dense_aligner.py", "viz/test_rerun_viewer.py"),
 )
 """Files that run first, so that several workers (``-n 2``) finish at about the same time."""
 
