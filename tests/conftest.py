@@ -3,42 +3,50 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
-import torch
 import typer.testing
+from filelock import FileLock
 from rich.console import Console
 
 from v3d_torch.io.download import cache_dir
 
+# Threads that wait for each other would keep cores busy that other workers of the tests need. Read by torch's OpenMP.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Commands that tests start with caches of their own share the compiled kernels; read when kernels are imported.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "kernels"))
-
-from helpers.demo_frames import copy_frames
-
-import v3d_torch.slam  # noqa: F401 - registers the kernels
-from v3d_torch.runs.kernel_compilation import compile_kernels
-
-torch.set_num_threads(1)
 
 # A call of a command in a test would build the command from its signature, which takes longer than many a command.
 typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[attr-defined]
 
 SLOWEST = (
-    *("test_real_sequences.py", "batch/test_ray_executor.py", "test_corpus.py", "cli/test_batch.py", "cli/test_run.py"),
-    *("project/test_notebooks.py", "cli/test_run_resume.py", "cli/test_ablate.py", "project/test_module_table.py"),
-    *("cli/test_report.py", "objects/test_classified_scenes.py", "project/test_privacy.py", "test_determinism.py"),
-    *("tracking/test_lost_camera.py", "backend/test_closed_loop.py", "test_slam.py", "viz/test_rerun_viewer.py"),
+    *("batch/test_ray_executor.py", "test_corpus.py", "cli/test_run.py", "project/test_notebooks.py"),
+    *("project/test_module_table.py", "objects/test_classified_scenes.py", "project/test_privacy.py"),
+    *("cli/test_batch.py", "test_real_sequences.py", "cli/test_run_resume.py", "cli/test_report.py"),
+    *("objects/test_motion_classifier.py", "cli/test_ablate.py", "tracking/test_lost_camera.py"),
+    *("backend/test_closed_loop.py", "project/test_docs.py", "live/test_interruptions.py", "cli/test_own_stages.py"),
+    *("test_determinism.py", "test_modules.py", "project/test_any_bytes.py", "project/test_benchmarks.py"),
+    *("segmentation/test_yolo.py", "odometry/test_dense_aligner.py", "viz/test_rerun_viewer.py"),
 )
 """Files that run first, so that several workers (``-n 2``) finish at about the same time."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compile all kernels before the tests, whose time is limited; with ``-n``, once and not in each worker."""
-    if not hasattr(config, "workerinput"):
+    """Compile all kernels before the tests, whose time is limited; with ``-n``, the first worker does it."""
+    if config.getoption("numprocesses", None):  # this process starts the workers, and runs no tests
+        return
+    # Imports that take seconds.
+    import torch
+
+    import v3d_torch.slam  # noqa: F401 - registers the kernels
+    from v3d_torch.runs.kernel_compilation import compile_kernels
+
+    torch.set_num_threads(1)
+    cache_dir().mkdir(parents=True, exist_ok=True)
+    with FileLock(cache_dir() / "kernels-of-tests.lock"):
         compile_kernels(Console(quiet=True))
 
 
@@ -59,9 +67,19 @@ collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
 @pytest.fixture(scope="session")
 def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of six frames of the demo with true masks, in which the walker is in the middle of the room."""
+    from helpers.demo_frames import copy_frames
+
     folder = tmp_path_factory.mktemp("sequences") / "moment"
     copy_frames(folder, range(52, 58))
     return folder
+
+
+@pytest.fixture(scope="module")
+def no_figures() -> Iterator[None]:
+    """Runs without figures, which take half of the time of short runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
+        yield
 
 
 @pytest.fixture(scope="session")

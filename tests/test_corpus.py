@@ -23,7 +23,7 @@ CASES = [
     for category, cases in CATEGORIES.items()
     for case in cases
 ]
-WITH_FIGURES = {"image content", "sequence names", "results and permissions"}
+WITH_FIGURES = {"image content", "sequence names"}
 """Categories whose runs draw figures. Drawing takes most of the time of such short runs."""
 
 SHELL = {

@@ -21,8 +21,8 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
 CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, readout=0.0)
-FRAMES = 60
-"""Frames of one lap: 6 degrees and 7.5 cm per frame."""
+FRAMES = 48
+"""Frames of one lap: 7.5 degrees and 9.4 cm per frame."""
 
 
 def true_pose(frame: int) -> np.ndarray:

@@ -25,6 +25,9 @@ from v3d_torch.io.ply import read_ply_points
 FRAMES = 12
 
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
+
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "walk"

@@ -85,6 +85,13 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def reported(results: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """Copy of the results with a page that the command has written, and the output of the command."""
+    folder = shutil.copytree(results, tmp_path_factory.mktemp("reported") / "copy <b>&")
+    return folder, call(folder)
+
+
 @pytest.fixture
 def copy(results: Path, tmp_path: Path) -> Path:
     return shutil.copytree(results, tmp_path / "copy <b>&")
@@ -113,11 +120,11 @@ def page_of(folder: Path, groundtruth: Path | None = None) -> Page:
 # --- a page
 
 
-def test_command_writes_one_self_contained_page(copy: Path) -> None:
-    done = call(copy)
+def test_command_writes_one_self_contained_page(reported: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    folder, done = reported
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"report: {copy / 'report.html'}\n"
-    html = (copy / "report.html").read_text(encoding="utf-8")
+    assert done.stdout == f"report: {folder / 'report.html'}\n"
+    html = (folder / "report.html").read_text(encoding="utf-8")
     page = Page(html)
     assert html.startswith("<!doctype html>")
     assert all(url.startswith(("data:image/", "#")) for url in page.urls), page.urls
@@ -125,7 +132,7 @@ def test_command_writes_one_self_contained_page(copy: Path) -> None:
     assert not re.search(r"url\((?!#)", html)
     assert page.images == 4  # masks, objects, votes, clusters
     assert "copy <b>& " in page.text  # escaped, so not parsed as markup
-    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics = json.loads((folder / "metrics.json").read_text())
     for number in (f"{metrics['ate']['rmse']:.4f} m", f"{metrics['rpe']['trans']['rmse']:.4f} m/s", f"{FRAMES} of"):
         assert number in page.text
     for words in (
@@ -151,15 +158,15 @@ def test_page_has_name_of_resolved_folder(copy: Path, tmp_path: Path, monkeypatc
         assert "A run of V3D-SLAM, copy <b>&" in page_of(folder).text
 
 
-def test_plots_are_valid_svg_and_reproducible(results: Path) -> None:
-    html = render_page(read_run(results))
+def test_plots_are_valid_svg_and_reproducible(reported: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    html = (reported[0] / "report.html").read_text(encoding="utf-8")
     plots = re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL)
     assert len(plots) == 8  # trajectory, positions, errors, statuses, masks, objects, stage bars, stages over time
     for plot in plots:
         ET.fromstring(plot)  # noqa: S314
     references, ids = set(re.findall(r'href="#([^"]+)"', html)), set(re.findall(r' id="([^"]+)"', html))
     assert references <= ids
-    assert render_page(read_run(results)) == html
+    assert render_page(read_run(reported[0])) == html  # of another process
 
 
 def test_errors_equal_those_of_the_run(results: Path) -> None:

@@ -19,9 +19,9 @@ import pandas as pd
 import plyfile
 import pytest
 from helpers.bag_messages import read_with_mcap
-from helpers.commands import RUN_FILES, assert_error_line, call, call_here, command, environment, files_in
+from helpers.commands import RUN_FILES, assert_error_line, call, call_here, environment, files_in
 from helpers.demo_frames import copy_frames
-from helpers.forked_command import call_forked
+from helpers.forked_command import call_forked, start_forked
 from typer.testing import Result
 
 from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
@@ -310,16 +310,18 @@ def test_failed_download_is_reported_and_leaves_no_files(tmp_path: Path) -> None
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
 def test_ctrl_c_keeps_partial_results(sequence: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    arguments = command("--seq", sequence, "--segmenter", "none", "--save-masks", "--out", out)
-    with subprocess.Popen(  # noqa: S603
-        arguments, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        deadline = time.monotonic() + 100
-        while len(list((out / "masks").glob("[0-9]*.png"))) < 3 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=100)
-    assert_error_line(subprocess.CompletedProcess(arguments, process.returncode, stdout, stderr), "interrupted after")
+    process = start_forked(
+        *("--seq", sequence, "--segmenter", "none", "--save-masks", "--out", out), cwd=tmp_path, output=tmp_path
+    )
+    deadline = time.monotonic() + 100
+    while len(list((out / "masks").glob("[0-9]*.png"))) < 3 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGINT)
+    process.join(timeout=100)
+    assert process.exitcode == 2
+    stdout, stderr = ((tmp_path / name).read_text() for name in ("stdout", "stderr"))
+    assert_error_line(subprocess.CompletedProcess([], 2, stdout, stderr), "interrupted after")
     assert "results" in stderr
     metrics = json.loads((out / "metrics.json").read_text())
     assert 3 <= metrics["processed"] < 30

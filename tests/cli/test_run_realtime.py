@@ -23,6 +23,8 @@ from v3d_torch.datasets.demo.sequence import FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 FRAMES = 24
 
 

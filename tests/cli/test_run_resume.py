@@ -31,6 +31,8 @@ from v3d_torch.io.state_file import VERSION
 from v3d_torch.runs.checkpoint import CHECKPOINT
 from v3d_torch.runs.stored_run import read_run
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 FRAMES = 20
 CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_fraction=1")
 DEFAULT_RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply")
@@ -40,14 +42,6 @@ RESULTS = (*DEFAULT_RESULTS, "mesh.ply", "occupancy.npz", "occupancy.bt")
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_walker(tmp_path_factory.mktemp("sequences") / "seq", FRAMES)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_figures() -> Iterator[None]:
-    """Skip the figures, which take most of the time of such short runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
-        yield
 
 
 def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:

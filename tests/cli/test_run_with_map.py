@@ -32,6 +32,9 @@ def join_trajectories(*paths: Path) -> Trajectory:
     return Trajectory(torch.cat([part.stamps for part in parts]), torch.cat([part.T_wc for part in parts]))
 
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
+
 @pytest.fixture(scope="module")
 def halves(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two overlapping recordings of a wall; the second is recorded a minute later."""

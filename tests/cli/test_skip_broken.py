@@ -26,6 +26,8 @@ from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import batch, run
 from v3d_torch.datasets.stored import max_broken_frames
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 FRAMES = 16
 BROKEN = {
     0: "rgb/1305031102.000000.png: is truncated or damaged",
@@ -37,14 +39,6 @@ BROKEN = {
 """Broken frames of the sequence, and the beginning of their messages."""
 
 GOOD = [index for index in range(FRAMES) if index not in BROKEN]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_figures() -> Iterator[None]:
-    """Skip the figures, which take most of the time of such short runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -311,6 +311,7 @@ def run(folder: Path, out: Path) -> dict[str, object]:
     return json.loads((out / "metrics.json").read_text())
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_run_is_scored_and_does_not_depend_on_ground_truth_masks(folder: Path, tmp_path: Path) -> None:
     for path in (folder / "masks").iterdir():  # the same person in all frames
         write_png(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED).clip(0, 1))

@@ -316,12 +316,15 @@ class Frame:
     owner: Tensor
     detected: list[int]
     result: FrameObjects
+    _found: dict[int, TrackedObject | None] = field(default_factory=dict)
 
     def find(self, thing: int) -> TrackedObject | None:
         """Return the detected object that best overlaps the visible part of a thing, None without a clear overlap."""
-        objects = [obj for obj in self.result.objects if not obj.missed]
-        best = max(objects, key=lambda obj: self.overlap(obj, thing), default=None)
-        return best if best is not None and self.overlap(best, thing) >= 0.3 else None
+        if thing not in self._found:
+            overlaps = [(self.overlap(obj, thing), obj) for obj in self.result.objects if not obj.missed]
+            overlap, best = max(overlaps, key=lambda pair: pair[0], default=(0.0, None))
+            self._found[thing] = best if overlap >= 0.3 else None
+        return self._found[thing]
 
     def visible_pixels(self, thing: int) -> int:
         """Return the number of visible pixels of a thing."""

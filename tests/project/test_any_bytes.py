@@ -16,7 +16,7 @@ CRASHES = sorted((Path(__file__).parents[1] / "helpers" / "crashes").glob("*/*")
 """Inputs that crashed a parser, by parser."""
 
 SEARCH = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 
 

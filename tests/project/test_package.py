@@ -70,6 +70,16 @@ def test_import_of_package_loads_no_heavy_library() -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_runs_and_reports_import_neither_pyplot_nor_rerun() -> None:
+    """The state of pyplot is global, and without a viewer the import of rerun would be for nothing."""
+    code = (
+        "import sys, v3d_torch.runs.open_sequences, v3d_torch.runs.report_page\n"
+        "print({'matplotlib.pyplot', 'rerun'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
+    assert done.stdout.strip() == "set()"
+
+
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
     """Modules of the package that each of its modules imports at module level."""

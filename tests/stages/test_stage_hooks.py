@@ -21,6 +21,7 @@ from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runtime.stage_hooks import HookedStage
 from v3d_torch.segmentation import UprightSegmenter
@@ -74,9 +75,18 @@ def test_every_stage_is_seen_with_its_arguments_and_result() -> None:
     assert torch.equal(last["estimate_state"][1].T_wc, results[-1].T_wc)
 
 
+@pytest.fixture(scope="module")
+def plain() -> Pipeline:
+    """Run without hooks and without prefetching."""
+    plain = make_pipeline(prefetch=False)
+    plain()
+    plain.flush()
+    return plain
+
+
 @pytest.mark.parametrize("prefetch", [False, True])
-def test_results_are_the_same_with_and_without_hooks(prefetch: bool) -> None:
-    plain, hooked = make_pipeline(prefetch=prefetch), make_pipeline(prefetch=prefetch)
+def test_results_are_the_same_with_and_without_hooks(plain: Pipeline, prefetch: bool) -> None:
+    hooked = make_pipeline(prefetch=prefetch)
     threads: dict[str, set[str]] = {name: set() for name in STAGES}
     stamps: dict[str, list[float]] = {"segment": [], "odometry": []}
 
@@ -89,8 +99,8 @@ def test_results_are_the_same_with_and_without_hooks(prefetch: bool) -> None:
         return "ignored"
 
     hooked.slam.register_stage_hook(None, hook)
-    plain(), hooked()
-    plain.flush(), hooked.flush()
+    hooked()
+    hooked.flush()
     expected, found = plain.slam.state_dict(), hooked.slam.state_dict()
     assert list(differences(expected, found, "state", {})) == []
     assert torch.equal(plain.slam.poses.trajectory().T_wc, hooked.slam.poses.trajectory().T_wc)

@@ -98,7 +98,7 @@ def _receive_event(job: Job, process: BaseProcess, connection: Connection) -> Jo
 
 
 def start_method() -> ForkServerContext | SpawnContext:
-    """Return how jobs are started: as forks of a server that has only imported the package, which takes seconds.
+    """Return how jobs are started: as forks of a server that has only imported the package and loaded its kernels.
 
     Windows has no forks, and the path of the server's socket, in the temporary folder, has a maximum length. There,
     jobs are new interpreters.
@@ -107,7 +107,7 @@ def start_method() -> ForkServerContext | SpawnContext:
     if not is_short or "forkserver" not in get_all_start_methods():
         return get_context("spawn")
     context = get_context("forkserver")
-    context.set_forkserver_preload([run_job.__module__])
+    context.set_forkserver_preload(["v3d_torch.batch.fork_server"])
     return context
 
 

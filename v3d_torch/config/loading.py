@@ -22,6 +22,9 @@ from v3d_torch.io.text import read_text, replace_odd_spaces
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""
 
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+"""Dumper of libyaml, which writes the same text several times faster. Some builds of PyYAML lack it."""
+
 FULL = "full"
 """Name of the default configuration."""
 
@@ -79,7 +82,7 @@ def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[s
 
 def dump_config(config: Config) -> str:
     """Return the whole configuration as YAML, which `load_config` reads."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    return yaml.dump(config.model_dump(mode="json"), Dumper=_DUMPER, sort_keys=False)
 
 
 def _validate(tree: Mapping[str, Any], source: str) -> Config:

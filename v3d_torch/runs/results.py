@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Sized
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.io.arrow import to_arrow
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
@@ -143,12 +145,12 @@ def _frame_table(pipeline: Pipeline) -> pa.Table:
     columns = {
         "frame": times.indices.numpy(),
         "stamp": times.stamps.numpy(),
-        "status": pa.array(statuses, pa.string()),
+        "status": statuses,
         "keyframe": torch.isin(times.indices, keyframes).numpy(),
         **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
         **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
     }
-    return pa.table(columns)
+    return pa.table({name: to_arrow(column) for name, column in columns.items()})
 
 
 def _object_table(dynamics: ObjectTable) -> pa.Table:
@@ -171,7 +173,7 @@ def _object_table(dynamics: ObjectTable) -> pa.Table:
         "missed": dynamics["missed"],
     }
     arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
-    return pa.table(arrays, schema=_DYNAMICS)
+    return pa.table({name: to_arrow(column) for name, column in arrays.items()}, schema=_DYNAMICS)
 
 
 def _write_table(path: Path, table: pa.Table) -> None:
@@ -216,12 +218,18 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "peak_memory_mb": _peak_memory_mb(),
         "seed": slam.config.seed,
         "stages": slam.config.stages.paths,
-        "versions": {
-            "v3d-torch": version("v3d-torch"),
-            "python": platform.python_version(),
-            **{name: version(name) for name in _LIBRARIES},
-        },
+        "versions": _versions(),
         "machine": {"processor": platform.machine(), "system": platform.system(), "threads": slam.config.threads},
+    }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Return the versions of the package, of Python and of the libraries."""
+    return {
+        "v3d-torch": version("v3d-torch"),
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
     }
 
 

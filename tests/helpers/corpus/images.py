@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable
+from functools import cache
 from io import BytesIO
 
 import cv2
@@ -72,16 +73,21 @@ def jpeg(frame: int) -> bytes:
     return cv2.imencode(".jpg", colour(*camera_position(frame)), [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
 
 
+@cache
+def packed_zeros() -> bytes:
+    """64 MB of zeros, compressed."""
+    packer = zlib.compressobj(9)
+    return b"".join(packer.compress(bytes(1 << 20)) for _ in range(64)) + packer.flush()
+
+
 def bomb(width: int, height: int, bits: int, kind: int) -> bytes:
     """PNG of zeros, small on disk and large in memory (decompression bomb)."""
 
     def chunk(name: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
-    packer = zlib.compressobj(9)
-    content = b"".join(packer.compress(bytes(1 << 20)) for _ in range(64)) + packer.flush()
     header = struct.pack(">IIBBBBB", width, height, bits, kind, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", content) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", packed_zeros()) + chunk(b"IEND", b"")
 
 
 def flip_bit(content: bytes) -> bytes:
