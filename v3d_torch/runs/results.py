@@ -24,7 +24,6 @@ from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.geometry.se3 import invert
-from v3d_torch.io.arrow import to_arrow
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
@@ -145,12 +144,12 @@ def _frame_table(pipeline: Pipeline) -> pa.Table:
     columns = {
         "frame": times.indices.numpy(),
         "stamp": times.stamps.numpy(),
-        "status": statuses,
+        "status": pa.array(statuses, pa.string()),
         "keyframe": torch.isin(times.indices, keyframes).numpy(),
         **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
         **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
     }
-    return pa.table({name: to_arrow(column) for name, column in columns.items()})
+    return pa.table(columns)
 
 
 def _object_table(dynamics: ObjectTable) -> pa.Table:
@@ -173,7 +172,7 @@ def _object_table(dynamics: ObjectTable) -> pa.Table:
         "missed": dynamics["missed"],
     }
     arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
-    return pa.table({name: to_arrow(column) for name, column in arrays.items()}, schema=_DYNAMICS)
+    return pa.table(arrays, schema=_DYNAMICS)
 
 
 def _write_table(path: Path, table: pa.Table) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from v3d_torch.io.arrow import to_arrow
 from v3d_torch.pipeline import RunRecord
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -19,14 +18,14 @@ def make_state_table(record: RunRecord) -> pa.Table:
     T_wc, count = states["T_wc"].numpy(), len(states)
     quaternions = Rotation.from_matrix(T_wc[:, :, :3]).as_quat(canonical=True) if count else np.zeros((0, 4))
     pose = [*T_wc[:, :, 3].T, *quaternions.T]
-    covariance = to_arrow(states["covariance"].reshape(-1).numpy())
+    covariance = pa.array(states["covariance"].reshape(-1).numpy())
     columns = {
-        "stamp": to_arrow(states["stamp"].numpy()),
-        "status": to_arrow(states.statuses),
-        **dict(zip(_POSE, map(to_arrow, pose), strict=True)),
-        **dict(zip(_TWIST, map(to_arrow, states["twist"].T.numpy()), strict=True)),
+        "stamp": states["stamp"].numpy(),
+        "status": pa.array(states.statuses, pa.string()),
+        **dict(zip(_POSE, pose, strict=True)),
+        **dict(zip(_TWIST, states["twist"].T.numpy(), strict=True)),
         "covariance": pa.FixedSizeListArray.from_arrays(covariance, 36),
-        "latency": to_arrow(live["latency"].numpy()) if len(live) else pa.nulls(count, pa.float64()),
-        "dropped": to_arrow(live["dropped"].numpy()) if len(live) else pa.nulls(count, pa.int64()),
+        "latency": pa.array(live["latency"].numpy()) if len(live) else pa.nulls(count, pa.float64()),
+        "dropped": pa.array(live["dropped"].numpy()) if len(live) else pa.nulls(count, pa.int64()),
     }
     return pa.table(columns)
