@@ -74,12 +74,23 @@ def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def _draw_no_run(patch: pytest.MonkeyPatch) -> None:
+    """Turn off the figures of runs, which take half of the time of short runs."""
+    patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
+
+
 @pytest.fixture(scope="module")
 def no_figures() -> Iterator[None]:
-    """Runs without figures, which take half of the time of short runs."""
+    """Runs of a file without figures, those of its fixtures too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
+        _draw_no_run(patch)
         yield
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of a test without figures."""
+    _draw_no_run(monkeypatch)
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,7 @@ CASES = [
     for category, cases in CATEGORIES.items()
     for case in cases
 ]
-WITH_FIGURES = {"image content", "sequence names"}
+WITH_FIGURES = {"image content", "sequence names", "results and permissions"}
 """Categories whose runs draw figures. Drawing takes most of the time of such short runs."""
 
 SHELL = {
@@ -104,10 +104,10 @@ def saved_poses(place: Workspace) -> int | None:
 @pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 @pytest.mark.parametrize(("category", "case"), CASES)
 def test_damaged_input_ends_as_expected(
-    category: str, case: Case, place: Workspace, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    category: str, case: Case, place: Workspace, capfd: pytest.CaptureFixture[str], request: pytest.FixtureRequest
 ) -> None:
     if category not in WITH_FIGURES:
-        monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
+        request.getfixturevalue("undrawn")
     case.damage(place)
     with case.context(place), memory_limit():
         done = CliRunner().invoke(run.app, arguments(place))

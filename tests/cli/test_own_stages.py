@@ -33,9 +33,8 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None) -> Path:
     """Folder of the user's module, from which it can be imported; it is not imported yet."""
-    monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)  # figures take most of the time
     monkeypatch.delitem(sys.modules, MODULE, raising=False)
     folder = write_own_stages(tmp_path / "own")
     monkeypatch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)

@@ -98,7 +98,7 @@ def copy(results: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without plots, for tests of texts and errors: plots take two seconds a page."""
     monkeypatch.setattr("v3d_torch.runs.report_page.embed_svg", lambda figure, name: "")
 
@@ -150,7 +150,7 @@ def test_command_writes_one_self_contained_page(reported: tuple[Path, subprocess
     assert "prefers-color-scheme: dark" in html and "@media print" in html
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_plots")
 def test_page_has_name_of_resolved_folder(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "latest").symlink_to(copy.name)
     monkeypatch.chdir(copy)
@@ -187,9 +187,8 @@ def test_help_takes_little_processor_time() -> None:
 # --- incomplete results
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_page_reports_run_that_ended_early(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
+@pytest.mark.usefixtures("undrawn", "without_plots")
+def test_page_reports_run_that_ended_early(tmp_path: Path) -> None:
     for broken, poses in ((0, 0), (1, 1), (6, 6)):
         run_into(tmp_path / str(broken), Wall(broken=broken), square)
         page = page_of(tmp_path / str(broken))
@@ -220,7 +219,7 @@ def test_missing_file_is_reported_and_the_rest_is_shown(
     assert page.images == images
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(
     ("moving", "static", "expected"),
     [
@@ -238,7 +237,7 @@ def test_masked_percentages_are_shown_as_far_as_measured(
     assert f"Compared with the ground-truth masks, {expected} were left out of tracking." in page_of(copy).text
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_plots")
 def test_page_of_run_without_objects(tmp_path: Path) -> None:
     run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
     page = page_of(tmp_path)
@@ -246,7 +245,7 @@ def test_page_of_run_without_objects(tmp_path: Path) -> None:
     assert page.images == 1
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_plots")
 def test_ground_truth_from_other_file_is_used(copy: Path, tmp_path: Path) -> None:
     (copy / "groundtruth.txt").rename(tmp_path / "truth.txt")
     assert read_run(copy).evaluation is None
@@ -297,7 +296,7 @@ def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
         read_run(copy / "map.ply")
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [
@@ -324,7 +323,7 @@ def test_damaged_file_is_an_error_with_its_path(
         render_page(read_run(copy))
 
 
-@pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("without_plots")
 def test_configuration_of_other_version_is_shown_but_not_compared(copy: Path) -> None:
     write_text(copy / "config.yaml", "seed: 3\nno_longer_there: true\n")
     page = page_of(copy)

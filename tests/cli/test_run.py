@@ -71,12 +71,6 @@ def copy(sequence: Path, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs without figures, which take half of the time of short runs."""
-    monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
-
-
 def rewrite(path: Path, change: Callable[[bytes], bytes]) -> None:
     content = change(path.read_bytes())
     path.unlink()

@@ -61,21 +61,17 @@ def test_stub_lists_every_public_name() -> None:
         v3d_torch.nonsense  # noqa: B018
 
 
-def test_import_of_package_loads_no_heavy_library() -> None:
-    code = (
-        "import sys, v3d_torch, v3d_torch.cli.run, v3d_torch.cli.evaluate, v3d_torch.batch.progress_board\n"
-        "print({'torch', 'cv2', 'scipy'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
-    assert done.stdout.strip() == "set()"
-
-
-def test_runs_and_reports_import_neither_pyplot_nor_rerun() -> None:
-    """The state of pyplot is global, and without a viewer the import of rerun would be for nothing."""
-    code = (
-        "import sys, v3d_torch.runs.open_sequences, v3d_torch.runs.report_page\n"
-        "print({'matplotlib.pyplot', 'rerun'} & set(sys.modules))"
-    )
+@pytest.mark.parametrize(
+    ("modules", "heavy"),
+    [
+        ("v3d_torch, v3d_torch.cli.run, v3d_torch.cli.evaluate, v3d_torch.batch.progress_board", "torch cv2 scipy"),
+        # The state of pyplot is global, and without a viewer the import of rerun would be for nothing.
+        ("v3d_torch.runs.open_sequences, v3d_torch.runs.report_page", "matplotlib.pyplot rerun"),
+    ],
+    ids=["commands", "runs and reports"],
+)
+def test_import_loads_no_heavy_library(modules: str, heavy: str) -> None:
+    code = f"import sys, {modules}; print({set(heavy.split())} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
     assert done.stdout.strip() == "set()"
 

@@ -40,12 +40,6 @@ def results(run: Pipeline, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results without figures, which take half of the time."""
-    monkeypatch.setattr("v3d_torch.runs.results.draw_run", lambda *_: None)
-
-
 def test_all_documented_files_are_written(results: Path) -> None:
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
     assert names == {

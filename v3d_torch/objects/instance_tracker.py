@@ -14,7 +14,7 @@ from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, p
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.track import Track
+from v3d_torch.objects.track import STAMP_TOLERANCE, Track
 from v3d_torch.objects.track_matching import (
     DEPTH_TOLERANCE,
     DetectedInstances,
@@ -39,6 +39,10 @@ _DUPLICATE_DISTANCE = 0.5
 
 _MIN_FREE_FRACTION = 0.5
 """The predicted place of a missed object is empty if the camera sees through more than this fraction of its points."""
+
+_MAX_VISIBLE_TIME = 0.1
+"""A missed object counts as visible for this long, seconds: who is missed for longer mostly is hidden or has turned, so
+that the predicted mask is wrong. Tracking leaves out the pixels of all predicted masks nevertheless."""
 
 _MAX_VACANT_TIME = 0.5
 """A missed object whose place was observed to be empty for longer has gone, seconds."""
@@ -241,7 +245,8 @@ class InstanceTracker(torch.nn.Module):
                 continue
             mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
             track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
-            track.visible = bool(predicted.visible[i])
+            is_recent = stamp - track.newest.stamp <= _MAX_VISIBLE_TIME + STAMP_TOLERANCE
+            track.visible = bool(predicted.visible[i]) and track.is_confirmed and is_recent
             missed.append(track)
         self._update_tracks_without_masks(stamp, resting, lost)
         return missed

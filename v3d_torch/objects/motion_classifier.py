@@ -29,7 +29,7 @@ from v3d_torch.objects.motion_evidence import (
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
-from v3d_torch.objects.track import STAMP_TOLERANCE, Track
+from v3d_torch.objects.track import Track
 from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import Instances
 
@@ -40,10 +40,6 @@ hundredths of an object."""
 _MIN_MISSED_SCORE = 0.3
 """A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones
 or one strong one: the network labels rotated furniture as people in single frames."""
-
-_MAX_SHOWN_TIME = 0.1
-"""A missed object is shown for this long, seconds: who is missed for longer mostly is hidden or has turned, so that the
-predicted mask is wrong. Tracking leaves out the pixels of all predicted masks nevertheless."""
 
 
 class MotionClassifier:
@@ -109,13 +105,12 @@ class MotionClassifier:
             track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
             for track, is_supported in zip(tracks, supported, strict=True)
         }
-        shown = [track for track in tracks if _is_shown(track, stamp)]
-        detected_masks = _unions_of_masks(detected, {track.label for track in shown if track.missed})
+        detected_masks = _unions_of_masks(detected, {track.label for track in tracks if track.missed and track.visible})
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=_visible_mask(track, detected_masks) if track in shown else torch.zeros_like(track.mask),
+                mask=_visible_mask(track, detected_masks),
                 state=track.predict_state(stamp),
                 history=tuple(track.history),
                 votes=vote.votes.get(track, 0),
@@ -215,13 +210,11 @@ def _unions_of_masks(tracks: Sequence[Track], labels: set[int]) -> dict[int, NDA
     return {label: np.logical_or.reduce(of_label) for label, of_label in masks.items() if of_label}
 
 
-def _is_shown(track: Track, stamp: float) -> bool:
-    """Check whether an object is detected, or its predicted mask is likely to be right."""
-    is_recent = stamp - track.newest.stamp <= _MAX_SHOWN_TIME + STAMP_TOLERANCE
-    return not track.missed or (track.visible and track.is_confirmed and is_recent)
-
-
 def _visible_mask(track: Track, detected: Mapping[int, NDArray[np.bool_]]) -> Tensor:
     """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
-    others = detected.get(track.label) if track.missed else None
+    if not track.missed:
+        return track.mask
+    if not track.visible:
+        return torch.zeros_like(track.mask)
+    others = detected.get(track.label)
     return track.mask if others is None else torch.from_numpy(track.mask.numpy() & ~others)

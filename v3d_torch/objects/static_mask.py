@@ -23,7 +23,7 @@ class StaticMasks(NamedTuple):
 
     Attributes:
         static: Pixels outside of all excluded objects, bool, shape :math:`(H, W)`.
-        without_people: Pixels outside of all excluded objects and people, at a larger distance, bool, shape
+        without_people: Pixels of ``static`` at a larger distance from all excluded objects and people, bool, shape
             :math:`(H, W)`.
     """
 
@@ -54,10 +54,8 @@ def static_masks(
     refiner = MaskRefiner(tracks, view, newly_occupied, config.static_mask, camera, config.clouds.voxel_size)
     masks = {track: refiner.refine(track) for track in tracks}
     size, margins = view.depth.shape[-2:], config.static_mask
-    return StaticMasks(
-        static=_outside([masks[track] for track in excluded], size, margins.dilation),
-        without_people=_outside(list(masks.values()), size, margins.map_dilation),
-    )
+    static = _outside([masks[track] for track in excluded], size, margins.dilation)
+    return StaticMasks(static, static & _outside(list(masks.values()), size, margins.map_dilation))
 
 
 def _outside(masks: list[Tensor], size: torch.Size, dilation: int) -> Tensor:
