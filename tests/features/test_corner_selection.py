@@ -1,4 +1,4 @@
-"""Selection of corners by contrast and by quadtrees."""
+"""Selection of corners by quadtrees."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from v3d_torch.features.corner_selection import select_corners, select_strong_corners
+from v3d_torch.features.corner_selection import select_corners
 from v3d_torch.kernels.compiler import ENABLED, TWINS
 
 Ints = NDArray[np.int64]
 SIZES = [(640, 480), (320, 240), (90, 300), (1300, 100)]
-QUADTREE, CONTRAST = (
-    TWINS[f"v3d_torch.features.corner_selection.{name}"] for name in ("_select_strongest", "select_strong_corners")
-)
+TWIN = TWINS["v3d_torch.features.corner_selection._select_strongest"]
 
 
 def random_corners(count: int, seed: int, clusters: int = 5) -> tuple[Ints, Ints, Ints]:
@@ -44,11 +42,11 @@ def test_as_many_corners_are_selected_as_wanted(count: int, wanted: int) -> None
 
 @given(st.integers(0, 400), st.integers(0, 1000), st.lists(st.integers(1, 200), min_size=4, max_size=4))
 @pytest.mark.skipif(not ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
-def test_kernel_of_the_quadtree_equals_its_twin(count: int, seed: int, wanted: list[int]) -> None:
+def test_kernel_equals_its_twin(count: int, seed: int, wanted: list[int]) -> None:
     generator = np.random.default_rng(seed)
     code = (generator.integers(0, 4, count) << 24) | generator.integers(0, 1 << generator.integers(1, 24), count)
     arguments = code, generator.integers(20, 24, count), np.array(wanted)
-    np.testing.assert_array_equal(QUADTREE.compiled(*arguments), QUADTREE.torch(*arguments))
+    np.testing.assert_array_equal(TWIN.compiled(*arguments), TWIN.torch(*arguments))
 
 
 def test_strongest_corner_of_each_quarter_is_selected() -> None:
@@ -72,30 +70,3 @@ def test_corners_are_spread_over_the_image() -> None:
     response = np.concatenate([np.full(len(dense), 200), np.full(len(sparse), 20)])
     selected = select_corners(corners, response, np.zeros(len(corners), np.int64), [(640, 480)], [300])
     assert np.isin(np.arange(len(dense), len(corners)), selected).mean() > 0.9
-
-
-def test_weak_corners_are_selected_in_cells_without_strong_ones() -> None:
-    corners = np.array([[1, 1], [30, 30], [33, 2], [40, 8], [70, 70], [95, 60]], np.float32)
-    response = np.array([10, 25, 12, 9, 21, 30], np.uint8)
-    is_inside = np.ones((100, 100), np.bool_)
-    is_inside[:, 90:] = False
-    assert select_strong_corners(corners, response, is_inside, 20, 32).tolist() == [1, 2, 3, 4]
-    # A strong corner outside does not count for its cell.
-    is_inside[30, 30] = False
-    assert select_strong_corners(corners, response, is_inside, 20, 32).tolist() == [0, 2, 3, 4]
-
-
-def test_one_of_several_adjacent_corners_is_selected() -> None:
-    corners = np.array([[10, 10], [11, 10], [12, 10], [11, 11], [20, 20], [21, 21]], np.float32)
-    response = np.array([30, 40, 30, 35, 50, 50], np.uint8)
-    assert select_strong_corners(corners, response, np.ones((40, 40), np.bool_), 20, 32).tolist() == [1, 4]
-
-
-@given(st.integers(0, 400), st.integers(0, 1000), st.sampled_from([8, 32, 200]))
-@pytest.mark.skipif(not ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
-def test_kernel_of_the_contrast_equals_its_twin(count: int, seed: int, cell: int) -> None:
-    generator = np.random.default_rng(seed)
-    is_inside = np.pad(generator.random((68, 118)) < 0.8, 1)
-    corners = np.unique(generator.integers(0, (120, 70), (count, 2)), axis=0).astype(np.float32)
-    arguments = corners, generator.integers(7, 30, len(corners)).astype(np.uint8), is_inside, 20, cell
-    np.testing.assert_array_equal(CONTRAST.compiled(*arguments), CONTRAST.torch(*arguments))

@@ -22,11 +22,10 @@ def test_levels_are_below_each_other() -> None:
     np.testing.assert_array_equal(canvas[144:, :64], cv2.resize(second, (64, 51), interpolation=cv2.INTER_LINEAR))
 
 
-def test_pixels_inside_of_levels_are_marked() -> None:
+def test_boxes_are_the_levels_without_their_margin() -> None:
     pyramid = ScalePyramid(100, 80, 3, 1.25, 10)
-    column, row = np.array([9, 10, 89, 90, 10, 69, 70, 50, 50]), np.array([10, 10, 69, 10, 90, 133, 133, 134, 154])
-    assert pyramid.is_inside[row, column].tolist() == [False, True, True, False, True, True, False, False, True]
-    assert pyramid.level_of_row[row].tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2]
+    assert pyramid.boxes.tolist() == [[10, 10, 90, 70], [10, 90, 70, 134], [10, 154, 54, 185]]
+    assert pyramid.level_of_row[[10, 69, 90, 133, 154]].tolist() == [0, 0, 1, 1, 2]
 
 
 @pytest.mark.parametrize(("size", "levels"), [((20, 20), 1), ((48, 60), 1), ((50, 60), 2), ((640, 480), 8)])

@@ -1,10 +1,9 @@
-"""Selection of corners that are spread over images, by contrast and by quadtrees (Mur-Artal et al., T-RO 2015)."""
+"""Selection of corners that are spread over images, by quadtrees (Mur-Artal et al., T-RO 2015)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,48 +16,7 @@ _DEPTH = 10
 _CELL_BITS = 2 * _DEPTH + 4
 """Bits of the code of a cell: two for each level, and four for the square cells of the first level."""
 
-_PIXELS_BEFORE = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0]], np.uint8)
-"""Offsets of the neighbours of a pixel that precede it in row-major order."""
-
 Ints = NDArray[np.int64]
-Points = NDArray[np.float32]
-
-
-def _select_strong_corners_compiled(
-    corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
-) -> Ints:
-    return kernels.select_strong_corners(corners, response, is_inside, threshold, cell)
-
-
-@compiled_by(_select_strong_corners_compiled)
-def select_strong_corners(
-    corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
-) -> Ints:
-    """Select strong local maxima, and weak local maxima in cells without a strong corner.
-
-    Weak corners lie on surfaces with little contrast. Of neighbours with equal response, the first is the maximum.
-
-    Args:
-        corners: Corners (column, row), whole numbers, float32, shape :math:`(N, 2)`.
-        response: Strength of the corners, at least 1, uint8, shape :math:`(N,)`.
-        is_inside: Mask of the pixels in which corners are selected, false at the image border, bool, shape
-            :math:`(H, W)`.
-        threshold: Corners with a larger response are strong.
-        cell: Side of a cell, pixels.
-
-    Returns:
-        Indices of the selected corners in their order, int64, shape :math:`(K,)`.
-    """
-    columns, rows = corners.T.astype(np.int64)
-    inside = is_inside[rows, columns]
-    strength = np.zeros(is_inside.shape, np.uint8)
-    strength[rows[inside], columns[inside]] = response[inside]
-    before, after = (cv2.dilate(strength, neighbours) for neighbours in (_PIXELS_BEFORE, _PIXELS_BEFORE[::-1, ::-1]))
-    is_maximum = inside & ((strength > before) & (strength >= after))[rows, columns]
-    cells = rows // cell * (is_inside.shape[1] // cell + 1) + columns // cell
-    is_strong = response > threshold
-    has_strong = np.bincount(cells, is_strong & inside) > 0
-    return np.flatnonzero(is_maximum & (is_strong | ~has_strong[cells]))
 
 
 def select_corners(

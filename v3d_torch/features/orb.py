@@ -10,7 +10,8 @@ from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig
 from v3d_torch.features import brief
-from v3d_torch.features.corner_selection import select_corners, select_strong_corners
+from v3d_torch.features.corner_selection import select_corners
+from v3d_torch.features.fast import detect_corners
 from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.features.scale_pyramid import ScalePyramid
 from v3d_torch.geometry.camera import PinholeCamera
@@ -24,12 +25,6 @@ cells without other corners (ORB-SLAM2)."""
 _CELL = 32
 """Side of these cells, pixels of the level (ORB-SLAM2 uses 30 or 35). The margin between two levels is wider."""
 
-_WHITE = 255
-"""Grey level of white, by which kornia-rs divides its corner response."""
-
-_ARC = 9
-"""Minimum number of adjacent pixels on the circle around a corner that are all brighter or all darker (FAST-9)."""
-
 _SMOOTHING_SIZE, _SMOOTHING_SIGMA = (7, 7), (2.0, 2.0)
 """Kernel size and standard deviation of the Gaussian filter before the comparisons of BRIEF, pixels (OpenCV)."""
 
@@ -37,8 +32,8 @@ _SMOOTHING_SIZE, _SMOOTHING_SIGMA = (7, 7), (2.0, 2.0)
 class ORB:
     """Detector and descriptor of ORB features.
 
-    FAST and the Gaussian filter are those of kornia-rs. The ORB of kornia-rs is not used: it takes longer, selects
-    several pixels of one corner, and finds no features on surfaces with little contrast.
+    The ORB of kornia-rs is not used: it takes longer, selects several pixels of one corner, and finds no features on
+    surfaces with little contrast.
 
     Args:
         config: Number of features, scale pyramid, maximum depth.
@@ -84,10 +79,7 @@ class ORB:
     def _detect(self, canvas: NDArray[np.uint8]) -> tuple[Ints, Ints]:
         """Return the corners (column, row) in the image of all levels, (N, 2), and the level of each, sorted, (N,)."""
         pyramid = self._pyramid
-        found, response = kornia_rs.features.fast_detect(canvas, _MIN_THRESHOLD, _ARC, brief.MARGIN)
-        strength = (response * _WHITE).round().astype(np.uint8)
-        strong = select_strong_corners(found, strength, pyramid.is_inside, _THRESHOLD, _CELL)
-        corners, strength = found[strong].astype(np.int64), strength[strong].astype(np.int64)
+        corners, strength = detect_corners(canvas, pyramid.boxes, _THRESHOLD, _MIN_THRESHOLD, _CELL)
         level = pyramid.level_of_row[corners[:, 1]]
         in_level = corners - np.stack([np.zeros_like(level), pyramid.tops[level]], axis=1)
         selected = select_corners(in_level, strength, level, pyramid.sizes, self._counts)

@@ -20,7 +20,7 @@ class ScalePyramid:
     Attributes:
         sizes: Width and height of each level, pixels.
         tops: First row of each level in the image of all levels.
-        is_inside: Mask of the pixels of the image of all levels that lie in a level, without its margin, bool.
+        boxes: Left, top, right, and bottom of each level without its margin, in the image of all levels, int64, (L, 4).
         level_of_row: Level of each row of the image of all levels, int64.
     """
 
@@ -31,9 +31,8 @@ class ScalePyramid:
         self.tops = np.cumsum([0, *rows[:-1]])
         self._shape = sum(rows), width
         self.level_of_row = np.arange(len(rows)).repeat(rows)
-        self.is_inside = np.zeros(self._shape, np.bool_)
-        for top, (columns, height) in zip(self.tops.tolist(), self.sizes, strict=True):
-            self.is_inside[top + margin : top + height - margin, margin : columns - margin] = True
+        left, columns = np.full_like(self.tops, margin), np.array(self.sizes)[:, 0]
+        self.boxes = np.stack([left, self.tops + margin, columns - margin, self.tops + rows - margin], axis=1)
 
     def build(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the image of all levels of a grey image, uint8."""

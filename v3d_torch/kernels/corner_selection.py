@@ -8,59 +8,6 @@ from numpy.typing import NDArray
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.radix_sort import Ints, argsort
 
-Points = NDArray[np.float32]
-
-
-@device
-def _is_maximum(strength: NDArray[np.uint8], row: int, column: int) -> bool:
-    """Check for a local maximum; of equal neighbours, the first is the maximum."""
-    centre = strength[row, column]
-    for neighbour in strength[row - 1, column - 1 : column + 2]:
-        if neighbour >= centre:
-            return False
-    for neighbour in strength[row + 1, column - 1 : column + 2]:
-        if neighbour > centre:
-            return False
-    return bool(strength[row, column - 1] < centre and strength[row, column + 1] <= centre)
-
-
-@kernel("(f4[:,::1], u1[::1], b1[:,::1], i8, i8)")
-def select_strong_corners(
-    corners: Points, response: NDArray[np.uint8], is_inside: NDArray[np.bool_], threshold: int, cell: int
-) -> Ints:
-    """Select strong local maxima, and weak local maxima in cells without a strong corner.
-
-    Args:
-        corners: Corners (column, row), (N, 2).
-        response: Strength of the corners, (N,).
-        is_inside: Mask of the pixels in which corners are selected, false at the image border, (H, W).
-        threshold: Corners with a larger response are strong.
-        cell: Side of a cell, pixels.
-
-    Returns:
-        Indices of the selected corners.
-    """
-    height, width = is_inside.shape
-    strength = np.zeros((height, width), np.uint8)
-    has_strong = np.zeros((height // cell + 1, width // cell + 1), np.bool_)
-    for i in range(len(corners)):
-        column, row = int(corners[i, 0]), int(corners[i, 1])
-        if is_inside[row, column]:
-            strength[row, column] = response[i]
-            if response[i] > threshold:
-                has_strong[row // cell, column // cell] = True
-    selected, count = np.empty(len(corners), np.int64), 0
-    for i in range(len(corners)):
-        column, row = int(corners[i, 0]), int(corners[i, 1])
-        if (
-            strength[row, column] > 0
-            and (response[i] > threshold or not has_strong[row // cell, column // cell])
-            and _is_maximum(strength, row, column)
-        ):
-            selected[count] = i
-            count += 1
-    return selected[:count]
-
 
 @device
 def _divide_fullest(sizes: Ints, gains: Ints, missing: int) -> NDArray[np.bool_]:
