@@ -83,10 +83,10 @@ def original(tmp_path: Path) -> Path:
     u, v = np.meshgrid(np.arange(640), np.arange(480))
     rays = np.stack([(u - 319.5) / 481.2, (v - 239.5) / -480.0, np.ones(u.shape)], axis=-1)  # published: y points up
     depth = np.where(rays[..., 1] < -0.4, -1.2 / np.minimum(rays[..., 1], -1e-6), 3.0)
-    distance = depth * np.linalg.norm(rays, axis=-1)
+    distances = " ".join(f"{value:.6g}" for value in (depth * np.linalg.norm(rays, axis=-1)).ravel().tolist())
     for i in (1, 2):
         save(root / f"scene_00_{i:04d}.png", colour_of(i, 640, 480))
-        (root / f"scene_00_{i:04d}.depth").write_text(" ".join(f"{value:.6g}" for value in distance.ravel()))
+        (root / f"scene_00_{i:04d}.depth").write_text(distances)
         (root / f"scene_00_{i:04d}.txt").write_text("cam_pos = [1.3705, 1.51739, 1.44963]';\n")
     (root / "livingRoom0.gt.freiburg").write_text("1 0 0 -2.25 0 0 0 1\n2 0 0.009 -2.249 -0.001 0 0 0.999999\n")
     return root

@@ -46,7 +46,7 @@ def test_unknown_or_ambiguous_name_gives_none(name: str) -> None:
     assert canonical_name(name) is None
 
 
-@given(st.text(max_size=30))
+@given(st.text(st.characters(exclude_categories=["Cs"]), max_size=30))  # the default alphabet takes seconds to compute
 def test_any_text_gives_a_full_name_or_none(text: str) -> None:
     assert canonical_name(text) in (None, *SEQUENCES)
 

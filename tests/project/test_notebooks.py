@@ -13,10 +13,10 @@ from nbclient import NotebookClient
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
 FEWER_FRAMES = {
-    "quickstart": {"FRAMES": 36},
-    "correct_depth_bias": {"TEST": ("demo", range(60, 120, 6))},
-    "learn_feature_uncertainty": {"TEST": [("demo", range(60, 120, 6))]},
-    "learn_voting_thresholds": {"TEST": [("demo", range(60, 100, 4))]},
+    "quickstart": {"FRAMES": 32},
+    "correct_depth_bias": {"TEST": ("demo", range(60, 120, 12))},
+    "learn_feature_uncertainty": {"TEST": [("demo", range(60, 120, 12))], "STEPS": 25},
+    "learn_voting_thresholds": {"TEST": [("demo", range(60, 100, 8))]},
     "training_through_the_modules": {"TRAINING": 10, "TEST": 60, "STEPS": 40},
 }
 """Settings of notebooks that replace those for readers: fewer frames, scenes and steps."""
