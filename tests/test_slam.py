@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch import Tensor
 
 from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_sequence
 from v3d_torch.config.loading import load_config
@@ -18,8 +20,10 @@ from v3d_torch.features.features import Features
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.floor import Floor
+from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.types import TrackingStatus
+from v3d_torch.tracking.pose_history import PoseHistory
+from v3d_torch.types import FramePose, TrackingStatus
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))
 
@@ -174,6 +178,29 @@ def test_replaced_stage_is_called(demo: RGBDSequence, frames: int) -> None:
     slam.smooth_depth = lambda depth: shapes.append(depth.shape) or smooth(depth)  # type: ignore[assignment,func-returns-value]
     slam(demo[frames])
     assert shapes == [(1, 1, 480, 640)]
+
+
+def test_first_keyframe_is_refined_before_and_after_the_second_frame_is_tracked(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(demo.camera, NoSegmentation())
+    track_camera, refine_previous = slam.track_camera, slam.refine_previous
+    calls: list[str] = []
+
+    class Track:
+        reference_keyframe = staticmethod(track_camera.reference_keyframe)
+
+        def __call__(self, *args: Any) -> FramePose:
+            calls.append("track")
+            return track_camera(*args)
+
+    def refine(previous: TrackedFrame | None, velocity: Tensor | None, poses: PoseHistory) -> None:
+        calls.append("nothing" if previous is None or velocity is None else f"refine {previous.frame.index}")
+        refine_previous(previous, velocity, poses)
+
+    slam.track_camera, slam.refine_previous = Track(), refine
+    for index in range(3):
+        slam(demo[index])
+    first, second, third = ["track", "nothing"], ["refine 0", "track", "refine 0"], ["track", "refine 1"]
+    assert calls == first + second + third
 
 
 def test_array_instead_of_a_frame_is_rejected(demo: RGBDSequence) -> None:

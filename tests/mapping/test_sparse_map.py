@@ -210,6 +210,28 @@ def test_update_features_moves_the_observations_of_that_keyframe_only() -> None:
     assert not torch.equal(sparse_map.observations["uv"][~others], before[~others])
 
 
+def test_update_features_moves_the_landmarks_that_no_other_keyframe_observes() -> None:
+    points = points_in_view(200)
+    T_cw = se3_exp(torch.tensor([0.3, -0.2, 0.1, 0.1, 0.4, -0.2], dtype=torch.float64))
+    in_camera = points @ T_cw[:3, :3].T + T_cw[:3, 3]
+    visible = in_camera[:, 2] > 0.1
+    points, in_camera = points[visible], in_camera[visible]
+    observed = observe_rolling(in_camera, VELOCITY, KINECT.seconds)
+    sparse_map = SparseMap(Config().mapping, Config().features, rolling_camera.CAMERA)
+    first = sparse_map.insert_keyframe(0, 0.0, T_cw, observed, unmatched(len(observed)))
+    shared = torch.where(torch.arange(len(observed)) < 50, first.landmarks, -1)
+    insert(sparse_map, shared[:50].tolist())
+    before = sparse_map.landmarks["point"].clone()
+    sparse_map.update_features(first, compensate_features(observed, VELOCITY, KINECT, rolling_camera.CAMERA))
+    created = first.landmarks >= 0
+    own, landmarks = created & (shared < 0), first.landmarks
+    after = sparse_map.landmarks["point"]
+    assert own.sum() > 100
+    assert torch.equal(after[shared[:50]], before[shared[:50]])
+    error = [(each[landmarks[own]] - points[own]).norm(dim=1).median() for each in (before, after)]
+    assert error[1] < 0.1 * error[0]
+
+
 def test_landmark_positions_are_those_of_active_landmarks() -> None:
     sparse_map = map_of_two_keyframes(KINECT)
     first = sparse_map.keyframes[0]

@@ -16,7 +16,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping import covisibility, culling, landmark_ids
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.mapping.landmark_creation import create_landmarks, select_new_landmarks
+from v3d_torch.mapping.landmark_creation import create_landmarks, landmark_points, select_new_landmarks
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.odometry.rolling_shutter import Readout
 
@@ -187,14 +187,20 @@ class SparseMap(MapTables):
     def update_features(self, keyframe: Keyframe, features: Features) -> None:
         """Replace the features of a keyframe by the same features with corrected pixels and depth.
 
+        Landmarks that no other keyframe observes move with their feature.
+
         Args:
             keyframe: Keyframe of this map.
             features: The corrected features, in the same order.
         """
         keyframe.features = features
         rows = torch.nonzero(self.observations["keyframe"] == keyframe.index)[:, 0]
+        feature, landmark = (self.observations[name][rows] for name in ("feature", "landmark"))
         for name in ("uv", "inverse_depth", "readout_jacobian"):
-            self.observations[name][rows] = getattr(features, name)[self.observations["feature"][rows]]
+            self.observations[name][rows] = getattr(features, name)[feature]
+        is_own = torch.bincount(self.observations["landmark"])[landmark] == 1
+        moved = is_own & self.landmarks["active"][landmark] & (features.depth[feature] > 0)
+        self.landmarks["point"][landmark[moved]] = landmark_points(keyframe.T_cw, features[feature[moved]], self.camera)
 
     def set_readout(self, readout: Readout) -> None:
         """Set the readout and shift all stored features accordingly.
