@@ -43,7 +43,8 @@ def test_state_of_a_long_run_in_one_place_stays_bounded() -> None:
     assert len(sizes) == TURNS
     for name in sizes[0].keys() - GROWING:
         assert sizes[-1][name] <= 1.3 * max(size[name] for size in sizes[:-1]) + 50_000, name
-    assert sizes[-1]["poses"] - sizes[-2]["poses"] < 2000 * TURN
+    # Over two turns, because the number of active keyframes, which the poses refer to, varies.
+    assert sizes[-1]["poses"] - sizes[-3]["poses"] < 2000 * 2 * TURN
     culled = len(slam.map.keyframes) - sizes[-1]["keyframes"]
     assert culled > sizes[-1]["keyframes"]
 
