@@ -15,8 +15,8 @@ _RADIUS = 3
 
 
 @device
-def _darkest_of_brightest_arc(circle: tuple[np.uint8, ...]) -> np.uint8:
-    """Maximum over all arcs of nine of 16 pixels, of the minimum in the arc."""
+def _brightest_arc(circle: tuple[np.uint8, ...]) -> np.uint8:
+    """Brightness of the brightest arc, nine adjacent ones of 16 pixels: that of its darkest pixel."""
     c = circle
     pairs = (
         min(c[1], c[2]), min(c[3], c[4]), min(c[5], c[6]), min(c[7], c[8]),
@@ -27,8 +27,7 @@ def _darkest_of_brightest_arc(circle: tuple[np.uint8, ...]) -> np.uint8:
         min(pairs[4], pairs[5]), min(pairs[5], pairs[6]), min(pairs[6], pairs[7]), min(pairs[7], pairs[0]),
     )  # fmt: skip
     brightest = np.uint8(0)
-    for k in range(8):
-        # Eight adjacent pixels, and the one before or the one behind them.
+    for k in range(8):  # the arcs of the pixels from 2 k + 1 to 2 k + 8, and of the pixel before or after them
         octet = min(quads[k], quads[(k + 2) & 7])
         brightest = max(brightest, min(octet, max(c[2 * k], c[(2 * k + 9) & 15])))
     return brightest
@@ -36,7 +35,9 @@ def _darkest_of_brightest_arc(circle: tuple[np.uint8, ...]) -> np.uint8:
 
 @device
 def _add_bright_arcs(rows: tuple[Image, ...], strength: Image) -> None:
-    """Raise the strength of the pixels of a row to the contrast of their bright arcs.
+    """Raise the strength of each pixel of a row to the difference between its brightest arc and the pixel.
+
+    The compiler vectorises this loop; a loop with conditions would take longer.
 
     Args:
         rows: The seven rows around the row, with a margin of the radius on both sides, each (W + 6,).
@@ -49,12 +50,12 @@ def _add_bright_arcs(rows: tuple[Image, ...], strength: Image) -> None:
             g[x + 3], g[x + 2], f[x + 1], e[x], d[x], c[x], b[x + 1], a[x + 2],
         )  # fmt: skip
         centre = d[x + 3]
-        strength[x] = max(strength[x], np.uint8(max(_darkest_of_brightest_arc(circle), centre) - centre))
+        strength[x] = max(strength[x], np.uint8(max(_brightest_arc(circle), centre) - centre))
 
 
 @device
 def _measure_strength(image: Image, y: int, left: int, right: int, strength: Image) -> None:
-    """Raise the strength of the pixels of a row to the contrast of their bright arcs."""
+    """Raise the strength of the pixels of row ``y`` from column ``left`` to ``right``, see `_add_bright_arcs`."""
     columns = slice(left - _RADIUS, right + _RADIUS)
     rows = (
         image[y - 3, columns], image[y - 2, columns], image[y - 1, columns], image[y, columns],
@@ -109,7 +110,7 @@ def detect_corners(image: Image, boxes: Ints, threshold: int, min_threshold: int
             begin, end = max(first, top), min(first + cell, bottom)
             above, below = max(begin - 1, top), min(end + 1, bottom)
             strength[:] = 0
-            inverted = ~image[above - _RADIUS : below + _RADIUS]
+            inverted = ~image[above - _RADIUS : below + _RADIUS]  # dark arcs are bright in it
             for y in range(above, below):
                 row = strength[y - begin + 1, inside]
                 _measure_strength(image, y, left, right, row)
