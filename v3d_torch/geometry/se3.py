@@ -16,6 +16,8 @@ from torch import Tensor
 from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import se3 as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.reprojection import SMALL_ANGLE
+from v3d_torch.kernels.se3 import SERIES_ANGLE_SQUARED
 
 # Generators of se(3): row k is the derivative of se3_exp by xi[k] at 0, a flattened 4x4 matrix.
 _GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
@@ -46,14 +48,6 @@ _QUATERNION_PRODUCTS = torch.tensor(
     ],
     dtype=torch.float64,
 ).T
-
-_SMALL_ANGLE = 1e-4
-"""Rotation angle in radians below which the limits of the closed forms are exact to float64."""
-
-_SMALL_ANGLE_SQUARED = _SMALL_ANGLE**2
-
-_SERIES_ANGLE_SQUARED = 1e-4
-"""Squared rotation angle below which the Jacobian is computed from its power series, to avoid cancellation."""
 
 
 def _is_single(tensor: Tensor, *shape: int) -> bool:
@@ -123,7 +117,7 @@ def se3_exp(xi: Tensor) -> Tensor:
     dtype, xi = xi.dtype, xi.to(working_dtype(xi.dtype))
     X = hat(xi)
     # Below the small angle the coefficients are constant to float64, and are multiplied by high powers of the angle.
-    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=_SMALL_ANGLE)
+    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=SMALL_ANGLE)
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
     X2 = X @ X
@@ -148,7 +142,7 @@ def se3_log(T: Tensor) -> Tensor:
     phi = _so3_log(T[..., :3, :3])
     square = (phi * phi).sum(dim=-1)[..., None, None]
     # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.
-    is_small = square < _SMALL_ANGLE_SQUARED
+    is_small = square < SMALL_ANGLE**2
     safe = torch.where(is_small, 1.0, square)
     half = safe.sqrt() / 2
     c = torch.where(is_small, 1 / 12, (1 - half / half.tan()) / safe)
@@ -223,7 +217,7 @@ def left_jacobian_inverse(xi: Tensor) -> Tensor:
     A = _block_triangular(K, _skew(xi[..., :3]))
     square = xi[..., 3:].square().sum(dim=-1)[..., None, None]
     # A has the eigenvalues 0 and +-i angle, each twice, so that the series x / 2 coth(x / 2) of A ends at A^4.
-    is_small = square < _SERIES_ANGLE_SQUARED
+    is_small = square < SERIES_ANGLE_SQUARED
     safe = torch.where(is_small, 1.0, square)
     angle = safe.sqrt()
     cotangent = 1 / (angle / 2).tan()
@@ -250,6 +244,6 @@ def _so3_log(R: Tensor) -> Tensor:
     q = torch.where(q[..., :1] < 0, -q, q)  # q and -q are the same rotation; w >= 0 gives an angle of at most pi
     w, v = q[..., :1], q[..., 1:]
     square = (v * v).sum(dim=-1, keepdim=True)
-    is_small = square < _SMALL_ANGLE_SQUARED
+    is_small = square < SMALL_ANGLE**2
     sine = torch.where(is_small, 1.0, square).sqrt()
     return v * torch.where(is_small, 2 / w.clamp(min=0.5) * (1 - square / 3), 2 * torch.atan2(sine, w) / sine)

@@ -15,6 +15,7 @@ from v3d_torch.kernels.compiler import device
 Array = NDArray[np.float64]
 
 SMALL_ANGLE = 1e-4
+"""Rotation angle in radians below which the limits of the closed forms are exact to float64."""
 
 
 @device

@@ -19,7 +19,7 @@ _MAX_NEWTON_STEPS = 8
 _NEWTON_TOLERANCE = 1e-8
 """Change of the elements in the last step. Newton's method squares the error in each step."""
 
-_SERIES_ANGLE_SQUARED = 1e-4
+SERIES_ANGLE_SQUARED = 1e-4
 """Squared rotation angle below which the Jacobian is computed from its power series, to avoid cancellation."""
 
 
@@ -140,7 +140,7 @@ def right_jacobian_inverse(xi: Array) -> Array:
     _write_skew(xi[3], xi[4], xi[5], A, 3, 3)
     _write_skew(xi[0], xi[1], xi[2], A, 0, 3)
     square = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
-    if square < _SERIES_ANGLE_SQUARED:
+    if square < SERIES_ANGLE_SQUARED:
         b, a = -1 / 720 - square / 15120, 1 / 12 - square * square / 30240
     else:
         angle = math.sqrt(square)
