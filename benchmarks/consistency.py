@@ -194,7 +194,7 @@ def run(source: str, configuration: str) -> Row:
     T_wc = torch.eye(4, dtype=torch.float64).repeat(len(states), 1, 1)
     T_wc[:, :3] = states["T_wc"]
     errors = calibrated_errors(sequence.groundtruth, states["stamp"], T_wc, states["covariance"].to(torch.float64))
-    return make_row(sequence.name, configuration, errors, groundtruth_noise(sequence.groundtruth))
+    return make_row(sequence.name.replace("/", "_"), configuration, errors, groundtruth_noise(sequence.groundtruth))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
