@@ -232,6 +232,15 @@ def test_update_features_moves_the_landmarks_that_no_other_keyframe_observes() -
     assert error[1] < 0.1 * error[0]
 
 
+def test_update_features_leaves_the_landmarks_of_a_keyframe_whose_pose_depends_on_others() -> None:
+    sparse_map = map_of_two_keyframes(KINECT)
+    newest, before = sparse_map.keyframes[1], sparse_map.landmarks["point"].clone()
+    assert set(sparse_map.landmarks["keyframe"][newest.landmarks[newest.landmarks >= 0]].tolist()) >= {0}
+    slower = compensate_features(newest.features, VELOCITY / 2, KINECT, rolling_camera.CAMERA)
+    sparse_map.update_features(newest, slower)
+    assert torch.equal(sparse_map.landmarks["point"], before)
+
+
 def test_landmark_positions_are_those_of_active_landmarks() -> None:
     sparse_map = map_of_two_keyframes(KINECT)
     first = sparse_map.keyframes[0]

@@ -187,7 +187,9 @@ class SparseMap(MapTables):
     def update_features(self, keyframe: Keyframe, features: Features) -> None:
         """Replace the features of a keyframe by the same features with corrected pixels and depth.
 
-        Landmarks that no other keyframe observes move with their feature.
+        If the keyframe created all landmarks that it observes, its pose does not depend on its features, as that of the
+        first keyframe. Landmarks that no other keyframe observes then move with their feature. In other keyframes they
+        wait for the bundle adjustment, which also corrects the pose.
 
         Args:
             keyframe: Keyframe of this map.
@@ -198,6 +200,8 @@ class SparseMap(MapTables):
         feature, landmark = (self.observations[name][rows] for name in ("feature", "landmark"))
         for name in ("uv", "inverse_depth", "readout_jacobian"):
             self.observations[name][rows] = getattr(features, name)[feature]
+        if not bool((self.landmarks["keyframe"][landmark] == keyframe.index).all()):
+            return
         is_own = torch.bincount(self.observations["landmark"])[landmark] == 1
         moved = is_own & self.landmarks["active"][landmark] & (features.depth[feature] > 0)
         self.landmarks["point"][landmark[moved]] = landmark_points(keyframe.T_cw, features[feature[moved]], self.camera)
