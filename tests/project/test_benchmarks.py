@@ -163,6 +163,10 @@ class TestProcess:
         assert {"read", "features", "tracking"} <= set(run.stages)
         assert torch.allclose(run.trajectory.T_wc[0], torch.eye(4, dtype=torch.float64))
 
+    def test_failure_is_one_line(self, tmp_path: Path) -> None:
+        with pytest.raises(SystemRunError, match=r"^\S*nowhere: "):
+            measure("v3d_torch --segmenter none", str(tmp_path / "nowhere"), tmp_path)
+
     def test_missing_peer_fails_with_its_name(
         self, moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

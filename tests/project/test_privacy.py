@@ -104,19 +104,25 @@ print("end")
     assert not list_foreign_files(home)
 
 
-def test_runs_in_an_empty_home_write_only_files_of_the_package(call: Call, home: Path, moment: Path) -> None:
+def test_baseline_in_an_empty_home_writes_only_files_of_the_package(call: Call, home: Path, moment: Path) -> None:
+    done = call("-m", "v3d_torch", "run", "--seq", str(moment), "--segmenter", "none", "--out", "out")
+    assert done.returncode == 0, done.stderr
+    assert not list_foreign_files(home)
+    assert (home / "work" / "out" / "figures" / "trajectory.png").is_file()
+
+
+def test_batch_with_the_network_in_an_empty_home_writes_only_files_of_the_package(
+    call: Call, home: Path, moment: Path
+) -> None:
     """The network runs in the process of the command, which checks it, and in the worker process of the run."""
     YOLOSegmenter(SegmentationConfig())  # downloads the weights and exports the network, if they are not in the cache
     cache = home / ".cache" / "v3d_torch"
     cache.mkdir()
     for name in ("weights", "networks"):
         (cache / name).symlink_to(cache_dir() / name)
-    options = ("--configs", "full", "baseline", "--out", "out", "--workers", "2")
-    done = call("-m", "v3d_torch", "batch", "--seqs", str(moment), *options)
+    done = call("-m", "v3d_torch", "batch", "--seqs", str(moment), "--out", "out", "--workers", "2")
     assert done.returncode == 0, done.stderr + done.stdout
     assert not list_foreign_files(home)
-    for name in ("full", "baseline"):
-        assert (home / "work" / "out" / "moment" / name / "seed0" / "figures" / "trajectory.png").is_file()
 
 
 def test_setting_of_the_user_for_the_telemetry_of_onnxruntime_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
