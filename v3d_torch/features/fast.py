@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from v3d_torch.kernels import fast as kernels
 from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.kernels.fast import RADIUS
 
 _ARC = 9
 """Minimum number of adjacent pixels on the circle around a corner that are all brighter or all darker (FAST-9)."""
-
-_RADIUS = 3
-"""Radius of the circle, pixels."""
 
 _WHITE = 255
 """Grey level of white, by which kornia-rs divides the strength of corners."""
@@ -55,9 +53,9 @@ def detect_corners(
     """
     strength = np.zeros_like(image)
     for left, top, right, bottom in boxes.tolist():
-        region = image[top - _RADIUS : bottom + _RADIUS, left - _RADIUS : right + _RADIUS]
-        corners, response = kornia_rs.features.fast_detect(region.copy(), min_threshold, _ARC, _RADIUS)
-        columns, rows = corners.T.astype(np.int64) - _RADIUS
+        region = image[top - RADIUS : bottom + RADIUS, left - RADIUS : right + RADIUS]
+        corners, response = kornia_rs.features.fast_detect(region.copy(), min_threshold, _ARC, RADIUS)
+        columns, rows = corners.T.astype(np.int64) - RADIUS
         strength[top:bottom, left:right][rows, columns] = (response * _WHITE).round()
     before, after = (cv2.dilate(strength, neighbours) for neighbours in (_PIXELS_BEFORE, _PIXELS_BEFORE[::-1, ::-1]))
     maxima = (strength > before) & (strength >= after)

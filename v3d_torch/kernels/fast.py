@@ -10,7 +10,7 @@ from v3d_torch.kernels.compiler import device, kernel
 Image = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
-_RADIUS = 3
+RADIUS = 3
 """Radius of the circle around a corner, pixels."""
 
 
@@ -56,7 +56,7 @@ def _add_bright_arcs(rows: tuple[Image, ...], strength: Image) -> None:
 @device
 def _measure_strength(image: Image, y: int, left: int, right: int, strength: Image) -> None:
     """Raise the strength of the pixels of row ``y`` from column ``left`` to ``right``, see `_add_bright_arcs`."""
-    columns = slice(left - _RADIUS, right + _RADIUS)
+    columns = slice(left - RADIUS, right + RADIUS)
     rows = (
         image[y - 3, columns], image[y - 2, columns], image[y - 1, columns], image[y, columns],
         image[y + 1, columns], image[y + 2, columns], image[y + 3, columns],
@@ -110,11 +110,11 @@ def detect_corners(image: Image, boxes: Ints, threshold: int, min_threshold: int
             begin, end = max(first, top), min(first + cell, bottom)
             above, below = max(begin - 1, top), min(end + 1, bottom)
             strength[:] = 0
-            inverted = ~image[above - _RADIUS : below + _RADIUS]  # dark arcs are bright in it
+            inverted = ~image[above - RADIUS : below + RADIUS]  # dark arcs are bright in it
             for y in range(above, below):
                 row = strength[y - begin + 1, inside]
                 _measure_strength(image, y, left, right, row)
-                _measure_strength(inverted, y - above + _RADIUS, left, right, row)
+                _measure_strength(inverted, y - above + RADIUS, left, right, row)
             strongest[:] = 0
             for i in range(1, end - begin + 1):
                 _raise(strength[i], strongest)

@@ -32,18 +32,17 @@ def select_new_landmarks(features: Features, landmarks: Tensor, max_landmarks: i
     return unmatched[select_evenly(features.pixel[unmatched], count, cell)]
 
 
-def landmark_points(T_cw: Tensor, features: Features, camera: PinholeCamera) -> Tensor:
+def landmark_points(T_wc: Tensor, features: Features, camera: PinholeCamera) -> Tensor:
     """Positions of the landmarks that a single keyframe observes.
 
     Args:
-        T_cw: World-to-camera pose of the keyframe, float64, shape :math:`(4, 4)`.
+        T_wc: Camera-to-world pose of the keyframe, float64, shape :math:`(4, 4)`.
         features: Features with depth.
         camera: Intrinsics.
 
     Returns:
         Points, world frame, metres, float64, shape :math:`(N, 3)`.
     """
-    T_wc = invert(T_cw)
     return camera.back_project(features.uv, features.depth) @ T_wc[:3, :3].T + T_wc[:3, 3]
 
 
@@ -63,8 +62,9 @@ def create_landmarks(
     Returns:
         IDs of the new landmarks, int64, shape :math:`(N,)`.
     """
-    points = landmark_points(T_cw, features, camera)
-    ray = points - invert(T_cw)[:3, 3]
+    T_wc = invert(T_cw)
+    points = landmark_points(T_wc, features, camera)
+    ray = points - T_wc[:3, 3]
     distance = ray.norm(dim=1)
     ones = torch.ones(len(features), dtype=torch.int64)
     return table.append(

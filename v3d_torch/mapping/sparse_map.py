@@ -204,7 +204,8 @@ class SparseMap(MapTables):
             return
         is_own = torch.bincount(self.observations["landmark"])[landmark] == 1
         moved = is_own & self.landmarks["active"][landmark] & (features.depth[feature] > 0)
-        self.landmarks["point"][landmark[moved]] = landmark_points(keyframe.T_cw, features[feature[moved]], self.camera)
+        points = landmark_points(invert(keyframe.T_cw), features[feature[moved]], self.camera)
+        self.landmarks["point"][landmark[moved]] = points
 
     def set_readout(self, readout: Readout) -> None:
         """Set the readout and shift all stored features accordingly.
