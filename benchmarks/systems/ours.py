@@ -53,7 +53,9 @@ class Ours:
         return self.slam.timer.seconds
 
     def __call__(self, on_frame: FrameCallback | None = None) -> None:
-        """Track all frames.
+        """Track all frames, and apply the last correction of the map to their poses.
+
+        The dense map is not fused: the other systems make none.
 
         Args:
             on_frame: Called after each frame.
@@ -64,7 +66,8 @@ class Ours:
         failure = self.pipeline(on_frame).failure
         if failure is not None:
             raise RuntimeError(failure)
-        self.pipeline.flush()
+        with torch.inference_mode():
+            self.slam.flush()
 
     def trajectory(self) -> Trajectory:
         """Return a pose for every frame."""
