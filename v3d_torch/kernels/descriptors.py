@@ -9,6 +9,8 @@ from v3d_torch.kernels.compiler import device, kernel
 
 Words = NDArray[np.uint64]
 """Descriptors as 64-bit words, (N, 4)."""
+Word = NDArray[np.uint64]
+"""One word of each descriptor, (N,)."""
 Indices = NDArray[np.int64]
 
 MAX_DISTANCE = 1 << 9
@@ -43,6 +45,40 @@ def hamming_distance(a: Words, i: int, b: Words, j: int) -> int:
     )
 
 
+@device
+def _measure_distances(a: Words, i: int, columns: tuple[Word, ...], distances: Indices) -> None:
+    """Write the distances between descriptor ``a[i]`` and all descriptors whose words are given in columns.
+
+    The compiler vectorises this loop; a loop with conditions would take longer.
+    """
+    first, second, third, fourth = columns
+    for j in range(distances.size):
+        distances[j] = (
+            _count_bits(a[i, 0] ^ first[j])
+            + _count_bits(a[i, 1] ^ second[j])
+            + _count_bits(a[i, 2] ^ third[j])
+            + _count_bits(a[i, 3] ^ fourth[j])
+        )
+
+
+@device
+def _minimum(distances: Indices) -> int:
+    """Smallest distance, of at least one."""
+    least = distances[0]
+    for j in range(distances.size):
+        least = min(least, distances[j])
+    return least
+
+
+@device
+def _first_of(distances: Indices, distance: int) -> int:
+    """Position of the first descriptor at a distance; there is one."""
+    position = 0
+    while distances[position] != distance:
+        position += 1
+    return position
+
+
 @kernel("(u8[:,::1], u8[:,::1], i8, f8)")
 def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) -> Indices:
     """Pairs of mutual nearest neighbours that pass the ratio test, sorted by the row of ``a``, (K, 2).
@@ -54,23 +90,19 @@ def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) ->
         max_ratio: Maximum ratio of the best to the second-best distance.
     """
     pairs, count = np.empty((len(a), 2), np.int64), 0
+    rows, columns = a.T.copy(), b.T.copy()
+    from_a, from_b = np.empty(len(b), np.int64), np.empty(len(a), np.int64)
     for i in range(len(a)):
-        best, second, nearest = MAX_DISTANCE, MAX_DISTANCE, -1
-        for j in range(len(b)):
-            distance = hamming_distance(a, i, b, j)
-            if distance < second:  # rarely true
-                if distance < best:
-                    best, second, nearest = distance, best, j
-                else:
-                    second = distance
-        if best > max_hamming or best >= max_ratio * second:
+        _measure_distances(a, i, (columns[0], columns[1], columns[2], columns[3]), from_a)
+        best = _minimum(from_a)
+        if best > max_hamming:
             continue
-        mutual = True
-        for k in range(len(a)):
-            if hamming_distance(a, k, b, nearest) < best + (k < i):  # the lower row wins ties
-                mutual = False
-                break
-        if mutual:
+        nearest = _first_of(from_a, best)
+        from_a[nearest] = MAX_DISTANCE
+        if best >= max_ratio * _minimum(from_a):
+            continue
+        _measure_distances(b, nearest, (rows[0], rows[1], rows[2], rows[3]), from_b)
+        if _minimum(from_b) == best and _first_of(from_b, best) == i:  # the lower row wins ties
             pairs[count, 0], pairs[count, 1] = i, nearest
             count += 1
     return pairs[:count]
