@@ -55,13 +55,15 @@ def colour_histograms(image: Tensor, masks: Tensor) -> Tensor:
     Returns:
         Histograms that sum to 1, float32, shape :math:`(N, D)`; NaN for an instance with too few pixels.
     """
+    if len(masks) == 0:
+        return torch.empty(0, HISTOGRAM_SIZE)
     colours = image.numpy()[:, ::_STRIDE, ::_STRIDE].transpose(1, 2, 0)
     lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(colours), cv2.COLOR_RGB2LAB), np.uint8)
     brightness, a, b = (bins.take(lab[..., axis]) for axis, bins in enumerate((_BRIGHTNESS, _CHROMA, _CHROMA)))
     bins = ((brightness * _BINS + a) * _BINS + b).reshape(-1)
     inside = masks.numpy()[:, ::_STRIDE, ::_STRIDE].reshape(len(masks), bins.size)
     counts = [np.bincount(bins[mask], minlength=HISTOGRAM_SIZE) for mask in inside]
-    counted = torch.from_numpy(np.array(counts, np.float32).reshape(len(masks), HISTOGRAM_SIZE))
+    counted = torch.from_numpy(np.array(counts, np.float32))
     total = counted.sum(dim=1, keepdim=True)
     return (counted @ _SMOOTHING / total).masked_fill(total < _MIN_PIXELS, torch.nan)
 

@@ -9,6 +9,7 @@ before the object.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -54,18 +55,25 @@ class MaskRefiner:
     ) -> None:
         self._view = view
         self._config = config
+        self._newly_occupied = newly_occupied
         self._stride = newly_occupied.stride
-        depth = view.depth[0].numpy()
-        self._concave = find_concave_edges(depth[:: self._stride, :: self._stride])
-        # Pixels that a surface can grow over: no edge, and not occupied before the object appeared.
-        self._growable = find_smooth_pixels(depth, self._stride, config.edge_ratio)
-        self._growable &= ~(self._concave | newly_occupied.previously_occupied.numpy())
         located = [track for track in tracks if track.newest.has_centroid]
         R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
         clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in located]
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
         projected = silhouettes(clouds, camera, spacing)
         self._silhouettes = dict(zip(located, zip(projected, median_depths, strict=True), strict=True))
+
+    @cached_property
+    def _concave(self) -> NDArray[np.bool_]:
+        """Concave edges, at every n-th pixel."""
+        return find_concave_edges(self._view.depth[0].numpy()[:: self._stride, :: self._stride])
+
+    @cached_property
+    def _growable(self) -> NDArray[np.bool_]:
+        """Every n-th pixel over which a surface can grow: no edge, and not occupied before the object appeared."""
+        smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
+        return smooth & ~(self._concave | self._newly_occupied.previously_occupied.numpy())
 
     def refine(self, track: Track) -> Tensor:
         """Return the refined mask of one of the objects, bool, shape :math:`(H, W)`."""
