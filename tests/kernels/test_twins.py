@@ -20,6 +20,8 @@ from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.config.loading import load_config
 from v3d_torch.features.essential import essential_ransac
+from v3d_torch.geometry.camera import back_project
+from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 from v3d_torch.segmentation import YOLOSegmenter
@@ -68,6 +70,7 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Call]]:
         segmenter = YOLOSegmenter(SegmentationConfig())
         for frame in list(sequence)[::SEGMENTED]:
             segmenter(frame)
+            surface_normals(back_project(frame.depth[None], camera.rays))  # the map of all frames needs them
         # A short run closes no loop, and does not need essential matrices.
         optimise_pose_graph(**camera_inputs.graph(2, 15, torch.float64), robust=1.0)
         essential_ransac(**camera_inputs.two_views(2, 60, torch.float64), threshold=0.5)

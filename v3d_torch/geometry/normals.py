@@ -4,17 +4,32 @@ from __future__ import annotations
 
 from itertools import product
 
+import numpy as np
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import pad
 
 from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.kernels import normals as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _EPS = 1e-30  # keeps the division by a norm finite
+_RADIUS = 4
+_EDGE_RATIO = 0.05
 
 
-def surface_normals(points: Tensor, radius: int = 4, edge_ratio: float = 0.05) -> Tensor:
+def _surface_normals_compiled(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _EDGE_RATIO) -> Tensor:
+    if points.dtype != torch.float32 or points.ndim != 4 or points.shape[3] != 3:
+        return NotImplemented
+    normals = torch.zeros_like(points)
+    for image, result in zip(to_array(points), normals.numpy(), strict=True):
+        kernels.surface_normals(image, radius, np.float32(edge_ratio), np.float32(_EPS), result)
+    return normals
+
+
+@compiled_by(_surface_normals_compiled)
+def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _EDGE_RATIO) -> Tensor:
     """Estimate normals by averaging cross products of neighbour differences over a window.
 
     Cross products are averaged, not depths: the normal of a plane is exact even if a depth edge cuts the window, where

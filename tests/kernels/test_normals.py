@@ -1,0 +1,28 @@
+"""Surface normals of the kernel equal those of its torch twin."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from v3d_torch.geometry.normals import surface_normals
+from v3d_torch.kernels import compiler
+from v3d_torch.kernels.compiler import TWINS
+
+pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
+
+TWIN = TWINS[f"{surface_normals.__module__}.{surface_normals.__qualname__}"]
+
+
+@pytest.mark.parametrize("radius", [0, 1, 4])
+@pytest.mark.parametrize(("height", "width"), [(40, 50), (3, 3), (2, 9), (1, 1), (0, 5)])
+def test_normals_equal_those_of_the_twin(height: int, width: int, radius: int) -> None:
+    """On two surfaces with noise and holes, one behind the other."""
+    generator = torch.Generator().manual_seed(height + radius)
+    points = torch.rand(2, height, width, 3, generator=generator)
+    points[..., 2] = 2 + 0.05 * points[..., 2]
+    points[:, :, width // 2 :] *= 1.5
+    points[torch.rand(2, height, width, generator=generator) < 0.05] = 0
+    found, expected = TWIN.compiled(points, radius), TWIN.torch(points, radius)
+    assert torch.equal(found != 0, expected != 0)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
