@@ -279,12 +279,11 @@ class V3DSLAM(ReplaceableStages):
             is_static = features.in_mask(objects.static_mask)
             static = self._compensate(preprocessed.extraction.features[is_static], preprocessed, motion.velocity)
             landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
-            if motion.is_measured and not self.poses.has_motion:  # the first known velocity of the previous frame
-                self.refine_previous(self._previous, motion.velocity, self.poses)
+            velocity = self.motion_model.previous_velocity(self.poses, motion)
+            self.refine_previous(self._previous, velocity, self.poses)
             pose = self.track_camera(static, depth, self._compose_pose(motion), landmarks, motion, self.poses)
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
-            self.refine_previous(self._previous, self.motion_model.previous_velocity, self.poses)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
             if pose.status is not TrackingStatus.LOST:

@@ -36,6 +36,7 @@ class Camera:
     def __init__(self) -> None:
         self.poses = PoseHistory()
         self.model = MotionModel()
+        self.previous_velocity: Tensor | None = None  # of the frame before the last one
 
     def predict(self, stamp: float) -> Tensor:
         return self.model.predict(self.poses).pose_at(stamp)
@@ -54,6 +55,7 @@ class Camera:
             motion = CameraMotion(predicted.motion_until(stamp), predicted.velocity, pairs, is_measured=False)
         else:
             motion = CameraMotion(T_cp, se3_log(T_cp) / (stamp - self.poses.stamp), pairs, is_measured=True)
+        self.previous_velocity = self.model.previous_velocity(self.poses, motion)
         self.model.update(self.poses, stamp, pose, motion)
         return self.poses.append(stamp, pose, motion, reference, new)
 

@@ -66,8 +66,7 @@ def test_every_stage_is_seen_with_its_arguments_and_result() -> None:
         assert len(args) == count and isinstance(result, kind), name
     counts = Counter(name for name, _, _ in seen)
     assert counts.pop("compensate") == 2 * FRAMES  # for the odometry, and for the pose in the map
-    assert counts.pop("refine_previous") == FRAMES + 1  # for the first keyframe twice
-    assert counts == dict.fromkeys(set(STAGES) - {"compensate", "refine_previous"}, FRAMES)
+    assert counts == dict.fromkeys(set(STAGES) - {"compensate"}, FRAMES)
     last = {name: (args, result) for name, args, result in seen}
     assert last["segment"][0][0].index == FRAMES - 1
     assert last["smooth_depth"][0][0].shape == (1, 1, 120, 160)

@@ -24,7 +24,7 @@ def test_previous_velocity_is_unknown_after_a_jump_without_measured_motion() -> 
     velocities = []
     for index, T_cw in enumerate(T_cws):
         camera.append(0.1 * index, frame_pose(T_cw), None, None if index in (0, 3) else step)
-        velocities.append(camera.model.previous_velocity)
+        velocities.append(camera.previous_velocity)
     assert velocities[0] is None and velocities[3] is None
     for known in (*velocities[1:3], *velocities[4:]):
         torch.testing.assert_close(known, TWIST, rtol=0, atol=1e-9)

@@ -48,18 +48,29 @@ class MotionModel:
 
     Attributes:
         velocity: Twist per second after the last frame, as in `PosePrediction`.
-        previous_velocity: Mean twist per second around the frame before the last one, from the poses before and after
-            it; None if it is not known.
     """
 
     def __init__(self) -> None:
         self.velocity = torch.zeros(6, dtype=torch.float64)
-        self.previous_velocity: Tensor | None = None
 
     def predict(self, poses: PoseHistory) -> PosePrediction:
         """Predict the motion after the last frame; before the first frame, a camera at rest in the origin."""
         stamp = poses.stamp if len(poses) else 0.0
         return PosePrediction(stamp, poses.T_cw, self.velocity)
+
+    def previous_velocity(self, poses: PoseHistory, motion: CameraMotion) -> Tensor | None:
+        """Mean twist per second around the last frame, from the motion before and after it.
+
+        Args:
+            poses: Poses of all frames so far.
+            motion: Motion of the camera since the last of these frames.
+
+        Returns:
+            Twist per second, float64, shape :math:`(6,)`; None if it is not known.
+        """
+        if not len(poses) or poses.status is TrackingStatus.LOST or not motion.is_measured:
+            return None
+        return (self.velocity + motion.velocity) / 2 if poses.has_motion else motion.velocity
 
     def update(self, poses: PoseHistory, stamp: float, pose: FramePose, motion: CameraMotion) -> None:
         """Update the velocity with a new frame.
@@ -70,7 +81,6 @@ class MotionModel:
             pose: Pose of the new frame.
             motion: Motion of the camera since the previous frame.
         """
-        self.previous_velocity = None
         if not len(poses):
             return
         elapsed = stamp - poses.stamp
@@ -79,10 +89,7 @@ class MotionModel:
         elif pose.status is TrackingStatus.LOST:
             self.velocity = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:
-            velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / elapsed
-            if motion.is_measured:  # otherwise the pose can have jumped, by relocalisation
-                self.previous_velocity = (self.velocity + velocity) / 2 if poses.has_motion else velocity
-            self.velocity = velocity
+            self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / elapsed
 
     def state_dict(self) -> dict[str, Any]:
         """Return the velocity."""

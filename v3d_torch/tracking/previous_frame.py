@@ -1,4 +1,4 @@
-"""Refinement of the previous frame: its velocity is known better after the next frame is tracked."""
+"""Refinement of the previous frame: its velocity is known better once the motion after it is measured."""
 
 from __future__ import annotations
 
