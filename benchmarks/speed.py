@@ -29,10 +29,9 @@ SYSTEMS = (*OURS, *PEERS)
 ABOUT = (
     "Each run is a process of its own. Times run from before the first frame is read until the last frame has a pose."
     " They include reading and decoding of the images. They exclude imports, loading of the network or vocabulary,"
-    " mapping by ORB-SLAM3's threads after the last frame, and writing of results. CPU time is user and system time of"
-    " all threads. Ratios compare with pyorbslam3's run of"
-    " the same turn: above 1 means more frames per second, or more CPU time. Values are the median [lowest-highest] of"
-    " the turns."
+    " mapping by ORB-SLAM3's threads and fusion of our dense map after the last frame, and writing of results. CPU time"
+    " is user and system time of all threads. Ratios compare with pyorbslam3's run of the same turn: above 1 means more"
+    " frames per second, or more CPU time. Values are the median [lowest-highest] of the turns."
 )
 
 Turn = dict[str, Measured | str]
