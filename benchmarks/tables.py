@@ -19,6 +19,7 @@ SYSTEMS = {"full": "full", "baseline": "baseline", "pyorbslam3": "ORB-SLAM3 (PyP
 
 COMMANDS = {
     "v3d_torch": "v3d_torch",
+    "v3d_torch --config realtime": "v3d_torch `--config realtime`",
     "v3d_torch --serial": "v3d_torch `--serial`",
     "v3d_torch --segmenter none": "v3d_torch `--segmenter none`",
     "open3d": "Open3D odometry (no segmentation)",
@@ -73,7 +74,7 @@ def speed_table(measurements: Sequence[Measurement]) -> Iterator[str]:
     ratios = [f"relative to ORB-SLAM3, {sequence}" for sequence in sequences]
     yield markdown_row(["frames per second (CPU ms per frame)", *headings, *ratios])
     yield markdown_row(["---", *["---:"] * (2 * len(sequences))])
-    for system in [name for name in COMMANDS if any(name == measured for measured, _ in rows)]:
+    for system in sorted({system for system, _ in rows}, key=list(COMMANDS).index):  # an unknown system is an error
         measured = [rows.get((system, sequence)) for sequence in sequences]
         speeds = [f"{cells['fps']} ({cells['cpu_ms']})" if cells else "-" for cells in measured]
         yield markdown_row([COMMANDS[system], *speeds, *(cells["fps_ratio"] if cells else "-" for cells in measured)])
