@@ -24,10 +24,11 @@ _WINDOW = 5
 _MAX_DURATION = 0.3
 """Maximum duration of a window, seconds: within it, a cubic polynomial describes the motion of a handheld camera."""
 
-_PRIOR_RATIO = 9.0
-"""Ratio of variances that is assumed at the start of a run: three times the nominal standard deviation."""
+_PRIOR_RATIO = 20.0
+"""Ratio of variances that is assumed at the start of a run: more than four times the nominal standard deviation,
+because neither the velocity of the camera nor its readout is known yet."""
 
-_PRIOR_FRAMES = 5.0
+_PRIOR_FRAMES = 2.0
 """Weight of the prior ratio, in frames."""
 
 _MEMORY = 100.0
