@@ -118,4 +118,4 @@ def test_problems_of_a_batch_are_solved_as_alone(compiled: bool) -> None:
     for k, problem in enumerate(problems):
         alone = adjust(*problem, compiled=compiled)
         for one, other in zip(alone, together, strict=True):
-            torch.testing.assert_close(one, other[k], rtol=1e-8, atol=1e-9)
+            torch.testing.assert_close(one, other[k], rtol=1e-7, atol=1e-9)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, pad
 
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.se3 import se3_exp
@@ -26,6 +26,10 @@ _REGULARISATION = 1e-9
 _OCCLUSION_RATIO = 0.1
 """Maximum relative difference between the inverse depth in the current view and the expected one. Beyond it a point is
 occluded: the views show different surfaces, and their difference contains no information on the motion."""
+
+_BLOCK = 256
+"""Number of rows of one matrix product. The library splits products of more rows among threads on some processors, so
+that their rounding depends on the number of threads."""
 
 
 @dataclass(frozen=True)
@@ -124,10 +128,11 @@ class AlignmentProblem:
             return none.new_tensor(torch.inf), (none, none[0])
         costs, weights = student_t((residuals.values / self._sigma).square(), self._degrees_of_freedom)
         weights = (weights * residuals.valid / self._sigma.square()).flatten()
-        weighted = (self._jacobian * weights[:, None]).T
+        weighted = self._jacobian * weights[:, None]
         # Occluded points have a constant cost; otherwise a motion that occludes outliers would lower the cost.
         counted = torch.stack([residuals.valid[0], residuals.valid[1] | residuals.occluded])
-        return costs[counted].mean(), (weighted @ self._jacobian, weighted @ residuals.values.flatten())
+        gradient = _sum_products(weighted, residuals.values.flatten()[:, None])[:, 0]
+        return costs[counted].mean(), (_sum_products(weighted, self._jacobian), gradient)
 
     def information(self, system: System, valid_brightness: Tensor) -> Tensor:
         """Information matrix of ``xi``, with gain and bias marginalised, shape (6, 6).
@@ -142,7 +147,22 @@ class AlignmentProblem:
         H, _ = system
         pixel_jacobian = self.reference.pixel_jacobian[valid_brightness].flatten(0, 1).to(torch.float64)
         marginalised = H[:6, 6:] @ torch.linalg.pinv(H[6:, 6:], hermitian=True) @ H[6:, :6]
-        return H[:6, :6] - marginalised - self._GRADIENT_NOISE * (pixel_jacobian.T @ pixel_jacobian)
+        return H[:6, :6] - marginalised - self._GRADIENT_NOISE * _sum_products(pixel_jacobian, pixel_jacobian)
+
+
+def _sum_products(a: Tensor, b: Tensor) -> Tensor:
+    """Product of a transposed matrix and a matrix, both with many rows: the same with any number of threads.
+
+    Args:
+        a: Matrix, shape (M, I).
+        b: Matrix, shape (M, J).
+
+    Returns:
+        Shape (I, J).
+    """
+    rows = _BLOCK * max(1, -(-len(a) // _BLOCK))
+    blocks = [pad(each, (0, 0, 0, rows - len(each))).unflatten(0, (-1, _BLOCK)) for each in (a, b)]
+    return (blocks[0].mT @ blocks[1]).sum(dim=0)
 
 
 def step(state: State, system: System, damping: Tensor) -> State:
