@@ -296,3 +296,12 @@ class TestPage:
         assert "| walkers_desk (composed; people in fr1_rpy) | 9 | 0.2500 (50% of the frames) |" in page
         assert "| v3d_torch | 20.0 (90.0) | 0.50 |" in page
         assert "| **0.017** |" in write_page.main_tables(tmp_path)
+
+    def test_table_of_speed_has_a_row_for_every_measured_system(self) -> None:
+        turn: speed.Turn = {name: measured(20, 90) for name in speed.SYSTEMS}
+        rows = [{"sequence": "walkers_desk"} | row for row in speed.system_rows([turn])]
+        lines = list(tables.speed_table([storage.Measurement(self.HEADING, rows)]))
+        assert len(lines) == 2 + len(speed.SYSTEMS)
+        unknown = storage.Measurement(self.HEADING, [rows[0] | {"system": "unknown"}])
+        with pytest.raises(ValueError, match="unknown"):
+            list(tables.speed_table([unknown]))
