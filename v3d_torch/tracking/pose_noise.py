@@ -24,9 +24,9 @@ _WINDOW = 5
 _MAX_DURATION = 0.3
 """Maximum duration of a window, seconds: within it, a cubic polynomial describes the motion of a handheld camera."""
 
-_PRIOR_RATIO = 20.0
-"""Ratio of variances that is assumed at the start of a run: more than four times the nominal standard deviation,
-because neither the velocity of the camera nor its readout is known yet."""
+_PRIOR_RATIO = 16.0
+"""Ratio of variances that is assumed at the start of a run, when neither the velocity of the camera nor its readout is
+known: four times the nominal standard deviation."""
 
 _PRIOR_FRAMES = 2.0
 """Weight of the prior ratio, in frames."""
