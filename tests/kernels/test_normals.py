@@ -26,3 +26,10 @@ def test_normals_equal_those_of_the_twin(height: int, width: int, radius: int) -
     found, expected = TWIN.compiled(points, radius), TWIN.torch(points, radius)
     assert torch.equal(found != 0, expected != 0)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+
+
+def test_layout_of_the_points_does_not_matter() -> None:
+    """A view of channels-first points is not contiguous."""
+    points = 1 + 0.01 * torch.rand(1, 3, 20, 30, generator=torch.Generator().manual_seed(0))
+    view = points.movedim(1, -1)
+    assert torch.equal(surface_normals(view), surface_normals(view.contiguous()))

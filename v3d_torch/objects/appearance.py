@@ -56,7 +56,7 @@ def colour_histograms(image: Tensor, masks: Tensor) -> Tensor:
         Histograms that sum to 1, float32, shape :math:`(N, D)`; NaN for an instance with too few pixels.
     """
     if len(masks) == 0:
-        return torch.empty(0, HISTOGRAM_SIZE)
+        return torch.empty(0, HISTOGRAM_SIZE, dtype=torch.float32)
     colours = image.numpy()[:, ::_STRIDE, ::_STRIDE].transpose(1, 2, 0)
     lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(colours), cv2.COLOR_RGB2LAB), np.uint8)
     brightness, a, b = (bins.take(lab[..., axis]) for axis, bins in enumerate((_BRIGHTNESS, _CHROMA, _CHROMA)))
