@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.occupancy.up_direction import UpDirection
 
@@ -138,7 +139,7 @@ def _fit_normal(points: Tensor, levels: list[Tensor], size: float, direction: Te
     scatter = size**2 * torch.eye(3, dtype=points.dtype)
     for level in levels:
         centred = points[level] - points[level].mean(dim=0)
-        scatter = scatter + centred.T @ centred
+        scatter = scatter + sum_products(centred, centred)
     normal = torch.linalg.eigh(scatter).eigenvectors[:, 0]
     return normal * (normal @ direction).sign() if levels else direction
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample, pad
+from torch.nn.functional import grid_sample
 
 from v3d_torch.config import DenseOdometryConfig
+from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.odometry.dense_view import Level
 from v3d_torch.optim.levenberg_marquardt import student_t, student_t_scale
@@ -26,10 +27,6 @@ _REGULARISATION = 1e-9
 _OCCLUSION_RATIO = 0.1
 """Maximum relative difference between the inverse depth in the current view and the expected one. Beyond it a point is
 occluded: the views show different surfaces, and their difference contains no information on the motion."""
-
-_BLOCK = 256
-"""Number of rows of one matrix product. The library splits products of more rows among threads on some processors, so
-that their rounding depends on the number of threads."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +128,8 @@ class AlignmentProblem:
         weighted = self._jacobian * weights[:, None]
         # Occluded points have a constant cost; otherwise a motion that occludes outliers would lower the cost.
         counted = torch.stack([residuals.valid[0], residuals.valid[1] | residuals.occluded])
-        gradient = _sum_products(weighted, residuals.values.flatten()[:, None])[:, 0]
-        return costs[counted].mean(), (_sum_products(weighted, self._jacobian), gradient)
+        gradient = sum_products(weighted, residuals.values.flatten()[:, None])[:, 0]
+        return costs[counted].mean(), (sum_products(weighted, self._jacobian), gradient)
 
     def information(self, system: System, valid_brightness: Tensor) -> Tensor:
         """Information matrix of ``xi``, with gain and bias marginalised, shape (6, 6).
@@ -147,22 +144,7 @@ class AlignmentProblem:
         H, _ = system
         pixel_jacobian = self.reference.pixel_jacobian[valid_brightness].flatten(0, 1).to(torch.float64)
         marginalised = H[:6, 6:] @ torch.linalg.pinv(H[6:, 6:], hermitian=True) @ H[6:, :6]
-        return H[:6, :6] - marginalised - self._GRADIENT_NOISE * _sum_products(pixel_jacobian, pixel_jacobian)
-
-
-def _sum_products(a: Tensor, b: Tensor) -> Tensor:
-    """Product of a transposed matrix and a matrix, both with many rows: the same with any number of threads.
-
-    Args:
-        a: Matrix, shape (M, I).
-        b: Matrix, shape (M, J).
-
-    Returns:
-        Shape (I, J).
-    """
-    rows = _BLOCK * max(1, -(-len(a) // _BLOCK))
-    blocks = [pad(each, (0, 0, 0, rows - len(each))).unflatten(0, (-1, _BLOCK)) for each in (a, b)]
-    return (blocks[0].mT @ blocks[1]).sum(dim=0)
+        return H[:6, :6] - marginalised - self._GRADIENT_NOISE * sum_products(pixel_jacobian, pixel_jacobian)
 
 
 def step(state: State, system: System, damping: Tensor) -> State:
