@@ -117,5 +117,7 @@ def test_problems_of_a_batch_are_solved_as_alone(compiled: bool) -> None:
     together = BUNDLE_ADJUST[compiled](*batch, iterations=5, tolerance=1e-8)
     for k, problem in enumerate(problems):
         alone = adjust(*problem, compiled=compiled)
-        for one, other in zip(alone, together, strict=True):
-            torch.testing.assert_close(one, other[k], rtol=1e-7, atol=1e-9)
+        for name, one, other in zip(alone._fields, alone, together, strict=True):
+            # On some processors torch rounds products of a batch differently, which squared errors amplify most.
+            rtol = 1e-7 if name == "chi2" and not compiled else 1e-8
+            torch.testing.assert_close(one, other[k], rtol=rtol, atol=1e-9)
