@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -48,6 +49,16 @@ def pytest_configure(config: pytest.Config) -> None:
     cache_dir().mkdir(parents=True, exist_ok=True)
     with FileLock(cache_dir() / "kernels-of-tests.lock"):
         compile_kernels(Console(quiet=True))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect without garbage collection, which would take seconds, as imports leave little to collect."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

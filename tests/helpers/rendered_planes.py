@@ -56,7 +56,7 @@ def render(T_cw: Tensor, camera: PinholeCamera = LENS, planes: tuple = CORNER, p
     points = T_wc[:3, 3] + depth[..., None] * directions
     grey = torch.zeros_like(depth)
     for plane in range(len(planes)):
-        grey = torch.where(nearest == plane, paint(points, plane), grey)
+        grey[nearest == plane] = paint(points[nearest == plane], plane)
     return grey[None].float(), depth[None].float()
 
 

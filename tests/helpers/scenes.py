@@ -9,14 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path as FilePath
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, max_pool2d
+from torch.nn.functional import interpolate
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.config.loading import load_config
@@ -207,7 +208,12 @@ def measure_depth(depth: Tensor, generator: torch.Generator) -> Tensor:
     noisy = depth + 0.0014 * depth.square() * torch.randn(depth.shape, generator=generator)
     step = 0.00285  # 1/m: an eighth of a pixel at 580 pixels and 0.075 m
     quantised = 1 / (step * (1 / (step * noisy)).round())
-    edge = max_pool2d(depth[:, None], 3, 1, 1)[:, 0] > 1.06 * -max_pool2d(-depth[:, None], 3, 1, 1)[:, 0]
+    square = np.ones((3, 3), np.uint8)
+    farthest, nearest = (
+        torch.from_numpy(np.stack([extreme(image, square) for image in depth.numpy()]))
+        for extreme in (cv2.dilate, cv2.erode)
+    )
+    edge = farthest > 1.06 * nearest
     lost = torch.rand(depth.shape, generator=generator) < 0.01 + 0.49 * edge
     return torch.where(lost, 0.0, quantised)
 
@@ -270,8 +276,9 @@ class Network:
         inside, outside = (
             cv2.distanceTransform(part.to(torch.uint8).numpy(), cv2.DIST_L2, 3) for part in (mask, ~mask)
         )
-        coarse = torch.randn(1, 1, mask.shape[0] // 8, mask.shape[1] // 8, generator=generator)
-        error = self.contour * interpolate(coarse, mask.shape, mode="bicubic")[0, 0]
+        coarse = torch.randn(mask.shape[0] // 8, mask.shape[1] // 8, generator=generator)
+        rows, columns = map(_bicubic_weights, coarse.shape, mask.shape)
+        error = self.contour * rows @ coarse @ columns.T
         # Distances are to the nearest pixel of the other kind; the contour lies half a pixel before this pixel.
         return torch.from_numpy(inside - outside) - 0.5 * (2 * mask.float() - 1) > error
 
@@ -280,6 +287,12 @@ class Network:
         label = other if float(torch.rand((), generator=generator)) < probability else thing.label
         assert label is not None
         return label
+
+
+@cache
+def _bicubic_weights(size: int, new_size: int) -> Tensor:
+    """Weights of bicubic interpolation along one axis, of shape (new_size, size)."""
+    return interpolate(torch.eye(size)[None, None], (new_size, size), mode="bicubic")[0, 0]
 
 
 def _bounding_box(mask: Tensor) -> Tensor:

@@ -289,5 +289,7 @@ def _compare(predicted: PredictedTracks, detected: DetectedInstances, config: Tr
 
 def _assign(evidence: Tensor, rows: Tensor, columns: Tensor) -> list[tuple[int, int]]:
     """Assign columns to rows by their evidence; return the pairs of indices."""
+    if not (rows.any() and columns.any()):
+        return []
     matched = match_instances(evidence[None], rows[None], columns[None])[0]
     return [(i, j) for j, i in enumerate(matched.tolist()) if i >= 0]

@@ -34,7 +34,12 @@ DEPTH = [f"depth/{stamp}.png" for stamp in STAMPS]
 
 def every(files: list[str], content: Callable[[int], bytes]) -> Damage:
     """Rewrite each of these files, by its index."""
-    return all_of(*(write(file, content(i)) for i, file in enumerate(files)))
+
+    def make(place: Workspace) -> None:
+        for i, file in enumerate(files):
+            write(file, content(i))(place)
+
+    return make
 
 
 def saved(image: NDArray[np.generic], form: str, **settings: object) -> bytes:
