@@ -8,8 +8,9 @@ import sys
 import psutil
 import pytest
 
-from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runtime.process import trim_memory
@@ -42,15 +43,16 @@ def test_trim_memory_does_nothing_with_other_c_libraries(monkeypatch: pytest.Mon
     trim_memory()
 
 
-def test_pipeline_trims_memory_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("live", [False, True])
+def test_pipeline_trims_memory_at_intervals(live: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     demo, trimmed_after = load_sequence("demo"), []
-    config = load_config(None, ["segmentation.source=none", "prefetch=false"])
-    pipeline = Pipeline(demo, V3DSLAM(demo.camera, config=config))
+    config = load_config(None, ["segmentation.source=none"])
+    pipeline = Pipeline(RealtimePlayback(demo) if live else demo, V3DSLAM(demo.camera, config=config))
     monkeypatch.setattr(pipeline_module, "_TRIM_INTERVAL", 3)
     monkeypatch.setattr(pipeline_module, "trim_memory", lambda: trimmed_after.append(len(pipeline.record.times)))
 
-    def stop(frame: RGBDFrame, *_: object) -> None:
-        if frame.index == 7:
+    def stop(*_: object) -> None:
+        if len(pipeline.record.times) == 8:
             raise KeyboardInterrupt
 
     assert pipeline(stop).interrupted and trimmed_after == [3, 6]

@@ -198,6 +198,8 @@ class Pipeline:
                     record.times.append(frame, times)
                     self._record_frame(frame, result)
                     self._viewer.show(frame, result, self.slam, times)
+                    if len(self.slam.poses) % _TRIM_INTERVAL == 0:
+                        trim_memory()
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
@@ -228,6 +230,7 @@ class Pipeline:
         self._warn(check_colour_order(self.views, self.slam.segment))
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
+        trim_memory()  # fusion and figures take their memory where the frames had theirs
         point_map = fuse_points(self.views, self.slam.config)
         try:
             self._viewer.finish(self.slam, point_map)
@@ -253,8 +256,6 @@ class Pipeline:
                 self._record_broken(frames, before=preprocessed.frame.index)
                 self.between_frames = False
                 yield preprocessed.frame, self.slam.track(preprocessed)
-                if len(self.slam.poses) % _TRIM_INTERVAL == 0:
-                    trim_memory()
         self._record_broken(frames, before=math.inf)
 
     def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
