@@ -6,6 +6,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
 from v3d_torch.runtime.batches import fill_padding
@@ -50,7 +51,7 @@ def umeyama(
         w = fill_padding(weights, valid, 0.0)[..., None]
     mean_a, mean_b = (weighted_mean(points, w) for points in (a, b))
     a, b = a - mean_a[..., None, :], b - mean_b[..., None, :]
-    M = (b if w is None else b * w).mT @ a
+    M = sum_products(b if w is None else b * w, a)
     R = nearest_rotation(M)
     if with_scale:
         spread = (a.square() if w is None else a.square() * w).sum(dim=(-2, -1))

@@ -14,12 +14,15 @@ def sum_products(a: Tensor, b: Tensor) -> Tensor:
     """Product of a transposed matrix and a matrix, both with many rows: the sum of the products of their rows.
 
     Args:
-        a: Matrix, shape :math:`(M, I)`.
-        b: Matrix of the same dtype, shape :math:`(M, J)`.
+        a: Matrix, shape :math:`(..., M, I)`.
+        b: Matrix of the same dtype, shape :math:`(..., M, J)`.
 
     Returns:
-        Shape :math:`(I, J)`.
+        Shape :math:`(..., I, J)`.
     """
-    rows = _BLOCK * max(1, -(-len(a) // _BLOCK))
-    a_blocks, b_blocks = (pad(each, (0, 0, 0, rows - len(each))).unflatten(0, (-1, _BLOCK)) for each in (a, b))
-    return (a_blocks.mT @ b_blocks).sum(dim=0)
+    rows = a.shape[-2]
+    if rows <= _BLOCK:
+        return a.mT @ b
+    padding = -rows % _BLOCK
+    a_blocks, b_blocks = (pad(each, (0, 0, 0, padding)).unflatten(-2, (-1, _BLOCK)) for each in (a, b))
+    return (a_blocks.mT @ b_blocks).sum(dim=-3)
