@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import columns
 from changed_cameras import calibrate_changed_cameras
 from command import add_sequences_option, make_parser, publish_rows
+from sequences import table_name
 from storage import Row
 
 from v3d_torch.calibration.parameters import DISTORTION, get_values
@@ -30,7 +31,7 @@ def measure(source: str, config: Config) -> Iterator[Row]:
                 continue
             (truth,) = get_values(right, math.nan if right.readout is None else right.readout, [each.name])
             yield {
-                "sequence": sequence.name,
+                "sequence": table_name(sequence),
                 "change": changed.change,
                 "parameter": each.name,
                 "right": "unknown" if math.isnan(truth) else f"{truth:.6g}",

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from command import add_sequences_option, make_parser, publish_rows
 from scipy.stats import chi2, norm
+from sequences import table_name
 from storage import Row
 from systems.ours import OPTIONS, Ours
 from torch import Tensor
@@ -194,7 +195,7 @@ def run(source: str, configuration: str) -> Row:
     T_wc = torch.eye(4, dtype=torch.float64).repeat(len(states), 1, 1)
     T_wc[:, :3] = states["T_wc"]
     errors = calibrated_errors(sequence.groundtruth, states["stamp"], T_wc, states["covariance"].to(torch.float64))
-    return make_row(sequence.name.replace("/", "_"), configuration, errors, groundtruth_noise(sequence.groundtruth))
+    return make_row(table_name(sequence), configuration, errors, groundtruth_noise(sequence.groundtruth))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

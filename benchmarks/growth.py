@@ -19,7 +19,7 @@ import torch
 from command import make_parser, publish
 from heading import make_heading
 from replay import Replay, back_and_forth
-from sequences import locate_sequence
+from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from systems.ours import Ours
 from tables import flat
@@ -109,7 +109,7 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
     early, late = ends[0], ends[-1]
     later = frames - frames // BLOCKS
     summary = {
-        "sequence": sequence.name,
+        "sequence": table_name(sequence),
         "frames": str(frames),
         "cpu_ms": ", ".join(cpu_ms),
         "memory_mb": f"{early.resident_mb:.0f} to {late.resident_mb:.0f}",

@@ -25,6 +25,7 @@ from interruptions import (
     elsewhere,
     uninterrupted,
 )
+from sequences import table_name
 from storage import Row
 from torch import Tensor
 
@@ -183,7 +184,7 @@ def measure(source: str, gaps: Sequence[int], before: int, after: int, with_mask
     for case in [*cases, elsewhere(count, before, after)]:
         scored = score(case, run_case(sequence, case, config, masks), plain, T_gc)
         yield {
-            "sequence": sequence.name,
+            "sequence": table_name(sequence),
             "interruption": case.name,
             "recovery": "no known place" if scored.recovery is None else f"{scored.recovery:g}",
             "unflagged": str(scored.unflagged),

@@ -16,7 +16,7 @@ import columns
 import torch
 from command import make_parser, publish
 from heading import make_heading
-from sequences import locate_sequence
+from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from tables import flat
 from timing import timed
@@ -95,7 +95,7 @@ def measure_costs(sequence: RGBDSequence, slam: V3DSLAM, views: StaticViews) -> 
         saving, _ = timed(lambda: save_map(path, slam.map, views), time.process_time)
         loading, _ = timed(lambda: load_map(path, sequence.camera, slam.config), time.process_time)
         return {
-            "sequence": sequence.name,
+            "sequence": table_name(sequence),
             "keyframes": str(len(views)),
             "points": f"{len(cloud)} in {points:.1f} s",
             "triangles": f"{len(mesh.faces)} in {faces:.1f} s",
@@ -118,7 +118,7 @@ def main() -> None:
         for name in options.seqs:
             sequence = load_sequence(locate_sequence(name, options.data_root), data_root=options.data_root)
             slam, views, people = run(sequence)
-            rows = list(count_people(sequence.name, people))
+            rows = list(count_people(table_name(sequence), people))
             costs = measure_costs(sequence, slam, views)
             lines += ["", f"## {name}", "", *flat(rows, columns.MAPS)]
             lines += ["", f"CPU time on {os.cpu_count()} cores: " + "; ".join(f"{k} {v}" for k, v in costs.items())]

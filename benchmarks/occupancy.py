@@ -19,7 +19,7 @@ import torch
 from command import make_parser, publish
 from demo_surfaces import body_points, seen_points, static_surfaces
 from heading import make_heading
-from sequences import locate_sequence
+from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from tables import flat
 from timing import timed
@@ -143,7 +143,7 @@ def measure_costs(pipeline: Pipeline, mapper: OccupancyMapper) -> Row:
         write_octomap(Path(folder) / "map.bt", occupancy)
         sizes = [f"{(Path(folder) / name).stat().st_size / 1e3:.0f}" for name in ("map.npz", "map.bt")]
     return {
-        "sequence": pipeline.sequence.name.replace("/", "_"),
+        "sequence": table_name(pipeline.sequence),
         "cpu_ms": f"{float(cpu.mean()):.2f}",
         "cpu_ms_95": f"{float(cpu.quantile(0.95)):.1f}",
         "octomap_ms": octomap_time(pipeline, mapper),

@@ -15,7 +15,7 @@ from statistics import median
 import columns
 from command import make_parser, publish
 from heading import make_heading
-from sequences import locate_sequence
+from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from tables import flat
 from torch import Tensor
@@ -115,7 +115,7 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
         if truth is not None:
             ate = evaluate(truth, pipeline.slam.poses.trajectory(), frames=len(sequence)).ate.rmse
         yield {
-            "sequence": sequence.name,
+            "sequence": table_name(sequence),
             "network": name,
             "ms": f"{1e3 * median(segmenter.seconds) / variant.every:.0f}",
             "people_found": format_value(found / expected if expected else None, ".1%"),

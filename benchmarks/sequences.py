@@ -7,6 +7,7 @@ from pathlib import Path
 from systems.vocabulary import vocabulary
 
 from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.base import RGBDStream
 
 
 def list_sequences(data_root: Path) -> list[str]:
@@ -20,6 +21,11 @@ def locate_sequence(name: str, data_root: Path) -> str:
     """Return the folder of a sequence in the data root, else its name, as `load_sequence` takes it."""
     folder = data_root / name
     return str(folder) if folder.is_dir() else name
+
+
+def table_name(sequence: RGBDStream) -> str:
+    """Return the name of a sequence in tables: that of its folder."""
+    return sequence.name.replace("/", "_")
 
 
 def trained_vocabulary(names: list[str], data_root: Path) -> Path:

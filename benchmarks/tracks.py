@@ -13,7 +13,7 @@ import columns
 import torch
 from command import make_parser, publish
 from heading import make_heading
-from sequences import locate_sequence
+from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from systems.box_trackers import PEERS, SETTINGS, BoxTracker
 from tables import flat
@@ -140,7 +140,7 @@ def main() -> None:
         for name in options.seqs:
             sequence = load_sequence(locate_sequence(name, options.data_root), data_root=options.data_root)
             truth = true_people(sequence, options.frames, correct_ids=not options.ids_as_given)
-            rows += score_rows(sequence.name, *compare(sequence, truth, Config()))
+            rows += score_rows(table_name(sequence), *compare(sequence, truth, Config()))
     except V3DError as error:
         parser.error(str(error))
     lines = ["# Tracks of people", "", *heading.lines(), "", *flat(rows, columns.TRACKS), "", ABOUT]
