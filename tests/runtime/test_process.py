@@ -12,7 +12,7 @@ from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.pipeline import pipeline as pipeline_module
+from v3d_torch.runtime import process
 from v3d_torch.runtime.process import trim_memory
 
 
@@ -48,8 +48,8 @@ def test_pipeline_trims_memory_at_intervals(live: bool, monkeypatch: pytest.Monk
     demo, trimmed_after = load_sequence("demo"), []
     config = load_config(None, ["segmentation.source=none"])
     pipeline = Pipeline(RealtimePlayback(demo) if live else demo, V3DSLAM(demo.camera, config=config))
-    monkeypatch.setattr(pipeline_module, "_TRIM_INTERVAL", 3)
-    monkeypatch.setattr(pipeline_module, "trim_memory", lambda: trimmed_after.append(len(pipeline.record.times)))
+    monkeypatch.setattr(process, "_TRIM_INTERVAL", 3)
+    monkeypatch.setattr(process, "trim_memory", lambda: trimmed_after.append(len(pipeline.record.times)))
 
     def stop(*_: object) -> None:
         if len(pipeline.record.times) == 8:

@@ -13,13 +13,10 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.frame_capture import FrameCapture
 from v3d_torch.live.live_preprocessor import LivePreprocessor
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
-from v3d_torch.runtime.process import trim_memory
+from v3d_torch.runtime.process import trim_memory_at_intervals
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame
-
-_TRIM_INTERVAL = 200
-"""Number of frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,8 +104,7 @@ class LiveSLAM:
                     finished_at=finished_at,
                     dropped=dropped,
                 )
-                if len(self.slam.poses) % _TRIM_INTERVAL == 0:
-                    trim_memory()
+                trim_memory_at_intervals(len(self.slam.poses))
             self.slam.flush()
 
     def __call__(self, on_result: Callable[[LiveResult], object]) -> None:

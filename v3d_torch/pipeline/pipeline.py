@@ -27,7 +27,7 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.pipeline.run_record import RunRecord, Snapshot
 from v3d_torch.reconstruction.point_map import PointMap, fuse_points
-from v3d_torch.runtime.process import trim_memory
+from v3d_torch.runtime.process import trim_memory, trim_memory_at_intervals
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
@@ -36,9 +36,6 @@ _LOG = logging.getLogger(__name__)
 
 _SNAPSHOTS = 6
 """Number of frames in the figure of masks."""
-
-_TRIM_INTERVAL = 200
-"""Number of frames between two calls of `trim_memory`, which takes some milliseconds."""
 
 _CHECKED_KEYFRAMES = 15
 """Number of keyframes after which camera and depth are checked: some seconds of a moving camera. A shorter run is
@@ -198,8 +195,6 @@ class Pipeline:
                     record.times.append(frame, times)
                     self._record_frame(frame, result)
                     self._viewer.show(frame, result, self.slam, times)
-                    if len(self.slam.poses) % _TRIM_INTERVAL == 0:
-                        trim_memory()
                     record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
                     if on_frame is not None:
                         on_frame(frame, result)
@@ -230,7 +225,7 @@ class Pipeline:
         self._warn(check_colour_order(self.views, self.slam.segment))
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
-        trim_memory()  # fusion and figures take their memory where the frames had theirs
+        trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
         point_map = fuse_points(self.views, self.slam.config)
         try:
             self._viewer.finish(self.slam, point_map)
@@ -256,6 +251,7 @@ class Pipeline:
                 self._record_broken(frames, before=preprocessed.frame.index)
                 self.between_frames = False
                 yield preprocessed.frame, self.slam.track(preprocessed)
+                trim_memory_at_intervals(len(self.slam.poses))
         self._record_broken(frames, before=math.inf)
 
     def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:

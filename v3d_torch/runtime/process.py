@@ -8,6 +8,9 @@ import sys
 import cv2
 import torch
 
+_TRIM_INTERVAL = 200
+"""Number of frames between two calls of `trim_memory`, which takes some milliseconds."""
+
 
 def set_num_threads(threads: int) -> None:
     """Set the number of threads of torch and OpenCV.
@@ -31,3 +34,13 @@ def trim_memory() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
+
+
+def trim_memory_at_intervals(frames: int) -> None:
+    """Call `trim_memory` after every 200th frame.
+
+    Args:
+        frames: Number of frames so far.
+    """
+    if frames % _TRIM_INTERVAL == 0:
+        trim_memory()
