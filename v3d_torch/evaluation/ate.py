@@ -10,6 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
+from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.runtime.batches import fill_padding
 
 _MIN_PLANE_SPREAD = 1e-3
@@ -104,7 +105,7 @@ def spans_plane(positions: Tensor, valid: Tensor | None = None) -> Tensor:
         count: Tensor | int = max(positions.shape[-2], 1)
     else:
         centred, count = torch.where(each, centred, 0.0), each.sum(dim=-2, keepdim=True).clamp(min=1)
-    spread = torch.linalg.eigvalsh(centred.mT @ centred / count).clamp(min=0).sqrt()  # increasing
+    spread = torch.linalg.eigvalsh(sum_products(centred, centred) / count).clamp(min=0).sqrt()  # increasing
     return spread[..., 1] > _MIN_PLANE_SPREAD
 
 
