@@ -24,7 +24,7 @@ def locate_sequence(name: str, data_root: Path) -> str:
 
 
 def table_name(sequence: RGBDStream) -> str:
-    """Return the name of a sequence in tables: that of its folder."""
+    """Return the name of a sequence in tables, without slashes: ``fr1_rpy`` for ``fr1/rpy``."""
     return sequence.name.replace("/", "_")
 
 

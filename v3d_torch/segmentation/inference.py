@@ -219,7 +219,7 @@ def open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
     options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.use_deterministic_compute = True
-    # An arena would keep the memory of the largest section of the feature maps for each of its sizes.
+    # An arena would keep memory for all sizes of the sections of feature maps, which differ from image to image.
     options.enable_cpu_mem_arena = False
     # Spinning threads would slow down torch, which computes between two calls.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
