@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import simplejpeg
 import torch
-from kornia_rs import io
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from v3d_torch.datasets.png import PNG_SIGNATURE, Pixels, decode_png
 from v3d_torch.errors import InputError
 
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
@@ -23,82 +27,68 @@ MAX_PIXELS = 1 << 26
 an image that would fill the memory."""
 
 
+_MAX_BYTES = 8 * MAX_PIXELS
+"""Number of bytes that are read of a file at most: 16-bit RGB images of `MAX_PIXELS` without compression have fewer."""
+
+_JPEG_SIGNATURE = b"\xff\xd8\xff"
+"""First bytes of a JPEG image."""
+
+
 def read_colour(path: Path) -> Tensor:
-    """Read a colour image. PNG and JPEG are decoded by kornia_rs, other formats by Pillow.
+    """Read a colour image from a file, see `decode_colour`.
+
+    Raises:
+        InputError: If the file is missing, truncated, not an image, too large, or a 16-bit (depth) image.
+    """
+    return decode_colour(_read_file(path), path)
+
+
+def read_depth_image(path: Path) -> NDArray[np.generic]:
+    """Read a depth image from a file, see `decode_depth`.
+
+    Raises:
+        InputError: If the file is missing, truncated, not an image, too large, or not a depth image.
+    """
+    return decode_depth(_read_file(path), path)
+
+
+def decode_colour(content: bytes, source: object) -> Tensor:
+    """Decode a colour image. PNG and JPEG are decoded without the GIL, other formats by Pillow.
+
+    Args:
+        content: Bytes of the image file.
+        source: Origin of the bytes, for messages.
 
     Returns:
         RGB image, uint8, shape :math:`(3, H, W)`. The memory is channels-last, so that :math:`(H, W, 3)` is available
         without a copy.
 
     Raises:
-        InputError: If the file is missing, truncated, not an image, too large, or a 16-bit (depth) image.
+        InputError: If the image is truncated, not an image, too large, or a 16-bit (depth) image.
     """
-    image_size(path)
-    try:
-        # These two decoders reject truncated files; kornia_rs.io.read_image and OpenCV fill them up with grey.
-        if path.suffix.lower() in (".jpg", ".jpeg"):
-            pixels = io.read_image_jpegturbo(str(path))
-        else:
-            pixels = io.read_image_png_u8(str(path), "rgb")
-    except Exception:  # kornia_rs raises bare Exception for every cause: Pillow decodes the image or names the cause
-        pixels = _decode_colour_with_pillow(path, path)
-    return torch.from_numpy(pixels).permute(2, 0, 1)
-
-
-def read_depth_image(path: Path) -> NDArray[np.generic]:
-    """Read a depth image. 16-bit PNG is decoded by kornia_rs, other formats by Pillow.
-
-    Args:
-        path: Path of an image with 16 or 32 bits per pixel.
-
-    Returns:
-        Whole numbers in units of the file, or metres in floating point, shape (H, W).
-
-    Raises:
-        InputError: If the file is missing, truncated, not an image, too large, or not a depth image.
-    """
-    image_size(path)
-    try:
-        return io.read_image_png_u16(str(path), "mono")[..., 0]
-    except Exception:  # kornia_rs raises bare Exception for every cause: Pillow decodes the image or names the cause
-        return _decode_depth_with_pillow(path, path)
-
-
-def decode_colour(content: bytes, source: object) -> Tensor:
-    """Decode a colour image from the bytes of an image file, like `read_colour`.
-
-    Args:
-        content: Bytes of the image file.
-        source: Origin of the bytes, for messages.
-
-    Returns:
-        RGB image, uint8, shape :math:`(3, H, W)`.
-
-    Raises:
-        InputError: See `read_colour`.
-    """
-    _read_header(BytesIO(content), source)
-    try:
-        pixels = io.decode_image_jpegturbo(content, "rgb")
-    except Exception:  # every format but JPEG
+    pixels = _decode_common(content)
+    if pixels is None or pixels.shape[2] != 3:
         pixels = _decode_colour_with_pillow(BytesIO(content), source)
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
 def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
-    """Decode a depth image from the bytes of an image file, like `read_depth_image`.
+    """Decode a depth image. 16-bit PNG is decoded without the GIL, other formats by Pillow.
 
     Args:
-        content: Bytes of the image file.
+        content: Bytes of the file of an image with 16 or 32 bits per pixel.
         source: Origin of the bytes, for messages.
 
     Returns:
         Whole numbers in units of the file, or metres in floating point, shape (H, W).
 
     Raises:
-        InputError: See `read_depth_image`.
+        InputError: If the image is truncated, not an image, too large, or not a depth image.
     """
-    return _decode_depth_with_pillow(BytesIO(content), source)
+    pixels = _decode_common(content)
+    if pixels is None or pixels.dtype != np.uint16:
+        return _decode_depth_with_pillow(BytesIO(content), source)
+    return pixels[..., 0]
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -118,6 +108,30 @@ def is_depth_image(path: Path) -> bool:
             return _is_depth_mode(image.mode)
     except InputError:
         return False
+
+
+def _read_file(path: Path) -> bytes:
+    """Bytes of a file, the first ones if it is too large for an image."""
+    with _file_errors(path), path.open("rb") as file:
+        return file.read(min(os.fstat(file.fileno()).st_size, _MAX_BYTES))
+
+
+def _decode_common(content: bytes) -> Pixels | None:
+    """Decode a PNG or JPEG image, shape (H, W, C).
+
+    Returns:
+        None for an image of another kind, or that is damaged or too large: Pillow decodes it or names the cause.
+    """
+    try:
+        if content.startswith(PNG_SIGNATURE):
+            return decode_png(content, MAX_PIXELS)
+        if content.startswith(_JPEG_SIGNATURE):
+            height, width, colours, _ = simplejpeg.decode_jpeg_header(content)
+            if height * width <= MAX_PIXELS and colours not in ("CMYK", "YCCK"):  # Pillow converts inks better
+                return simplejpeg.decode_jpeg(content, "RGB")
+    except ValueError:
+        pass
+    return None
 
 
 def _is_depth_mode(mode: str) -> bool:
@@ -166,11 +180,11 @@ def _decode(file: Path | BytesIO, source: object) -> Image.Image:
 def _read_header(file: Path | BytesIO, source: object) -> Image.Image:
     """Open an image and read its header only."""
     try:
-        with warnings.catch_warnings():
+        with _file_errors(source), warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(file, formats=_FORMATS)
-    except FileNotFoundError as error:
-        raise InputError(f"{source}: is listed but does not exist; copy the whole sequence again") from error
+    except InputError:
+        raise
     except UnidentifiedImageError as error:
         if _is_tiff(file):
             raise InputError(
@@ -180,14 +194,25 @@ def _read_header(file: Path | BytesIO, source: object) -> Image.Image:
         raise InputError(f"{source}: is not a PNG, JPEG or TIFF image; copy or export it again") from error
     except Image.DecompressionBombError as error:
         raise too_large_error(source) from error
-    except Exception as error:  # an error of the file system, or any exception of a decoder on invalid data
-        if isinstance(error, OSError) and error.errno is not None:
-            raise InputError(f"{source}: cannot be read ({error.strerror}); check its permissions") from error
+    except Exception as error:  # on invalid data a decoder can raise any exception
         raise InputError(f"{source}: is truncated or damaged; copy or download it again") from error
     if image.width * image.height > MAX_PIXELS:
         image.close()
         raise too_large_error(source)
     return image
+
+
+@contextmanager
+def _file_errors(source: object) -> Iterator[None]:
+    """Turn errors of the file system into an InputError."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"{source}: is listed but does not exist; copy the whole sequence again") from error
+    except OSError as error:
+        if error.errno is None:  # raised by a decoder
+            raise
+        raise InputError(f"{source}: cannot be read ({error.strerror}); check its permissions") from error
 
 
 def _is_tiff(file: Path | BytesIO) -> bool:
