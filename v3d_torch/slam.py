@@ -39,7 +39,7 @@ from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful, is_stateful
-from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation import NoSegmentation, make_segmenter
 from v3d_torch.segmentation.segmenter import restore_segmenter, segment_frame, segmenter_state_of
 from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stages.protocols import (
@@ -286,7 +286,7 @@ class V3DSLAM(ReplaceableStages):
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
-            if pose.status is not TrackingStatus.LOST:
+            if pose.status is not TrackingStatus.LOST and not isinstance(self.segment, NoSegmentation):
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)

@@ -125,7 +125,9 @@ def se3_exp(xi: Tensor) -> Tensor:
 
 
 def _se3_log_compiled(T: Tensor) -> Tensor:
-    return torch.from_numpy(kernels.log(to_array(T))) if _is_single(T, 4, 4) else NotImplemented
+    if T.dtype != torch.float64:
+        return NotImplemented
+    return torch.from_numpy(kernels.logarithms(to_array(T.reshape(-1, 4, 4)))).reshape(*T.shape[:-2], 6)
 
 
 @compiled_by(_se3_log_compiled)

@@ -1,4 +1,4 @@
-"""Kernels for one rigid motion or one tangent vector; see `v3d_torch.geometry.se3`."""
+"""Kernels for rigid motions and tangent vectors; see `v3d_torch.geometry.se3`."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _quaternion(R: Array) -> Array:
     return -q if q[0] < 0 else q
 
 
-@kernel("(f8[:,::1],)")
+@device
 def log(T: Array) -> Array:
     """Logarithm of a rigid motion, (4, 4): the tangent vector ``[translation, rotation]``, (6,)."""
     q, small = _quaternion(T), SMALL_ANGLE**2
@@ -123,6 +123,15 @@ def log(T: Array) -> Array:
             c,
         ]
     )
+
+
+@kernel("(f8[:,:,::1],)")
+def logarithms(T: Array) -> Array:
+    """Logarithms of rigid motions, (B, 4, 4): the tangent vectors, (B, 6)."""
+    result = np.empty((len(T), 6))
+    for b in range(len(T)):
+        result[b] = log(T[b])
+    return result
 
 
 @device

@@ -60,6 +60,8 @@ def static_masks(
 
 def _outside(masks: list[Tensor], size: torch.Size, dilation: int) -> Tensor:
     """Return the pixels outside of all dilated masks, bool, shape (H, W)."""
+    if not masks:
+        return torch.ones(size, dtype=torch.bool)
     covered = np.zeros(size, np.bool_)
     for mask in masks:
         covered |= mask.numpy()  # NumPy combines masks faster here than torch

@@ -118,9 +118,10 @@ class ObjectTable(TensorTable):
 
     def append_objects(self, frame: RGBDFrame, found: FrameObjects, up: Tensor) -> None:
         """Append the objects of a frame; `up` is the direction against gravity in the world frame, shape (3,)."""
-        objects, boxes = found.objects, found.boxes(up)
+        objects = found.objects
         if not objects:
             return
+        boxes = found.boxes(up)
         self.append(
             frame=torch.full((len(objects),), frame.index),
             stamp=torch.full((len(objects),), frame.stamp, dtype=torch.float64),
