@@ -10,8 +10,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import scipy
 import torch
-from scipy.special import chdtrc  # scipy.stats would take half a second to import
 from torch import Tensor
 
 from v3d_torch.calibration.parameters import (
@@ -77,7 +77,7 @@ def decide(name: str, given: float, value: float, sigma: float, tolerance: float
     """
     if not sigma <= tolerance:
         return Estimate(name, given, value, sigma, accepted=False, reason=NOT_DETERMINED)
-    if chdtrc(1, ((value - given) / sigma) ** 2) > MAX_P_VALUE:
+    if scipy.special.chdtrc(1, ((value - given) / sigma) ** 2) > MAX_P_VALUE:
         return Estimate(name, given, value, sigma, accepted=False, reason=AGREES)
     return Estimate(name, given, value, sigma, accepted=True, reason="")
 
@@ -195,7 +195,7 @@ class ParameterSelection:
         model_error = torch.tensor([self.fit.model_error(name) for name in names], dtype=torch.float64)
         total = self.fit.covariance_of(group) + model_error.square().diag()
         statistic = difference @ torch.linalg.solve(total, difference)
-        return float(chdtrc(len(names), max(float(statistic), 0.0)))
+        return float(scipy.special.chdtrc(len(names), max(float(statistic), 0.0)))
 
     def _reject(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
         for name in group.parameters:

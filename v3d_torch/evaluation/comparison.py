@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy
 
 from v3d_torch.evaluation.outcome import Outcome, find_difference, label_sequence
 from v3d_torch.evaluation.tables import Cell, ErrorTable
@@ -58,7 +58,7 @@ def mean_ratio(ratios: Sequence[float]) -> Ratio:
     if len(ratios) < 2:
         return Ratio(math.exp(mean))
     error = float(logarithms.std(ddof=1)) / math.sqrt(len(ratios))
-    reach = error * float(stdtrit(len(ratios) - 1, (1 + CONFIDENCE) / 2))
+    reach = error * float(scipy.special.stdtrit(len(ratios) - 1, (1 + CONFIDENCE) / 2))
     return Ratio(math.exp(mean), math.exp(mean - reach), math.exp(mean + reach))
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import scipy
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from v3d_torch.kernels.compiler import can_read
@@ -38,7 +38,7 @@ def _assign(gain: Tensor) -> Tensor:
     """Row of the highest total gain that each column gets, (B, T, N) to (B, N); -1 if its gain is 0."""
     matched = torch.full((gain.shape[0], gain.shape[2]), -1)
     for gains, matches in zip(gain, matched, strict=True):
-        rows, columns = map(torch.from_numpy, linear_sum_assignment(gains.numpy(), maximize=True))
+        rows, columns = map(torch.from_numpy, scipy.optimize.linear_sum_assignment(gains.numpy(), maximize=True))
         matches[columns] = torch.where(gains[rows, columns] > 0, rows, -1)
     return matched
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+import scipy
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
@@ -149,7 +149,7 @@ def _cluster(points: NDArray[np.float64], eps: float, min_samples: int) -> Ints:
 
 def _neighbours(points: NDArray[np.float64], eps: float) -> tuple[Ints, Iterable[Pairs]]:
     """Return the neighbour count of each point, itself included, and every pair of neighbours once, in blocks."""
-    tree = cKDTree(points, balanced_tree=False, leafsize=32)
+    tree = scipy.spatial.cKDTree(points, balanced_tree=False, leafsize=32)
     if _max_pairs(points, eps) <= _MAX_PAIRS:
         pairs = tree.query_pairs(eps, output_type="ndarray")
         a, b = pairs.T.astype(np.int32)  # contiguous and small, because they are read many times
@@ -172,12 +172,12 @@ def _max_pairs(points: NDArray[np.float64], eps: float) -> float:
     return _MAX_NEIGHBOUR_CELLS * float(np.dot(occupancy, occupancy))
 
 
-def _pairs_in_blocks(tree: cKDTree, counts: Ints, eps: float) -> Iterator[Pairs]:
+def _pairs_in_blocks(tree: scipy.spatial.cKDTree, counts: Ints, eps: float) -> Iterator[Pairs]:
     """Yield every pair once, in blocks of bounded size; each block contains the neighbours of some adjacent points."""
     order = tree.indices
     block = np.cumsum(counts[order]) // _BLOCK
     for points in np.split(order, np.flatnonzero(np.diff(block)) + 1):
-        neighbours = cKDTree(tree.data[points]).sparse_distance_matrix(tree, eps, output_type="ndarray")
+        neighbours = scipy.spatial.cKDTree(tree.data[points]).sparse_distance_matrix(tree, eps, output_type="ndarray")
         a, b = points[neighbours["i"]], neighbours["j"]
         once = a < b
         yield a[once], b[once]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE
@@ -29,7 +29,7 @@ class NearestVoxels:
 
     def __init__(self, centres: Tensor, max_distance: float) -> None:
         self._centres = centres
-        self._tree = cKDTree(centres.numpy())
+        self._tree = scipy.spatial.cKDTree(centres.numpy())
         self._max_distance = max_distance
 
     def __call__(self, points: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import scipy.sparse
-import scipy.sparse.linalg
+import scipy
 import torch
 from torch import Tensor
 
