@@ -39,6 +39,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile all kernels before the tests, whose time is limited; with ``-n``, the first worker does it."""
     if config.getoption("numprocesses", None):  # this process starts the workers, and runs no tests
         return
+    gc.disable()  # until all tests are collected
     # Imports that take seconds.
     import torch
 
@@ -53,11 +54,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Collect without garbage collection, which would take seconds, as imports leave little to collect."""
-    gc.disable()
+    """Begin garbage collection once the tests are imported: they stay, and looking at them would take seconds."""
     try:
         return (yield)
     finally:
+        gc.freeze()
         gc.enable()
 
 

@@ -38,20 +38,34 @@ def double() -> Iterator[list[str]]:
     TWINS.pop(f"{__name__}.make_doubled.<locals>.doubled", None)
 
 
-def make_doubled(calls: list[str], supported: torch.dtype = torch.float64):  # type: ignore[no-untyped-def]
+def make_doubled(  # type: ignore[no-untyped-def]
+    calls: list[str], supported: torch.dtype = torch.float64, *, on_demand: bool = True
+):
     def compiled(x: Tensor) -> Tensor:
         if x.dtype != supported:
             return NotImplemented
         calls.append("kernel")
         return 2 * x
 
-    @compiled_by(compiled)
+    @compiled_by(compiled, on_demand=on_demand)
     def doubled(x: Tensor) -> Tensor:
         """Twice a number."""
         calls.append("torch")
         return 2 * x
 
     return doubled
+
+
+@needs_numba
+def test_function_that_compiles_nothing_on_demand_waits_for_the_kernels_of_the_run(
+    double: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    doubled = make_doubled(double, on_demand=False)
+    x = torch.ones(1, dtype=torch.float64)
+    for waiting in ([("kernel", "signature")], []):
+        monkeypatch.setattr(compiler, "_TO_COMPILE", waiting)
+        assert doubled(x) == 2
+    assert double == ["torch", "kernel"]
 
 
 @needs_numba

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 
-import v3d_torch.batch.run_job
-import v3d_torch.runs.results  # noqa: F401 - with the libraries for tables and figures
-from v3d_torch.kernels.compiler import compile_kernels
+from v3d_torch.runtime.imports import quick_imports
+
+with quick_imports():
+    import v3d_torch.batch.run_job
+    import v3d_torch.runs.results  # noqa: F401 - with the libraries for tables and figures
+    from v3d_torch.kernels.compiler import compile_kernels
 
 deque(compile_kernels(), maxlen=0)

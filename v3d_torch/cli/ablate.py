@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import DataRoot, make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -39,7 +40,8 @@ def main(
 
     Each variant runs with each seed on each sequence, one run after the other.
     """
-    from v3d_torch.batch.ablation_study import run_ablation_study
+    with quick_imports():
+        from v3d_torch.batch.ablation_study import run_ablation_study
 
     with exit_on_error():
         names = [name.strip() for name in variants.split(",")]

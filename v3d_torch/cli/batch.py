@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, SkipBroken, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -54,7 +55,8 @@ def main(
 
     Each run has its own process. Tables compare the scores of all runs.
     """
-    from v3d_torch.batch.runner import run_batch
+    with quick_imports():
+        from v3d_torch.batch.runner import run_batch
 
     with exit_on_error():
         run_batch(

@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 if TYPE_CHECKING:
     from v3d_torch.datasets import RGBDSequence
@@ -48,15 +49,16 @@ def main(
 
     from rich.console import Console
 
-    from v3d_torch.config.loading import load_config
-    from v3d_torch.datasets import SourceOptions, load_sequence
-    from v3d_torch.errors import OutputError
-    from v3d_torch.io.files import check_writable, write_text
-    from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
-    from v3d_torch.runs.interrupts import interrupts_between_frames
-    from v3d_torch.runs.kernel_compilation import compile_kernels
-    from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
-    from v3d_torch.segmentation import make_segmenter
+    with quick_imports():
+        from v3d_torch.config.loading import load_config
+        from v3d_torch.datasets import SourceOptions, load_sequence
+        from v3d_torch.errors import OutputError
+        from v3d_torch.io.files import check_writable, write_text
+        from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
+        from v3d_torch.runs.interrupts import interrupts_between_frames
+        from v3d_torch.runs.kernel_compilation import compile_kernels
+        from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
+        from v3d_torch.segmentation import make_segmenter
 
     console = Console(soft_wrap=True)
     options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)

@@ -9,6 +9,7 @@ import typer
 
 from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -41,10 +42,11 @@ def main(
     """
     from rich.console import Console
 
-    from v3d_torch.datasets.tum_trajectory import read_trajectory
-    from v3d_torch.errors import InputError, V3DError
-    from v3d_torch.evaluation import evaluate
-    from v3d_torch.evaluation.paper_tables import find_paper_sequence, make_paper_table
+    with quick_imports():
+        from v3d_torch.datasets.tum_trajectory import read_trajectory
+        from v3d_torch.errors import InputError, V3DError
+        from v3d_torch.evaluation import evaluate
+        from v3d_torch.evaluation.paper_tables import find_paper_sequence, make_paper_table
 
     try:
         truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)

@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -42,7 +43,8 @@ def main(
     """
     from rich.console import Console
 
-    from v3d_torch.cli.export_command import ExportOptions, export_run
+    with quick_imports():
+        from v3d_torch.cli.export_command import ExportOptions, export_run
 
     with exit_on_error():
         options = ExportOptions(format_, every, keyframes, undistort, not no_masks)

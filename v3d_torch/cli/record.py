@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -44,13 +45,14 @@ def main(
     """
     from rich.console import Console
 
-    from v3d_torch.cli.record_command import record_all, record_static
-    from v3d_torch.config.loading import FULL, find_config, load_config
-    from v3d_torch.datasets import SourceOptions, open_source
-    from v3d_torch.datasets.stored import StoredSequence
-    from v3d_torch.errors import ConfigError, InputError
-    from v3d_torch.runs.interrupts import interrupts_between_frames
-    from v3d_torch.runs.open_sequences import print_assumptions
+    with quick_imports():
+        from v3d_torch.cli.record_command import record_all, record_static
+        from v3d_torch.config.loading import FULL, find_config, load_config
+        from v3d_torch.datasets import SourceOptions, open_source
+        from v3d_torch.datasets.stored import StoredSequence
+        from v3d_torch.errors import ConfigError, InputError
+        from v3d_torch.runs.interrupts import interrupts_between_frames
+        from v3d_torch.runs.open_sequences import print_assumptions
 
     console = Console(soft_wrap=True)
     with exit_on_error():

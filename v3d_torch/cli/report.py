@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -27,9 +28,10 @@ def main(
 
     The report is report.html in the folder of the results: one self-contained file for any browser.
     """
-    from v3d_torch.io.files import write_text
-    from v3d_torch.runs.report_page import render_page
-    from v3d_torch.runs.stored_run import read_run
+    with quick_imports():
+        from v3d_torch.io.files import write_text
+        from v3d_torch.runs.report_page import render_page
+        from v3d_torch.runs.stored_run import read_run
 
     with exit_on_error():
         run = read_run(folder, groundtruth)

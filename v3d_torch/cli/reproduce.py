@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, make_app, workers_option
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -39,7 +40,8 @@ def main(
 
     Runs the paper's eight sequences of the TUM RGB-D benchmark and downloads those that are missing.
     """
-    from v3d_torch.batch.reproduction import TABLE_CONFIGS, run_reproduction
+    with quick_imports():
+        from v3d_torch.batch.reproduction import TABLE_CONFIGS, run_reproduction
 
     with exit_on_error():
         run_reproduction(

@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import Camera, DataRoot, DepthTopic, Fps, InfoTopic, RgbTopic, SkipBroken, Version, make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
 
@@ -81,8 +82,9 @@ def main(
         with exit_on_error():
             check_name(seq, data_root)  # before the imports below, which take seconds
 
-    from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
-    from v3d_torch.runs.request import RunRequest
+    with quick_imports():
+        from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
+        from v3d_torch.runs.request import RunRequest
 
     if seq is None and resume is None:
         raise typer.BadParameter("give a sequence, or a run to resume (--resume)", param_hint="--seq")

@@ -1,4 +1,7 @@
-"""Decoder of the PNG images of RGB-D cameras. It releases the GIL, so that frames are read while others are tracked."""
+"""Decoder of the PNG images of RGB-D cameras.
+
+During a run it is a kernel, which releases the GIL, so that the next frame is read while others are tracked.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ def _decode_png_compiled(content: bytes, max_pixels: int) -> Pixels:
     return values.reshape(height, width, channels)
 
 
-@compiled_by(_decode_png_compiled)
+@compiled_by(_decode_png_compiled, on_demand=False)  # a sequence is opened before its run begins
 def decode_png(content: bytes, max_pixels: int) -> Pixels:
     """Decode a PNG image with one or three channels of 8 bits, or one channel of 16 bits.
 

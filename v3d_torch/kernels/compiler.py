@@ -142,7 +142,9 @@ def compile_kernels(*, backwards: bool = False) -> Iterator[tuple[int, int]]:
         yield compiled, len(_TO_COMPILE)
 
 
-def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+def compiled_by(
+    compiled: Callable[_P, _R], *, on_demand: bool = True
+) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
     """Decorate a torch function with its compiled twin.
 
     The twin runs if all tensors among the arguments are on the CPU and need no gradient. It returns NotImplemented for
@@ -150,6 +152,8 @@ def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Call
 
     Args:
         compiled: Function with the same arguments and results that calls a kernel.
+        on_demand: False to call the kernel only if all kernels have been compiled before, as at the start of a run:
+            they take a minute to compile, for which it is not worth waiting.
     """
 
     def decorate(function: Callable[_P, _R]) -> Callable[_P, _R]:
@@ -159,9 +163,9 @@ def compiled_by(compiled: Callable[_P, _R]) -> Callable[[Callable[_P, _R]], Call
         @wraps(function)
         def either(*args: _P.args, **kwargs: _P.kwargs) -> _R:
             if ENABLED and not _is_traced() and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
-                if _TO_COMPILE:
+                if _TO_COMPILE and on_demand:
                     deque(compile_kernels(), maxlen=0)
-                result = TWINS[name].compiled(*args, **kwargs)
+                result = NotImplemented if _TO_COMPILE else TWINS[name].compiled(*args, **kwargs)
                 if result is not NotImplemented:
                     return result
             return function(*args, **kwargs)

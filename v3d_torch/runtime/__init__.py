@@ -1,1 +1,1 @@
-"""Threads, memory, timing, padded batches, and checks of arguments."""
+"""Threads, memory, imports, timing, padded batches, and checks of arguments."""
