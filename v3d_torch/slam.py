@@ -286,7 +286,8 @@ class V3DSLAM(ReplaceableStages):
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
-            if pose.status is not TrackingStatus.LOST and not isinstance(self.segment, NoSegmentation):
+            has_objects = not isinstance(self.segment, NoSegmentation)
+            if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from io import BytesIO
 
 import cv2
@@ -13,9 +14,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from v3d_torch.datasets.png import decode_png
+from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 
 TWIN = TWINS[f"{decode_png.__module__}.{decode_png.__qualname__}"]
+
+DECODERS = [TWIN.compiled, TWIN.torch] if compiler.ENABLED else [TWIN.torch]
 
 FILTERS = [
     cv2.IMWRITE_PNG_FILTER_NONE,
@@ -55,7 +59,7 @@ def test_pixels_of_all_filters_are_those_that_were_written(
 ) -> None:
     pixels = pixels_of(seed, kind, height, width)
     content = encode(pixels, chosen)
-    for decode in (decode_png, TWIN.torch):
+    for decode in DECODERS:
         found = decode(content, height * width)
         assert found.dtype == pixels.dtype
         assert np.array_equal(found, pixels)
@@ -66,12 +70,13 @@ def test_compressed_pixels_can_be_in_several_chunks() -> None:
     pixels = pixels_of(0, "depth", 100, 100)
     content = encode(pixels, cv2.IMWRITE_PNG_FILTER_NONE)
     assert content.count(b"IDAT") > 1
-    assert np.array_equal(decode_png(content, pixels.size), pixels)
+    for decode in DECODERS:
+        assert np.array_equal(decode(content, pixels.size), pixels)
 
 
-def saved(image: Image.Image, **options: object) -> bytes:
+def saved(image: Image.Image) -> bytes:
     file = BytesIO()
-    image.save(file, "PNG", **options)
+    image.save(file, "PNG")
     return file.getvalue()
 
 
@@ -93,12 +98,27 @@ COLOUR = Image.fromarray(pixels_of(1, "rgb", 8, 9))
     ids=["alpha", "palette", "1 bit", "no end", "end cut", "pixels cut", "signature only", "empty"],
 )
 def test_other_images_are_errors(content: bytes, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        decode_png(content, 1000)
+    for decode in DECODERS:
+        with pytest.raises(ValueError, match=message):
+            decode(content, 1000)
+
+
+def test_damaged_pixels_are_an_error() -> None:
+    """Too few pixels, an unknown filter, and pixels that are not compressed, with a right checksum."""
+    content = saved(COLOUR)
+    begin = content.index(b"IDAT")
+    end = content.index(b"IEND") - 4
+    for compressed in (zlib.compress(b"\0" * 10), zlib.compress(b"\5" * 224), b"abc"):
+        chunk = b"IDAT" + compressed
+        damaged = len(compressed).to_bytes(4) + chunk + zlib.crc32(chunk).to_bytes(4)
+        for decode in DECODERS:
+            with pytest.raises(ValueError):
+                decode(content[: begin - 4] + damaged + content[end:], 1000)
 
 
 def test_number_of_pixels_is_limited() -> None:
     content = saved(COLOUR)
-    assert decode_png(content, 72).shape == (8, 9, 3)
-    with pytest.raises(ValueError, match="size of the image is not supported"):
-        decode_png(content, 71)
+    for decode in DECODERS:
+        assert decode(content, 72).shape == (8, 9, 3)
+        with pytest.raises(ValueError, match="size of the image is not supported"):
+            decode(content, 71)
