@@ -33,6 +33,9 @@ _FOCAL_ERROR = 0.015
 """Relative standard deviation of focal lengths by what the model lacks: true lens distortion differs from its model,
 the readout is not constant, depth has errors. It is that of recordings whose focal lengths are known."""
 
+_CENTRE_ERROR = 0.005
+"""Standard deviation of the principal point by the same causes, relative to the width of the image."""
+
 _LONG_BLOCKS = MAX_BLOCKS // 2
 """Number of the longer blocks with which standard deviations are compared."""
 
@@ -89,10 +92,12 @@ class _Fit:
     Attributes:
         values: Value of each free parameter.
         covariance: Covariance of the free parameters, shape (C, C).
+        width: Width of the images, pixels.
     """
 
     values: dict[str, float]
     covariance: Tensor
+    width: int
 
     def sigma(self, name: str) -> float:
         """Standard deviation of a parameter."""
@@ -101,7 +106,9 @@ class _Fit:
 
     def model_error(self, name: str) -> float:
         """Standard deviation of a parameter by what the model lacks."""
-        return _FOCAL_ERROR * self.values[name] if name in ("fx", "fy") else 0.0
+        if name in ("fx", "fy"):
+            return _FOCAL_ERROR * self.values[name]
+        return _CENTRE_ERROR * self.width if name in ("cx", "cy") else 0.0
 
     def total_sigma(self, name: str) -> float:
         """Standard deviation of a parameter by noise and by what the model lacks."""
@@ -128,7 +135,7 @@ class ParameterSelection:
     def __init__(self, problem: SelfCalibration) -> None:
         self._problem = problem
         self.free: list[ParameterGroup] = []
-        self.fit = _Fit({}, torch.zeros(0, 0, dtype=torch.float64))
+        self.fit = self._fit([])
         self.rejected: list[Estimate] = []
         for group in groups_of(problem.given):
             self._free_if_determined(group)
@@ -160,13 +167,13 @@ class ParameterSelection:
             self._reject(group, fit, NOT_DETERMINED)
 
     def _fit(self, groups: Sequence[ParameterGroup]) -> _Fit:
-        names = [name for group in groups for name in group.parameters]
+        names, width = [name for group in groups for name in group.parameters], self._problem.given.width
         if not names:
-            return _Fit({}, torch.zeros(0, 0, dtype=torch.float64))
+            return _Fit({}, torch.zeros(0, 0, dtype=torch.float64), width)
         given = self._problem.given_values(names).tolist()
         start = [self.fit.values.get(name, value) for name, value in zip(names, given, strict=True)]
         values, at = self._problem.minimise(names, torch.tensor(start, dtype=torch.float64))
-        return _Fit(dict(zip(names, values.tolist(), strict=True)), covariance(self._problem, at))
+        return _Fit(dict(zip(names, values.tolist(), strict=True)), covariance(self._problem, at), width)
 
     def _is_determined(self, group: ParameterGroup, fit: _Fit) -> bool:
         """Check whether a fit determines a group within its tolerance."""
