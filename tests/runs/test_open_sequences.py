@@ -1,20 +1,28 @@
-"""Sequences opened for a command."""
+"""Notes on a source when a command opens it."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
+from io import StringIO
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
-from helpers.corpus.base import write_base
 from rich.console import Console
 
-from v3d_torch.errors import InputError
-from v3d_torch.runs.open_sequences import open_sequences
+from v3d_torch.datasets.demo.sequence import CAMERA
+from v3d_torch.runs.open_sequences import print_assumptions
 
 
-def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
-    write_base(tmp_path / "seq")
-    assert list(open_sequences([str(tmp_path / "seq")], None, Console())) == ["seq"]
-    (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
-    with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
-        open_sequences([str(tmp_path / "seq")], None, Console())
+@pytest.mark.parametrize(
+    ("width", "height", "gigabytes"), [(640, 480, None), (1920, 1080, None), (3840, 2160, 4), (7680, 4320, 17)]
+)
+def test_memory_for_large_images_is_stated(width: int, height: int, gigabytes: int | None) -> None:
+    source: Any = SimpleNamespace(name="hall", camera=replace(CAMERA, width=width, height=height))
+    output = StringIO()
+    print_assumptions(source, Console(file=output, width=300))
+    expected = (
+        f"note: hall: a run with images of {width}x{height} pixels needs about {gigabytes} GB of memory; scale images"
+        " and camera file down if there is less\n"
+    )
+    assert output.getvalue() == ("" if gigabytes is None else expected)

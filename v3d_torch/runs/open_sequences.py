@@ -13,6 +13,12 @@ from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 
+_MANY_PIXELS = 1 << 22
+"""Number of pixels of an image above which the memory of a run is stated: that of smaller images is below 3 GB."""
+
+_BYTES_PER_PIXEL = 500
+"""Memory of a run for each pixel of an image, measured on sequences of 640x360 to 1920x1080 pixels."""
+
 
 def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
     """Open a sequence as `load_sequence` does, with a progress bar for downloads."""
@@ -24,9 +30,19 @@ def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_b
 
 
 def print_assumptions(source: RGBDStream, console: Console) -> None:
-    """Print the assumptions about a source that does not state everything: an estimated depth scale."""
+    """Print the assumptions about a source that does not state everything, and the memory for large images."""
+    notes = []
     if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
-        console.print(f"note: {source.name}: {source.depth_scale_note}", markup=False, highlight=False)
+        notes.append(source.depth_scale_note)
+    width, height = source.camera.width, source.camera.height
+    if width * height > _MANY_PIXELS:
+        gigabytes = width * height * _BYTES_PER_PIXEL / 1e9
+        notes.append(
+            f"a run with images of {width}x{height} pixels needs about {gigabytes:.0f} GB of memory; scale images and"
+            " camera file down if there is less"
+        )
+    for note in notes:
+        console.print(f"note: {source.name}: {note}", markup=False, highlight=False)
 
 
 def open_sequences(
