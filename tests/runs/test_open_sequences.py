@@ -1,17 +1,28 @@
-"""Notes on a source when a command opens it."""
+"""Sequences opened for a command, and notes on them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.corpus.base import write_base
 from rich.console import Console
 
 from v3d_torch.datasets.demo.sequence import CAMERA
-from v3d_torch.runs.open_sequences import print_assumptions
+from v3d_torch.errors import InputError
+from v3d_torch.runs.open_sequences import open_sequences, print_notes
+
+
+def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
+    write_base(tmp_path / "seq")
+    assert list(open_sequences([str(tmp_path / "seq")], None, Console())) == ["seq"]
+    (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
+    with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
+        open_sequences([str(tmp_path / "seq")], None, Console())
 
 
 @pytest.mark.parametrize(
@@ -20,7 +31,7 @@ from v3d_torch.runs.open_sequences import print_assumptions
 def test_memory_for_large_images_is_stated(width: int, height: int, gigabytes: int | None) -> None:
     source: Any = SimpleNamespace(name="hall", camera=replace(CAMERA, width=width, height=height))
     output = StringIO()
-    print_assumptions(source, Console(file=output, width=300))
+    print_notes(source, Console(file=output, width=300))
     expected = (
         f"note: hall: a run with images of {width}x{height} pixels needs about {gigabytes} GB of memory; scale images"
         " and camera file down if there is less\n"

@@ -52,7 +52,7 @@ def main(
         from v3d_torch.datasets.stored import StoredSequence
         from v3d_torch.errors import ConfigError, InputError
         from v3d_torch.runs.interrupts import interrupts_between_frames
-        from v3d_torch.runs.open_sequences import print_assumptions
+        from v3d_torch.runs.open_sequences import print_notes
 
     console = Console(soft_wrap=True)
     with exit_on_error():
@@ -61,7 +61,7 @@ def main(
         with console.status(f"opening {seq}"):
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
-        print_assumptions(source, console)
+        print_notes(source, console)
         with interrupts_between_frames() as interrupted:
             if static:
                 frames, failure = record_static(

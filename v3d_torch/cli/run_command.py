@@ -26,7 +26,7 @@ from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.diagnosis import diagnose
-from v3d_torch.runs.open_sequences import print_assumptions
+from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
@@ -151,7 +151,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if map_file is not None:
         check_writable(map_file)
     sequence = _open_sequence(request, console)
-    print_assumptions(sequence, console)
+    print_notes(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
         raise InputError(
             f"{request.seq}: has changed since the run in {checkpoint.folder} began ({change}); restore the sequence,"

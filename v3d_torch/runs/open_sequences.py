@@ -1,4 +1,4 @@
-"""Sequences opened for a command, with a progress bar for downloads and notes on what is assumed."""
+"""Sequences opened for a command, with a progress bar for downloads and notes on them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_b
     with progress_bars(console) as progress:
         bar = ProgressBar(progress, "sequence")
         sequence = load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)
-    print_assumptions(sequence, console)
+    print_notes(sequence, console)
     return sequence
 
 
-def print_assumptions(source: RGBDStream, console: Console) -> None:
-    """Print the assumptions about a source that does not state everything, and the memory for large images."""
+def print_notes(source: RGBDStream, console: Console) -> None:
+    """Print notes on a source: an estimated depth scale, and the memory of a run with large images."""
     notes = []
     if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
         notes.append(source.depth_scale_note)
