@@ -22,6 +22,7 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
 
@@ -57,6 +58,15 @@ def test_segmenter_of_the_config_equals_the_same_segmenter_as_an_argument(demo: 
     configured, passed = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
     for index in range(3):
         assert torch.equal(configured(demo[index]).T_wc, passed(demo[index]).T_wc)
+
+
+def test_moving_regions_become_objects_without_a_network(demo: RGBDSequence) -> None:
+    """The baseline has no objects; a configuration with a network proposes regions also if no instance is found."""
+    proposing, baseline = V3DSLAM(demo.camera, NoSegmentation()), V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
+    for index in range(40, 56):  # a person walks through the image
+        result = proposing(demo[index])
+        assert baseline(demo[index]).objects == []
+    assert result.objects and all(each.label == UNLABELLED for each in result.objects)
 
 
 def test_frames_from_opencv_arrays_give_the_same_poses(demo: RGBDSequence) -> None:

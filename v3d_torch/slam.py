@@ -174,6 +174,11 @@ class V3DSLAM(ReplaceableStages):
         return None if self.gravity is None and self._floor is None else level_frame(self.up)
 
     @property
+    def _proposes_objects(self) -> bool:
+        """True if moving regions without a class become objects: not in the baseline without masks."""
+        return self.config.segmentation.source != "none"
+
+    @property
     def _floor(self) -> Floor | None:
         return None if self.occupancy is None else self.occupancy.floor
 
@@ -286,7 +291,7 @@ class V3DSLAM(ReplaceableStages):
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
-            has_objects = not isinstance(self.segment, NoSegmentation)
+            has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
@@ -398,7 +403,7 @@ class V3DSLAM(ReplaceableStages):
         """Redraw the previous objects in a frame without segmentation, and add moving regions without a class."""
         if instances is None:
             instances = self.classify_motion.propagate_instances(view)
-        if self.config.segmentation.source == "none":
+        if not self._proposes_objects:
             return instances
         return instances.concatenate(self.propose_unlabelled(occupied, instances, view.depth))
 
