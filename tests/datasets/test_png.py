@@ -1,4 +1,4 @@
-"""PNG decoder: the pixels of Pillow and OpenCV for all filters, and one error for what it does not support."""
+"""PNG decoder: the pixels that were written, with all filters, and one error for what it does not support."""
 
 from __future__ import annotations
 

@@ -165,9 +165,10 @@ def compiled_by(
             if ENABLED and not _is_traced() and all(map(_is_plain, args)) and all(map(_is_plain, kwargs.values())):
                 if _TO_COMPILE and on_demand:
                     deque(compile_kernels(), maxlen=0)
-                result = NotImplemented if _TO_COMPILE else TWINS[name].compiled(*args, **kwargs)
-                if result is not NotImplemented:
-                    return result
+                if on_demand or not _TO_COMPILE:
+                    result = TWINS[name].compiled(*args, **kwargs)
+                    if result is not NotImplemented:
+                        return result
             return function(*args, **kwargs)
 
         return either
