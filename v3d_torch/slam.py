@@ -354,10 +354,9 @@ class V3DSLAM(ReplaceableStages):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
+        self.back_end.discard()  # it reads the map
         for name, component in self._stateful_components().items():
             component.load_state_dict(state[name])
-        pending = self.back_end.keyframe
-        self.loop_closer.rebuild_database(each for each in self.map.active_keyframes if each is not pending)
         self._previous, self.gravity = state["previous"], state["gravity"]
         self.predictions = deque(state["predictions"])
         self._segmenter_state = state["segmenter"]

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import gc
 import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
 
 import pytest
 import torch
 from helpers.first_frames import FirstFrames
+from helpers.walk_run import make_pipeline
 from torch import Tensor
 
 import v3d_torch.backend.back_end
@@ -131,17 +135,60 @@ def test_back_end_that_loads_a_state_gives_the_pending_result(in_background: boo
     slam = V3DSLAM(demo.camera, config=config)
     for index in range(5):
         slam(demo[index])
-    state = slam.back_end.state_dict()
+    state, expected = slam.back_end.state_dict(), slam.back_end.result()
     assert state == {"keyframe": slam.map.keyframes[-1]} and state["keyframe"].frame == 4
     loaded = BackEnd(config, slam.map.camera, slam.map, slam.loop_closer)
     loaded.load_state_dict(state)
     assert loaded.keyframe is state["keyframe"]
-    expected, result = slam.back_end.result(), loaded.result()
+    result = loaded.result()
     assert expected is not None and result is not None
     assert result.keyframe is expected.keyframe and result.loop_correction is expected.loop_correction is None
     assert expected.adjustment is not None and result.adjustment is not None
     assert torch.equal(result.adjustment.T_cw, expected.adjustment.T_cw)
     assert torch.equal(result.adjustment.points, expected.adjustment.points)
+
+
+class ImmediateExecutor:
+    """Executor that has computed a result before `submit` returns: the earliest that a thread can be."""
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def submit(self, function: Callable[[], object]) -> Future[object]:
+        future: Future[object] = Future()
+        future.set_result(function())
+        return future
+
+
+def test_loop_of_a_loaded_state_is_found_however_early_the_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The database of places must be complete when the pending keyframe is submitted."""
+    pipeline = make_pipeline(prefetch=False)
+    slam, frames = pipeline.slam, iter(pipeline.sequence)
+    while (expected := slam.back_end.result()) is None or expected.loop_correction is None:
+        slam(next(frames))
+    state = slam.state_dict()
+    monkeypatch.setattr(v3d_torch.backend.back_end, "ThreadPoolExecutor", ImmediateExecutor)
+    loaded = make_pipeline(prefetch=True).slam
+    for _ in range(2):  # into a new system, and over a pending computation
+        loaded.load_state_dict(state)
+        result = loaded.back_end.result()
+        assert result is not None and result.loop_correction is not None
+        assert result.loop_correction.place.keyframe is expected.loop_correction.place.keyframe
+        assert torch.equal(result.loop_correction.T_cw, expected.loop_correction.T_cw)
+
+
+def test_discarded_computation_has_ended(demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[bool] = []
+
+    def adjust(*_: object) -> None:
+        time.sleep(0.2)
+        ended.append(True)
+
+    monkeypatch.setattr(v3d_torch.backend.back_end, "local_bundle_adjust", adjust)
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=True))
+    slam(demo[0])
+    slam.back_end.discard()
+    assert ended and slam.back_end.keyframe is None and slam.back_end.result() is None
 
 
 def test_state_without_a_pending_keyframe_submits_nothing(demo: RGBDSequence) -> None:

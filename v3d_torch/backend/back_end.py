@@ -94,18 +94,27 @@ class BackEnd:
         self._loop_closer.add_keyframe(result.keyframe)
         return T_new_old
 
+    def discard(self) -> None:
+        """Wait until the pending computation has ended, and discard its result; then the map may change."""
+        if self._executor is not None:
+            self._executor.submit(bool).result()  # it runs after the pending computation, in the same thread
+        self.keyframe = self._get_result = None
+
     def state_dict(self) -> dict[str, Any]:
         """Return the pending keyframe, ``{"keyframe": Keyframe | None}``: the same object as in the map."""
         return {"keyframe": self.keyframe}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`, and submit the pending keyframe again.
+        """Restore a state of `state_dict`: rebuild the database of places, and submit the pending keyframe again.
 
         Load the map and the loop closer first. The pending keyframe must be the object in the map.
         """
-        self.keyframe = self._get_result = None
-        if state["keyframe"] is not None:
-            self.submit(state["keyframe"])
+        self.discard()
+        pending = state["keyframe"]
+        # The database has the pending keyframe only after its result was applied.
+        self._loop_closer.rebuild_database(each for each in self._map.active_keyframes if each is not pending)
+        if pending is not None:
+            self.submit(pending)
 
     def _optimise(self, keyframe: Keyframe, *, inference: bool) -> BackEndResult:
         """Adjust the map around a keyframe and detect a loop; the map itself does not change."""

@@ -93,11 +93,11 @@ class LoopCloser:
             self.add_keyframe(keyframe)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of loops, ``{"loop_count": int}``; `rebuild` restores the database from the map."""
+        """Return the number of loops, ``{"loop_count": int}``; `rebuild_database` restores the rest."""
         return {"loop_count": self.loop_count}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`; call `rebuild` as well."""
+        """Restore a state of `state_dict`; call `rebuild_database` as well."""
         self.loop_count = state["loop_count"]
 
     def relocalise(self, features: Features, sparse_map: SparseMap, exclude: Iterable[int] = ()) -> PlaceMatch | None:
