@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import torch
 
 from v3d_torch.calibration.colour_order import check_colour_order
+from v3d_torch.calibration.exposure import check_exposure
 from v3d_torch.calibration.people_size import apparent_sizes
 from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
@@ -222,7 +223,7 @@ class Pipeline:
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
-        self._warn(check_colour_order(self.views, self.slam.segment))
+        self._warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
         trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
