@@ -25,6 +25,7 @@ def no_intrinsics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the calibration by the map."""
     monkeypatch.setattr(camera_calibration, "SelfCalibration", lambda *_: None)
     monkeypatch.setattr(camera_calibration, "ParameterSelection", lambda _: SimpleNamespace(estimates=()))
+    monkeypatch.setattr(camera_calibration, "better_focal_lengths", lambda _, camera, __: (camera.fx, camera.fy))
 
 
 def calibrate(scale: float | None = None, delay: float = 0.0, given: PinholeCamera = CAMERA) -> Calibration:
@@ -85,3 +86,23 @@ def test_camera_at_rest_tells_no_delay() -> None:
     views, trajectory = make_views(COUNT, moving=False)
     calibration = calibrate_camera(MapTables(), views, trajectory, None, CAMERA, CAMERA, Config())
     assert estimate_of(calibration, "depth_delay").reason == NOT_DETERMINED
+
+
+@pytest.mark.parametrize(("fx", "next_fx"), [(270.0, 260.0), (320.0, 320.0)])
+def test_next_run_has_focal_lengths_that_differ_significantly(
+    fx: float, next_fx: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are not accurate enough to be accepted, so that the calibrated camera keeps the given ones."""
+    estimates = tuple(Estimate(name, 260.0, fx, 15.0, accepted=False, reason="") for name in ("fx", "fy"))
+    monkeypatch.setattr(camera_calibration, "ParameterSelection", lambda _: SimpleNamespace(estimates=estimates))
+    monkeypatch.setattr(camera_calibration, "better_focal_lengths", lambda *_: None)
+    calibration = calibrate()
+    assert (calibration.camera.fx, calibration.camera.fy) == (260.0, 260.0)
+    assert (calibration.next_camera.fx, calibration.next_camera.fy) == (next_fx, next_fx)
+
+
+def test_next_run_has_the_focal_lengths_of_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(camera_calibration, "better_focal_lengths", lambda *_: (500.0, 510.0))
+    calibration = calibrate()
+    assert (calibration.next_camera.fx, calibration.next_camera.fy) == (500.0, 510.0)
+    assert calibration.camera.fx == CAMERA.fx

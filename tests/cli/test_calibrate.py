@@ -27,13 +27,17 @@ def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(calibrate.app, list(map(str, arguments)), env={"COLUMNS": "200"})
 
 
-def test_wrong_focal_lengths_are_found_again(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("factor", "features"), [(1.15, 500), (0.5, 1500)])
+def test_wrong_focal_lengths_are_found_again(
+    factor: float, features: int, sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With half the focal lengths the first run finds no accurate ones, but such with which the second run does."""
     monkeypatch.setattr("v3d_torch.runs.calibration_run._MAX_RUNS", 2)  # to save time
     right = load_sequence(str(sequence)).camera
-    (tmp_path / "wrong.yaml").write_text(camera_text(replace(right, fx=1.15 * right.fx, fy=1.15 * right.fy)))
+    (tmp_path / "wrong.yaml").write_text(camera_text(replace(right, fx=factor * right.fx, fy=factor * right.fy)))
     out = tmp_path / "camera.yaml"
     wrong = "--camera", tmp_path / "wrong.yaml"
-    fast = "--segmenter", "none", "--set", "features.count=500"
+    fast = "--segmenter", "none", "--set", f"features.count={features}"
     done = call("--seq", sequence, *wrong, *fast, "--out", out)
     assert done.exit_code == 0, done.stderr
     found, text = load_camera(out), out.read_text()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
 from v3d_torch.calibration.edge_alignment import EdgeAlignment
+from v3d_torch.calibration.focal_length import better_focal_lengths
 from v3d_torch.calibration.metric_scale import metric_scale
 from v3d_torch.calibration.parameters import with_values
 from v3d_torch.calibration.problem import SelfCalibration
@@ -31,6 +33,9 @@ _MAX_SHIFT = 0.01
 _MIN_VIEWS = 5
 """Minimum number of views for an estimate of the depth delay."""
 
+_SIGNIFICANCE = 3.0
+"""Number of standard deviations by which focal lengths must differ from those of a run to be those of the next."""
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -38,10 +43,13 @@ class Calibration:
 
     Attributes:
         camera: The given camera with the accepted estimates as new values.
+        next_camera: Camera for another run. If no focal lengths are accepted, it has those of this run, or others that
+            explain the motion of the images better: a map that was built with wrong ones gives no accurate ones.
         estimates: Estimates of all parameters.
     """
 
     camera: PinholeCamera
+    next_camera: PinholeCamera
     estimates: tuple[Estimate, ...]
 
 
@@ -71,7 +79,18 @@ def calibrate_camera(
         *_estimate_scale(groundtruth, trajectory, camera, given),
     ]
     accepted = {each.name: each.value for each in estimates if each.accepted}
-    return Calibration(with_values(given, accepted), tuple(estimates))
+    calibrated = next_camera = with_values(given, accepted)
+    if "fx" not in accepted:
+        fx, fy = better_focal_lengths(tables, camera, config) or _rejected_focal_lengths(estimates, camera)
+        next_camera = replace(calibrated, fx=fx, fy=fy)
+    return Calibration(calibrated, next_camera, tuple(estimates))
+
+
+def _rejected_focal_lengths(estimates: Sequence[Estimate], camera: PinholeCamera) -> tuple[float, float]:
+    """Estimated focal lengths if they differ significantly from those of the run, else those of the run."""
+    fx, fy = (each for name in ("fx", "fy") for each in estimates if each.name == name)
+    is_significant = any(abs(each.value - getattr(camera, each.name)) > _SIGNIFICANCE * each.sigma for each in (fx, fy))
+    return (fx.value, fy.value) if is_significant else (camera.fx, camera.fy)
 
 
 def _estimate_delay(

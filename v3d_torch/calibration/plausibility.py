@@ -13,9 +13,8 @@ from torch import Tensor
 
 from v3d_torch.calibration.depth_steps import disparity_step
 from v3d_torch.calibration.edge_alignment import EdgeAlignment, Misalignment
+from v3d_torch.calibration.focal_length import better_focal_lengths
 from v3d_torch.calibration.people_size import check_people_size
-from v3d_torch.calibration.problem import SelfCalibration
-from v3d_torch.calibration.selection import covariance
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.map_tables import MapTables
@@ -25,9 +24,6 @@ from v3d_torch.types import Trajectory
 _FIRST_VIEWS, _MAX_VIEWS = 8, 32
 """Number of views whose edges are compared first, which takes a tenth of a second, and number of views for a more
 accurate estimate if these do not seem to fit."""
-
-_MAX_KEYFRAMES = 12
-"""Maximum number of keyframes in the bundle adjustment that estimates the focal length."""
 
 _SUSPICION = 0.5
 """Fraction of the following limits above which a first, inaccurate estimate is followed by a more accurate one."""
@@ -42,14 +38,6 @@ synchronisation."""
 
 _SHIFT, _DELAY = (0, 1), (2,)
 """Indices of the shift and of the delay of depth in the values of a `Misalignment`."""
-
-_MIN_FOCAL_CHANGE = 0.1
-"""Minimum relative error of the focal length that is reported: the focal lengths of cameras of one model differ by a
-fifth of it, and lens distortion that is not modelled changes the estimate by half of it."""
-
-_FOCAL_FACTORS = (0.6, 1.0, 1.7)
-"""Focal lengths relative to the given ones at which the cost is compared. If the given ones are half of the true ones,
-the cost can have another minimum near them: matches that do not fit them have been left out of the map."""
 
 _SIGNIFICANCE = 3.0
 """Number of standard deviations by which an estimate must exceed the limits above."""
@@ -199,28 +187,13 @@ def _warn_of(found: Misalignment, camera: PinholeCamera, free: tuple[int, ...] =
 
 
 def _check_focal_length(tables: MapTables, camera: PinholeCamera, config: Config) -> list[str]:
-    """Estimate the focal length by a bundle adjustment of the newest keyframes."""
-    problem = SelfCalibration(tables, camera, config, max_keyframes=_MAX_KEYFRAMES)
-    if len(problem.T_cw) < _MIN_VIEWS:
+    """Compare the focal lengths with those that explain best how the images move."""
+    better = better_focal_lengths(tables, camera, config)
+    if better is None:
         return []
-    names = ("fx", "fy", "cx", "cy")  # a wrong principal point would change the focal lengths
-    given = problem.given_values(names)
-    scales = torch.tensor([[factor, factor, 1.0, 1.0] for factor in _FOCAL_FACTORS], dtype=torch.float64)
-    tried = [problem.adjust(names, given * scale, problem.T_cw, problem.points) for scale in scales]
-    best = min(range(len(tried)), key=lambda index: float(tried[index].cost))
-    at = problem.differentiate(names, given * scales[best], tried[best])
-    step = torch.linalg.pinv(at.hessian.sum(dim=0), hermitian=True) @ at.gradient.sum(dim=0)
-    if not bool(((scales[best] - step / given - 1).abs()[:2] > _SUSPICION * _MIN_FOCAL_CHANGE).any()):
-        return []
-    starts = [given] if bool((scales[best] == 1).all()) else [given, given * scales[best]]
-    minima = [problem.minimise(names, start) for start in starts]
-    values, at = min(minima, key=lambda found: float(problem.adjust(names, found[0], *found[1][:2]).cost))
-    sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
-    change = (values / given).log().abs() - _SIGNIFICANCE * sigma / values
-    if not bool((change[:2] > _MIN_FOCAL_CHANGE).any()):
-        return []
+    fx, fy = better
     return [
-        f"the focal lengths {camera.fx:g} and {camera.fy:g} do not explain how the images move, {values[0]:.0f} and"
-        f" {values[1]:.0f} would be better; give the camera of images with {camera.width}x{camera.height} pixels, or"
+        f"the focal lengths {camera.fx:g} and {camera.fy:g} do not explain how the images move, {fx:.0f} and {fy:.0f}"
+        f" would be better; give the camera of images with {camera.width}x{camera.height} pixels, or"
         " calibrate it with v3d-torch calibrate"
     ]

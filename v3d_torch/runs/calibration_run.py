@@ -77,22 +77,29 @@ def calibrate_sequence(
             given,
             config,
         )
-        if _is_converged(calibration, previous):
+        if _is_converged(calibration, camera, previous):
             break
-        previous, camera = calibration, calibration.camera
+        previous, camera = calibration, calibration.next_camera
         sequence = open_sequence(camera)
     return calibration
 
 
-def _is_converged(calibration: Calibration, previous: Calibration | None) -> bool:
-    """Check whether the last two runs gave the same values, up to a fraction of their uncertainty."""
-    if previous is None:
-        return not any(each.accepted for each in calibration.estimates)
-    before = {each.name: each for each in previous.estimates}
-    return all(
-        each.accepted == before[each.name].accepted
-        and (not each.accepted or abs(each.value - before[each.name].value) <= _CONVERGED * each.sigma)
-        for each in calibration.estimates
+def _is_converged(calibration: Calibration, camera: PinholeCamera, previous: Calibration | None) -> bool:
+    """Check whether the last two runs gave the same values, up to a fraction of their uncertainty.
+
+    Args:
+        calibration: Calibration from the last run.
+        camera: Camera of the last run.
+        previous: Calibration from the run before; None after the first run.
+    """
+    accepted, before = (
+        {} if each is None else {estimate.name: estimate for estimate in each.estimates if estimate.accepted}
+        for each in (calibration, previous)
+    )
+    if "fx" not in accepted and calibration.next_camera.fx != camera.fx:
+        return False  # other focal lengths explain the images better
+    return accepted.keys() == before.keys() and all(
+        abs(each.value - before[name].value) <= _CONVERGED * each.sigma for name, each in accepted.items()
     )
 
 
