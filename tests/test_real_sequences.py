@@ -40,6 +40,7 @@ def run(real_sequence: Callable[[str], Path], tmp_path_factory: pytest.TempPathF
         associated = (folder / "associations.txt").read_text().splitlines()
         assert len(read_trajectory(out / "trajectory.txt")) == metrics["frames"] == len(associated)
         assert metrics["coverage"] == 1.0
+        assert metrics["warnings"] == []  # the camera files are right, and so is the exposure
         return metrics
 
     return run_sequence

@@ -30,14 +30,14 @@ def make_white_views(fractions: Sequence[float], *, from_earlier_run: bool = Fal
 
 
 def test_overexposed_views_give_one_warning_with_their_times() -> None:
-    views = make_white_views([0.0, 0.3, 0.4, 0.1, 0.5, 0.2])
+    views = make_white_views([0.0, 0.4, 0.5, 0.1, 0.6, 0.3])
     first, last = (list(views)[index].keyframe.stamp for index in (1, 4))
     (warning,) = check_exposure(views)
     assert warning.startswith(f"the images of 3 of 6 keyframes, from {first:.3f} to {last:.3f} s, are overexposed")
-    assert "up to 50% of their pixels are white" in warning and warning.endswith("lower the exposure of the camera")
+    assert "up to 60% of their pixels are white" in warning and warning.endswith("lower the exposure of the camera")
 
 
-@pytest.mark.parametrize("fractions", [[], [0.2] * 6, [0.3, 0.9, 0.0, 0.0]])
+@pytest.mark.parametrize("fractions", [[], [0.3] * 6, [0.4, 0.9, 0.0, 0.0]])
 def test_windows_and_single_white_views_give_no_warning(fractions: list[float]) -> None:
     assert check_exposure(make_white_views(fractions)) == []
 
