@@ -354,8 +354,9 @@ class V3DSLAM(ReplaceableStages):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
+        components = self._stateful_components()
         self.back_end.discard()  # it reads the map
-        for name, component in self._stateful_components().items():
+        for name, component in components.items():
             component.load_state_dict(state[name])
         self._previous, self.gravity = state["previous"], state["gravity"]
         self.predictions = deque(state["predictions"])

@@ -105,7 +105,7 @@ class BackEnd:
         return {"keyframe": self.keyframe}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`: rebuild the database of places, and submit the pending keyframe again.
+        """Restore a state of `state_dict`: rebuild the database of place recognition, and submit the pending keyframe.
 
         Load the map and the loop closer first. The pending keyframe must be the object in the map.
         """

@@ -52,6 +52,11 @@ class Calibration:
     next_camera: PinholeCamera
     estimates: tuple[Estimate, ...]
 
+    @property
+    def accepted(self) -> dict[str, Estimate]:
+        """The accepted estimates, by the name of the parameter."""
+        return {each.name: each for each in self.estimates if each.accepted}
+
 
 def calibrate_camera(
     tables: MapTables,

@@ -94,7 +94,7 @@ class EdgeAlignment:
     def __init__(
         self, views: StaticViews, trajectory: Trajectory, depth_delay: float, max_views: int | None = None
     ) -> None:
-        own = [view for view in views if not view.keyframe.is_from_earlier_run]
+        own = views.own
         step = 1 if max_views is None else max(-(-len(own) // max_views), 1)
         pairs = [(view, find_edges(view.colour, view.depth, views.stride)) for view in own[::step]]
         pairs = [(view, edges) for view, edges in pairs if len(edges.axis) >= _MIN_BOUNDARIES]

@@ -104,7 +104,7 @@ def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
     """
     if camera.depth_scale is None:
         return []
-    own = [view for view in views if not view.keyframe.is_from_earlier_run]
+    own = views.own
     step = max(-(-len(own) // _DEPTH_VIEWS), 1)
     depth = torch.cat([torch.zeros(0), *(view.depth[view.depth > 0] for view in own[::step])])
     if not len(depth):

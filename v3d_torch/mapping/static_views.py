@@ -92,6 +92,11 @@ class StaticViews:
     def __iter__(self) -> Iterator[StaticView]:
         return iter(self._views)
 
+    @property
+    def own(self) -> list[StaticView]:
+        """Views of this run, without those of a known map."""
+        return [view for view in self._views if not view.keyframe.is_from_earlier_run]
+
     def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor, depth_delay: float = 0.0) -> None:
         """Store the static pixels of a keyframe as a view.
 

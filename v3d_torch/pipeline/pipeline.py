@@ -296,7 +296,7 @@ class Pipeline:
             if not self.record.was_checked:
                 self.record.people_sizes += apparent_sizes(result.objects, frame.depth, self.slam.camera)
             is_due = self._live is None and not self.record.was_checked
-            if is_due and self._own_view_count() >= _CHECKED_KEYFRAMES:
+            if is_due and len(self.views.own) >= _CHECKED_KEYFRAMES:
                 with self.slam.timer("plausibility"):
                     self._check_plausibility()
         self._keep_snapshot(Snapshot(frame, self.slam.poses.T_cw, result))
@@ -306,10 +306,6 @@ class Pipeline:
         slam, sizes = self.slam, self.record.people_sizes
         self._warn(check_plausibility(slam.map, self.views, sizes, slam.poses.trajectory(), slam.camera, slam.config))
         self.record.was_checked = True
-
-    def _own_view_count(self) -> int:
-        """Number of views of this run, without those of a known map."""
-        return sum(not view.keyframe.is_from_earlier_run for view in self.views)
 
     def _warn(self, warnings: Iterable[str]) -> None:
         """Log and record warnings."""

@@ -92,10 +92,7 @@ def _is_converged(calibration: Calibration, camera: PinholeCamera, previous: Cal
         camera: Camera of the last run.
         previous: Calibration from the run before; None after the first run.
     """
-    accepted, before = (
-        {} if each is None else {estimate.name: estimate for estimate in each.estimates if estimate.accepted}
-        for each in (calibration, previous)
-    )
+    accepted, before = calibration.accepted, {} if previous is None else previous.accepted
     if "fx" not in accepted and calibration.next_camera.fx != camera.fx:
         return False  # other focal lengths explain the images better
     return accepted.keys() == before.keys() and all(
