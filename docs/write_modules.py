@@ -21,14 +21,14 @@ These functions, and the modules that call them, run on the device of their inpu
 |---|---|
 | `float64` to `bfloat16` | returns the result of float64 for the same inputs, up to the precision of the dtype |
 | `meta` | returns the shapes and dtypes without values |
-| other device | runs on fake tensors of another device than the CPU; constants and results are there |
-| no synchronisation | does so without an operator that reads a value on the host |
+| other device | runs on fake tensors of a device other than the CPU; constants and results stay on that device |
+| no synchronisation | runs there without copying a value to the CPU, for which a GPU would have to wait |
 | `compile` | is captured by `torch.compile(fullgraph=True)`, with the same result and gradients |
 | `export` | is captured by `torch.export.export`, with the same result |
 | `vmap` | returns the same rows if `torch.func.vmap` maps it over the batch |
 | `grad`, `jacrev` | has the same gradients with `torch.func` as with `torch.autograd` |
 
-A number refers to the reason below the table, - means that the result has no gradients.
+A number refers to a reason below the table; `-` means that the result has no gradients.
 
 """
 
