@@ -71,8 +71,8 @@ class V3DSLAM(ReplaceableStages):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature; the results of the replacement are checked. `compensate`, `estimate_motion`, `track_map` and
-    `loop_closer` are also used inside other stages, which keep their own references to the original. `preprocess` runs
+    signature; the results of the replacement are checked. `estimate_motion`, `track_map` and `loop_closer` are also
+    used inside other stages, which keep their own references to the original. `preprocess` runs
     the stages that depend only on the frame, and can run ahead of `track`. Hooks see the
     arguments and results of stages, see `register_stage_hook`.
 
@@ -83,6 +83,8 @@ class V3DSLAM(ReplaceableStages):
         known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map.
 
     Attributes:
+        camera: Camera of all frames.
+        config: Configuration of all stages.
         map: Keyframes and landmarks.
         poses: Poses of all frames.
         states: States of the camera in the last 10 seconds.
@@ -138,7 +140,7 @@ class V3DSLAM(ReplaceableStages):
         self.loop_closer = LoopCloser(config.loop, self.estimate_motion, self.track_map, local_keyframes)
         self.track_camera = CameraTracker(self.track_map, self.loop_closer, self.map, local_keyframes)
         self.refine_previous = PreviousFrameRefinement(
-            self.compensate, self.track_map, self.map, refine_pose=config.rolling_shutter.enabled
+            self.track_map, self.map, refine_pose=config.rolling_shutter.enabled
         )
         self.estimate_state = StateEstimator()
         self.states = StateHistory()
@@ -184,6 +186,13 @@ class V3DSLAM(ReplaceableStages):
 
     def __call__(self, frame: RGBDFrame) -> FrameResult:
         """Process the next frame: preprocess and track.
+
+        Args:
+            frame: Next frame, later than the previous one.
+
+        Returns:
+            Objects of the frame, and state of the camera as it is known now. Poses that later frames correct are in
+            ``poses``.
 
         Raises:
             InputError: If the frame is not valid, of another camera, or not later than the previous one.
@@ -255,6 +264,9 @@ class V3DSLAM(ReplaceableStages):
     def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         """Track the camera and the objects in the next frame, and extend the map.
 
+        Args:
+            preprocessed: Result of `preprocess` for the next frame.
+
         Raises:
             InputError: If the frame is not later than the previous one.
         """
@@ -285,7 +297,7 @@ class V3DSLAM(ReplaceableStages):
             static = self._compensate(preprocessed.extraction.features[is_static], preprocessed, motion.velocity)
             landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
             velocity = self.motion_model.previous_velocity(self.poses, motion)
-            self.refine_previous(self._previous, velocity, self.poses)
+            self.refine_previous(self._previous, velocity, self.poses, self.compensate)
             pose = self.track_camera(static, depth, self._compose_pose(motion), landmarks, motion, self.poses)
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)

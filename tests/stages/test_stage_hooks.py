@@ -46,7 +46,7 @@ CALLS: dict[str, tuple[int, type | tuple[type, ...]]] = {
     "classify_motion": (6, FrameObjects),
     "track_camera": (6, FramePose),
     "estimate_state": (5, CameraState),
-    "refine_previous": (3, type(None)),
+    "refine_previous": (4, type(None)),
     "mapper": (4, object),
 }
 """Number of arguments and type of the result of each stage."""
@@ -65,7 +65,8 @@ def test_every_stage_is_seen_with_its_arguments_and_result() -> None:
         count, kind = CALLS[name]
         assert len(args) == count and isinstance(result, kind), name
     counts = Counter(name for name, _, _ in seen)
-    assert counts.pop("compensate") == 2 * FRAMES  # for the odometry, and for the pose in the map
+    # For the odometry, for the pose in the map, and for each previous frame.
+    assert counts.pop("compensate") == 3 * FRAMES - 1
     assert counts == dict.fromkeys(set(STAGES) - {"compensate"}, FRAMES)
     last = {name: (args, result) for name, args, result in seen}
     assert last["segment"][0][0].index == FRAMES - 1

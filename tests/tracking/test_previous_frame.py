@@ -66,8 +66,8 @@ class Scene:
     def refine(
         self, previous: TrackedFrame | None, velocity: Tensor | None = VELOCITY, *, refine_pose: bool = True
     ) -> None:
-        refine = PreviousFrameRefinement(self.compensate, self.track_map(), self.map, refine_pose=refine_pose)
-        refine(previous, velocity, self.poses)
+        refine = PreviousFrameRefinement(self.track_map(), self.map, refine_pose=refine_pose)
+        refine(previous, velocity, self.poses, self.compensate)
 
     def pose_error(self) -> float:
         """Error of the last pose, metres and radians."""

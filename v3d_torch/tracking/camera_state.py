@@ -28,8 +28,9 @@ class CameraState:
             shape :math:`(6, 6)`.
         twist: Velocity of the camera: after dt seconds the pose is ``T_wc @ se3_exp(twist * dt)``; m/s and rad/s,
             float64, shape :math:`(6,)`.
-        twist_covariance: Covariance of the twist, float64, shape :math:`(6, 6)`.
-        cross_covariance: Covariance of the errors of pose (rows) and twist (columns), float64, shape :math:`(6, 6)`.
+        twist_covariance: Covariance of the twist, m/s and rad/s, float64, shape :math:`(6, 6)`.
+        cross_covariance: Covariance of the errors of pose (rows, metres and radians) and twist (columns, m/s and
+            rad/s), float64, shape :math:`(6, 6)`.
     """
 
     stamp: float

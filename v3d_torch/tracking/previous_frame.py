@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
+from v3d_torch.features.features import Features
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.odometry import TrackedFrame
-from v3d_torch.odometry.time_compensation import TimeCompensation
 from v3d_torch.tracking.map_tracker import MapTracker
 from v3d_torch.tracking.pose_history import PoseHistory
 
@@ -18,37 +20,40 @@ class PreviousFrameRefinement:
     pose.
 
     Args:
-        compensate: Compensation of rolling shutter and depth delay.
         track_map: Refines a pose.
         sparse_map: Map of the system.
         refine_pose: False to update keyframes only.
     """
 
-    def __init__(
-        self, compensate: TimeCompensation, track_map: MapTracker, sparse_map: SparseMap, *, refine_pose: bool
-    ) -> None:
-        self._compensate = compensate
+    def __init__(self, track_map: MapTracker, sparse_map: SparseMap, *, refine_pose: bool) -> None:
         self._track_map = track_map
         self._map = sparse_map
         self._refine_pose = refine_pose
 
-    def __call__(self, previous: TrackedFrame | None, velocity: Tensor | None, poses: PoseHistory) -> None:
+    def __call__(
+        self,
+        previous: TrackedFrame | None,
+        velocity: Tensor | None,
+        poses: PoseHistory,
+        compensate: Callable[..., Features],
+    ) -> None:
         """Refine the last frame of the history.
 
         Args:
             previous: Last frame of the history; None before the second frame.
             velocity: Mean twist per second around this frame, float64, shape :math:`(6,)`; None if it is not known.
             poses: Poses of all frames so far.
+            compensate: Compensation of rolling shutter and depth delay, see `TimeCompensation`.
         """
         if previous is None or previous.landmarks is None or velocity is None or not self._map.keyframes:
             return
         newest, depth, delay = self._map.keyframes[-1], previous.depth, previous.frame.depth_delay
         if newest.frame == previous.frame.index:
-            features = self._compensate(newest.features, depth, delay, velocity, self._map.readout)
+            features = compensate(newest.features, depth, delay, velocity, self._map.readout)
             self._map.update_features(newest, features)
         elif self._refine_pose:
             matched, points = self._map.landmark_positions(previous.landmarks)
-            features = self._compensate(previous.features[matched], depth, delay, velocity, self._map.readout)
+            features = compensate(previous.features[matched], depth, delay, velocity, self._map.readout)
             refined = self._track_map.refine(poses.T_cw, points, features, rounds=1)
             if refined is not None:
                 poses.replace_last(refined.T_cw)
