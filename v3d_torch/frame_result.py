@@ -76,4 +76,8 @@ class FrameResult(FrameObjects, CameraState):
     """Result of `V3DSLAM.track`: the objects of a frame, and the state of the camera as it was known then.
 
     Later corrections of the pose are in `V3DSLAM.poses`.
+
+    Attributes: ``stamp``, ``T_wc``, ``status``, ``covariance``, ``twist``, ``twist_covariance`` and
+    ``cross_covariance`` of `CameraState`; ``objects``, ``static_mask``, ``static_without_people`` and ``vote_pairs`` of
+    `FrameObjects`.
     """

@@ -11,7 +11,11 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 DataRoot = Annotated[
-    Path | None, typer.Option(envvar="V3D_DATA", help="Folder of named sequences; missing ones are downloaded to it.")
+    Path | None,
+    typer.Option(
+        help="Folder of named sequences, to which missing ones are downloaded [$V3D_DATA is searched; downloads go to"
+        " the cache]."
+    ),
 ]
 Camera = Annotated[
     str | None,

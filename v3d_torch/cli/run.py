@@ -18,7 +18,6 @@ app = make_app()
 @app.command()
 @expand_user_paths
 def main(
-    context: typer.Context,
     seq: Annotated[
         str | None,
         typer.Option(
@@ -34,10 +33,11 @@ def main(
     fps: Fps = None,
     config: Annotated[
         str | None,
-        typer.Option(help="Name of a configuration (full, paper, baseline ...) or a YAML file [full]."),
+        typer.Option(help="Name of a configuration (full, realtime, paper, baseline ...) or a YAML file [full]."),
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Set one value, such as objects.voting.distance_threshold=0.05.")
+        list[str] | None,
+        typer.Option("--set", help="Set one value, such as objects.voting.distance_threshold=0.05; can be repeated."),
     ] = None,
     segmenter: Annotated[str | None, typer.Option(help="Source of instances: yolo, masks or none.")] = None,
     model: Annotated[str | None, typer.Option(help="Network: yolov8n-seg, yolo11n-seg or yolo26n-seg.")] = None,
@@ -97,9 +97,6 @@ def main(
     overrides += ["occupancy.enabled=true"] if occupancy else []
     overrides += ["mapping.enabled=false"] if localise else []
     overrides += ["prefetch=false"] if serial else []
-    data_root_source = context.get_parameter_source("data_root")
-    if resume is not None and data_root_source is not None and data_root_source.name == "ENVIRONMENT":
-        data_root = None  # that of the run to resume is used
     choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, bag, profile)
     with exit_on_error():
         request = RunRequest(

@@ -109,10 +109,11 @@ def se3_exp(xi: Tensor) -> Tensor:
             + \frac{\theta - \sin\theta}{\theta^3} \hat\xi^3, \qquad \theta = \|\phi\|, \quad \xi = [\rho, \phi]
 
     Args:
-        xi: Tangent vectors ``[translation, rotation]``, shape :math:`(..., 6)`; any rotation angle.
+        xi: Tangent vectors ``[translation, rotation]``, metres and radians, floating point, shape :math:`(..., 6)`; any
+            rotation angle.
 
     Returns:
-        Rigid motions, shape :math:`(..., 4, 4)`.
+        Rigid motions, dtype of ``xi``, shape :math:`(..., 4, 4)`.
     """
     dtype, xi = xi.dtype, xi.to(working_dtype(xi.dtype))
     X = hat(xi)
@@ -135,10 +136,11 @@ def se3_log(T: Tensor) -> Tensor:
     """Logarithm of SE(3), the inverse of `se3_exp`.
 
     Args:
-        T: Rigid motions, shape :math:`(..., 4, 4)`.
+        T: Rigid motions, floating point, shape :math:`(..., 4, 4)`.
 
     Returns:
-        Tangent vectors ``[translation, rotation]``, shape :math:`(..., 6)`, with a rotation angle in [0, pi].
+        Tangent vectors ``[translation, rotation]``, metres and radians, dtype of ``T``, shape :math:`(..., 6)`, with a
+        rotation angle in [0, pi].
     """
     dtype, T = T.dtype, T.to(working_dtype(T.dtype))
     phi = _so3_log(T[..., :3, :3])

@@ -24,7 +24,7 @@ class LiveResult(FrameResult):
     """Result of a live frame.
 
     Attributes:
-        frame: Frame.
+        frame: Frame to which the result belongs.
         captured_at: Time of capture in the clock of the computer (`time.monotonic`), seconds; ``stamp`` is the time in
             the clock of the camera.
         finished_at: Time of this result in the clock of the computer, seconds.

@@ -17,8 +17,8 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
     instance is more likely a new object. SciPy computes the assignment on the host for all devices.
 
     Args:
-        log_ratio: Log-likelihood ratio that instance n continues object t, shape :math:`(B, T, N)`; -inf for impossible
-            pairs.
+        log_ratio: Log-likelihood ratio that instance n continues object t, floating point, shape :math:`(B, T, N)`;
+            -inf for impossible pairs.
         tracked: Mask of the objects that are not padding, bool, shape :math:`(B, T)`; None for all.
         present: Mask of the instances that are not padding, bool, shape :math:`(B, N)`; None for all.
 

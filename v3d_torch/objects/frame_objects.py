@@ -16,9 +16,13 @@ class MotionState(StrEnum):
     """Motion state of an object."""
 
     STATIC = "static"
+    """At rest: its pixels are tracked and, unless it is a person, mapped."""
     DYNAMIC = "dynamic"
+    """It moved, by the votes or by the surface that appeared and vacated."""
     DEFORMING = "deforming"
+    """A person or animal that changes its shape in place, by the Chamfer distance."""
     UNKNOWN = "unknown"
+    """Not decided yet: its pixels are not tracked."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,8 @@ class TrackedObject:
         id: Number of the object.
         label: COCO class index; see `name` for the class name.
         mask: Pixels of the object, bool, shape :math:`(H, W)`; empty if it is hidden, or missed for more than 0.1 s,
-            because later predictions are seldom right. ``static_mask`` of `FrameObjects` leaves these out nevertheless.
+            because later predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes the predicted
+            pixels.
         state: Position and velocity with their covariance at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the baselines.

@@ -50,8 +50,8 @@ def hough_vote(
     object.
 
     Args:
-        previous: Centroids at the earlier time, metres, shape :math:`(..., K, 3)`.
-        current: Centroids at the current time, metres, shape :math:`(..., K, 3)`.
+        previous: Centroids at the earlier time, metres, floating point, shape :math:`(..., K, 3)`.
+        current: Centroids at the current time, metres, dtype and shape of ``previous``.
         present: Mask of the objects that are observed at both times, bool, shape :math:`(..., K)`; the centroids of all
             others are ignored.
         distance_threshold: Minimum change of a distance that counts as a vote, :math:`T_d`, metres.

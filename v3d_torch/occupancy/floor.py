@@ -63,6 +63,9 @@ class Floor:
 
         Args:
             points: Points, world frame, metres, shape :math:`(..., 3)`.
+
+        Returns:
+            Heights, float64, shape :math:`(...)`.
         """
         return points.to(torch.float64) @ self.up - self.offset
 
@@ -76,8 +79,8 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     few voxels below it. All voxels are hypotheses, so the result is deterministic.
 
     Args:
-        occupancy: Map.
-        up: Approximate up direction.
+        occupancy: Occupancy map.
+        up: Approximate up direction, see `estimate_up`.
 
     Returns:
         The floor; None if none is visible.

@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.io.paths import StrPath
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.occupancy.occupancy_map import VoxelState
 
@@ -19,16 +20,17 @@ _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of map_saver."""
 
 
-def write_map_server_files(path: Path, grid: OccupancyGrid) -> None:
+def write_map_server_files(path: StrPath, grid: OccupancyGrid) -> None:
     """Write a grid as ``.pgm`` and ``.yaml``.
 
     Args:
         path: Path of the YAML file; the image is written beside it.
-        grid: Grid.
+        grid: 2D grid, see `occupancy_grid`.
 
     Raises:
         OutputError: If a file cannot be written.
     """
+    path = Path(path)
     image = path.with_suffix(".pgm")
     values = torch.tensor([_GREY[state] for state in VoxelState], dtype=torch.uint8)
     grey = values[grid.states.flip(0).to(torch.int64) + 1]  # the first row of the image has the largest y

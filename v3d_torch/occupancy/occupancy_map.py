@@ -27,8 +27,11 @@ class VoxelState(IntEnum):
     """State of a voxel."""
 
     UNKNOWN = -1
+    """Never observed."""
     FREE = 0
+    """Seen through, so that no static surface is in it."""
     OCCUPIED = 1
+    """Contains a static surface."""
 
 
 class OccupancyMap:

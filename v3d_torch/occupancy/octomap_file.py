@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from v3d_torch.errors import OutputError
 from v3d_torch.io.files import atomic_write
+from v3d_torch.io.paths import StrPath
 from v3d_torch.kernels.voxel_blocks import UNKNOWN
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 
@@ -31,7 +32,7 @@ Codes = NDArray[np.uint64]
 Levels = list[tuple[Codes, NDArray[np.uint64]]]
 
 
-def write_octomap(path: Path, occupancy: OccupancyMap) -> None:
+def write_octomap(path: StrPath, occupancy: OccupancyMap) -> None:
     """Write a map as binary OctoMap file, in the world frame. Children of the same state are merged.
 
     Args:
@@ -41,7 +42,7 @@ def write_octomap(path: Path, occupancy: OccupancyMap) -> None:
     Raises:
         OutputError: If the file cannot be written, or the map is larger than OctoMap's trees.
     """
-    log_odds = occupancy.blocks.log_odds
+    path, log_odds = Path(path), occupancy.blocks.log_odds
     known = log_odds != UNKNOWN
     voxels = occupancy.blocks.voxels_where(known)
     states = torch.where(log_odds[known] >= 0, _OCCUPIED, _FREE).numpy().astype(np.uint64)

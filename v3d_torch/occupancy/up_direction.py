@@ -39,6 +39,9 @@ def estimate_up(gravity: Tensor | None = None, votes: Tensor | None = None) -> U
         gravity: Measured direction of gravity, world frame, shape :math:`(3,)`; None if it is not measured.
         votes: Sum of the votes of the segmentation for the up direction, world frame, shape :math:`(3,)`; see
             `UprightSegmenter`. None if there are none.
+
+    Returns:
+        Up direction with a bound of its error; that of the first image if neither source is available.
     """
     if gravity is not None:
         return UpDirection(-normalize(gravity.to(torch.float64), dim=0), _GRAVITY_TOLERANCE)

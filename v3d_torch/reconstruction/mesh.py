@@ -38,11 +38,14 @@ class Mesh:
 
 @torch.no_grad()
 def fuse_mesh(views: StaticViews, config: DenseMapConfig) -> Mesh:
-    """Extract the zero level of the mean signed distance of all views.
+    """Fuse all views into a coloured triangle mesh: the zero level of their mean truncated signed distance.
 
     Args:
         views: Static views of the keyframes.
         config: Configuration of the dense map and the mesh.
+
+    Returns:
+        Mesh in the world frame; without vertices if no surface is seen.
     """
     blocks = surface_blocks(views, config)
     tile_vertices, tile_faces = [torch.zeros(0, 3, dtype=torch.float64)], [torch.zeros(0, 3, dtype=torch.int64)]

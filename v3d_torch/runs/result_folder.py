@@ -19,6 +19,7 @@ _RESULTS = (
     *("map.ply", "mesh.ply", "trajectory.ply"),
     *("occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml", "figures/occupancy.png"),
     *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png"),
+    "figures/objects.png",
     *("masks/*.png", "map_masks/*.png"),
 )
 """Names of the files that a run, or the report of a run, writes in addition to the log."""

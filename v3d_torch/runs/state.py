@@ -45,8 +45,8 @@ def save_state(path: StrPath, slam: V3DSLAM) -> None:
     """Save the state of a system between two frames, so that another process can continue; see `load_state`.
 
     Args:
-        path: File.
-        slam: System.
+        path: Path of the file to write.
+        slam: System, between two frames.
 
     Raises:
         OutputError: If the file cannot be written.
@@ -60,7 +60,7 @@ def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesCo
     """Load a system that `save_state` saved. With the same frames it gives the same results, to the bit.
 
     Args:
-        path: File.
+        path: Path of a file written by `save_state`.
         segment: Segmenter; None to create the one named in the configuration.
         stages: Import paths of the saved configuration, ``config.stages``, if it has any; nothing is imported on the
             word of a file alone.

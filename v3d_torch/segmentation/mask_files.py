@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from v3d_torch.errors import InputError
+from v3d_torch.io.paths import StrPath
 from v3d_torch.io.safe_yaml import parse_yaml
 from v3d_torch.io.text import read_text
 from v3d_torch.segmentation.coco import COCO_NAMES, PERSON
@@ -45,8 +46,8 @@ class MaskFolder:
         InputError: If the folder is missing or contains no PNG file, or ``labels.yaml`` is invalid.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: StrPath) -> None:
+        self.folder = folder = Path(folder)
         self._paths: list[Path] = []
         with suppress(OSError):  # for example a name that is too long
             self._paths = sorted(folder.glob("*.png"))
