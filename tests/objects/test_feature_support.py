@@ -41,11 +41,11 @@ def test_too_few_inliers_support_no_object(count: int, supported: bool) -> None:
     assert support.supports(mask, 0.5, 10).tolist() == [supported]
 
 
-def test_object_over_the_whole_image_is_supported_by_the_number_of_inliers() -> None:
-    """Without features outside of the object, only the number of inliers decides."""
-    support, _ = scene(0.5)
+@pytest.mark.parametrize(("ratio", "supported"), [(0.5, True), (0.25, True), (0.24, False), (0.12, False)])
+def test_object_over_the_whole_image_is_compared_with_the_usual_inlier_ratio(ratio: float, supported: bool) -> None:
+    support, _ = scene(ratio, outside=ratio)
     everything = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
-    assert support.supports(everything, 0.5, 10).tolist() == [True]
+    assert support.supports(everything, 0.5, 10).tolist() == [supported]
 
 
 def test_no_features_and_no_objects_are_accepted() -> None:

@@ -20,6 +20,10 @@ on a static object both are similar, on a walking person nearly no feature is an
 MIN_SUPPORTING_FEATURES = 10
 """Minimum number of inliers on a supported object: a few inliers can lie on the contour of an object in front of it."""
 
+_MIN_OUTSIDE_FEATURES, _USUAL_INLIER_RATIO = 20, 0.5
+"""With fewer features outside of all objects, their inlier ratio is not known, and this usual ratio is the minimum:
+otherwise a few inliers on a person who fills the image would be enough."""
+
 
 @dataclass(frozen=True)
 class FeatureSupport:
@@ -53,5 +57,7 @@ class FeatureSupport:
         inside = torch.stack([mask.flatten().index_select(0, index) for mask in masks])
         outside = ~inside.any(dim=0)
         outside_ratio = (self.inliers & outside).sum() / outside.sum().clamp(min=1)
+        if int(outside.sum()) < _MIN_OUTSIDE_FEATURES:
+            outside_ratio = outside_ratio.clamp(min=_USUAL_INLIER_RATIO)
         counts, features = (inside & self.inliers).sum(dim=1), inside.sum(dim=1)
         return (counts >= min_inliers) & (counts >= min_ratio * outside_ratio * features)
