@@ -49,4 +49,6 @@ def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: Pinhol
     if not masks:
         return Instances.empty(*view.depth.shape[-2:])
     labels = torch.tensor([track.label for track in detected])
-    return Instances(torch.stack(masks), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
+    instances = Instances(torch.stack(masks), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
+    # An object that has left the view or is hidden is missed.
+    return instances[torch.tensor([bool(mask.numpy().any()) for mask in masks])]
