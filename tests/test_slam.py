@@ -202,14 +202,35 @@ def test_previous_frame_is_refined_before_a_frame_is_tracked(demo: RGBDSequence)
             calls.append("track")
             return track_camera(*args)
 
-    def refine(previous: TrackedFrame | None, velocity: Tensor | None, poses: PoseHistory) -> None:
+    def refine(previous: TrackedFrame | None, velocity: Tensor | None, *rest: Any) -> None:
         calls.append("nothing" if previous is None or velocity is None else f"refine {previous.frame.index}")
-        refine_previous(previous, velocity, poses)
+        refine_previous(previous, velocity, *rest)
 
     slam.track_camera, slam.refine_previous = Track(), refine
     for index in range(3):
         slam(demo[index])
     assert calls == ["nothing", "track", "refine 0", "track", "refine 1", "track"]
+
+
+def test_views_before_a_loss_are_compared_only_when_the_camera_is_found(demo: RGBDSequence) -> None:
+    slam = V3DSLAM(demo.camera, NoSegmentation())
+    track_camera, lost = slam.track_camera, (3, 4)
+    compared: list[bool] = []
+
+    class Track:
+        reference_keyframe = staticmethod(track_camera.reference_keyframe)
+
+        def __call__(self, features: Features, depth: Tensor, T_cw: Tensor, *rest: Any) -> FramePose:
+            if len(compared) - 1 in lost:
+                return FramePose(TrackingStatus.LOST, T_cw, torch.full((len(features),), -1))
+            return track_camera(features, depth, T_cw, *rest)
+
+    slam.track_camera = Track()
+    slam.register_stage_hook("free_space_check", lambda name, args, result: compared.append(args[1]))
+    statuses = [slam(demo[index]).status for index in range(7)]
+    assert [index for index, status in enumerate(statuses) if status is TrackingStatus.LOST] == [*lost]
+    # The pose of a frame is known if the frame before it was found; the first frame has no motion.
+    assert compared == [False, True, True, True, False, False, True]
 
 
 def test_array_instead_of_a_frame_is_rejected(demo: RGBDSequence) -> None:

@@ -19,7 +19,7 @@ from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, S
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.geometry.level_frame import level_frame
-from v3d_torch.geometry.se3 import orthonormalise
+from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -280,8 +280,9 @@ class V3DSLAM(ReplaceableStages):
             motion = self.odometry(self._previous, current, T_cp, prediction.velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
-            view = self.free_space_check.make_view(frame.stamp, depth, self._compose_pose(motion))
-            occupied = self.free_space_check(view, pose_known=motion.is_measured)
+            T_cw, was_lost = self._compose_pose(motion), self.poses.status is TrackingStatus.LOST
+            view = self.free_space_check.make_view(frame.stamp, depth, T_cw, is_measured=motion.is_measured)
+            occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
         segmentation = self._wait_for_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
             instances = self._complete_instances(segmentation.instances, view, occupied)
@@ -306,6 +307,8 @@ class V3DSLAM(ReplaceableStages):
             has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
+            elif keyframe is not None:  # the first one of a part of the map whose pose relative to the rest is a guess
+                self.free_space_check.drop_views()
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, velocity of the camera
@@ -425,8 +428,11 @@ class V3DSLAM(ReplaceableStages):
         """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
         reference = self.track_camera.reference_keyframe(pose)
         keyframe = self.mapper(frame, features, pose, reference)
+        T_map_guess = invert(pose.T_cw) @ self._compose_pose(motion)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
         self._apply_world_correction(T_new_old)
+        if pose.status is not TrackingStatus.LOST and T_new_old is None:
+            self.classify_motion.tracker.end_guess(T_map_guess)
         self._update_gravity(frame, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)

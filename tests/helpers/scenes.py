@@ -383,6 +383,25 @@ NO_FEATURES = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0
 """Feature support of a frame without features: the simulated scenes have depth only."""
 
 
+GUESS_ERROR = se3_exp(torch.tensor([0.2, 0.05, 0.15, 0.0, 0.08, 0.02], dtype=torch.float64))
+"""Transform from the true world frame to that of guessed poses: 25 cm and 5 degrees."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Pose that the object stage is given.
+
+    Attributes:
+        T_wc: Camera-to-world pose, float64, shape (4, 4).
+        is_measured: False if the motion since the previous frame was not measured.
+        is_found: True if the camera is found in the map afterwards, so that the true pose is known.
+    """
+
+    T_wc: Tensor
+    is_measured: bool = True
+    is_found: bool = True
+
+
 class ObjectStage:
     """Object stage in the order of `V3DSLAM`.
 
@@ -399,19 +418,30 @@ class ObjectStage:
         self._classify = MotionClassifier(config, camera)
         self.instances = Instances.empty(camera.height, camera.width)
         self.feature_support = NO_FEATURES
+        self._is_lost = False
 
     def __call__(
-        self, stamp: float, instances: Instances, depth: Tensor, T_wc: Tensor, cloud_depth: Tensor | None = None
+        self,
+        stamp: float,
+        instances: Instances,
+        depth: Tensor,
+        T_wc: Tensor,
+        cloud_depth: Tensor | None = None,
+        guess: Guess | None = None,
     ) -> FrameObjects:
         """Process a frame. The clouds use ``cloud_depth`` if it is given, everything else uses ``depth``."""
-        view = self._free_space_check.make_view(stamp, depth, invert(T_wc))
-        newly_occupied = self._free_space_check(view)
+        guess = guess or Guess(T_wc)
+        view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), is_measured=guess.is_measured)
+        newly_occupied = self._free_space_check(view, pose_known=guess.is_measured and not self._is_lost)
         min_area = self._config.free_space.min_unlabelled_area
         unlabelled = unlabelled_instances(newly_occupied, instances, depth, self._camera, min_area)
         self.instances = instances.concatenate(unlabelled)
         clouds = self._back_project(depth if cloud_depth is None else cloud_depth, self.instances)
         result = self._classify(self.instances, clouds, view, newly_occupied, self.feature_support)
-        self._free_space_check.add_view(view, view.T_cw)
+        self._is_lost = not guess.is_found
+        if guess.is_found:
+            self._free_space_check.add_view(view, invert(T_wc))
+            self._classify.tracker.end_guess(T_wc @ invert(guess.T_wc))
         return result
 
     def move_world(self, T_new_old: Tensor) -> None:
@@ -437,6 +467,7 @@ def simulate(
     camera: Callable[[Tensor], Tensor] = handheld,
     network: Network | None = None,
     pose_error: bool = False,
+    guessed: range = range(0),
     overrides: tuple[str, ...] = (),
     config: FilePath | None = None,
 ) -> Run:
@@ -450,6 +481,8 @@ def simulate(
         camera: True camera-to-world poses at given times, (B,) to (B, 4, 4).
         network: Errors of the segmentation; contour errors only by default.
         pose_error: True to pass poses with the error of `perturb_poses`.
+        guessed: Frames with a guessed pose: the motion before the first one is not measured, and the camera is found
+            again in the last one.
         overrides: Overrides of the configuration.
         config: Configuration file.
     """
@@ -466,6 +499,9 @@ def simulate(
     frames = []
     for i, stamp in enumerate(t.tolist()):
         instances, detected = network(owner[i], list(things), stamp, generator)
-        result = stage(stamp, instances, smooth(depth[i][None])[0], poses[i])
+        guess = None
+        if i in guessed:
+            guess = Guess(GUESS_ERROR @ poses[i], is_measured=i > guessed.start, is_found=i + 1 == guessed.stop)
+        result = stage(stamp, instances, smooth(depth[i][None])[0], poses[i], guess=guess)
         frames.append(Frame(stamp, owner[i], detected, result))
     return Run(frames)

@@ -343,6 +343,21 @@ def test_walker_is_dynamic_despite_pose_error(seed: int) -> None:
     assert_static(run, 0, 1)
 
 
+@pytest.mark.parametrize("guessed", [range(12, 13), range(12, 13 + 6)], ids=["one frame", "half a second"])
+def test_guessed_poses_make_no_static_object_dynamic(guessed: range) -> None:
+    things = (LEFT_CHAIR, RIGHT_CHAIR, person(stand(0.1, 2.7)))
+    run = simulate(*things, seconds=2.5, guessed=guessed)
+    assert_static(run, 0, 1, 2, max_fraction=0.0)
+    assert all(len(run.ids(thing)) == 1 for thing in range(3))
+
+
+def test_walker_stays_dynamic_after_guessed_poses() -> None:
+    things = (LEFT_CHAIR, RIGHT_CHAIR, person(walk(-0.8, 2.9, 0.7, 0.3), 0.2))
+    run = simulate(*things, seconds=2.5, guessed=range(12, 13 + 6))
+    assert_dynamic(run, 2)
+    assert_static(run, 0, 1)
+
+
 # ---------------------------------------------------------------- kinds of motion
 
 
@@ -353,6 +368,14 @@ def test_pushed_chair_is_dynamic(seed: int) -> None:
     run = simulate(LEFT_CHAIR, RIGHT_CHAIR, chair(path), seconds=2.0, seed=seed)
     assert_dynamic(run, 2)
     assert_static(run, 0, 1)
+
+
+def test_walker_beyond_the_depth_of_objects_is_never_static() -> None:
+    things = (LEFT_CHAIR, RIGHT_CHAIR, person(walk(-0.8, 2.9, 0.7, 0.3), 0.2))
+    near = ("objects.clouds.max_depth=2.0", "objects.free_space.max_depth=2.0")
+    run = simulate(*things, seconds=2.0, overrides=near)
+    assert run.state_fraction(2, MotionState.UNKNOWN) == 1
+    assert run.state_fraction(0, MotionState.STATIC) == run.state_fraction(1, MotionState.STATIC) == 1
 
 
 @SEEDS

@@ -369,6 +369,13 @@ def test_view_with_guessed_pose_is_not_compared() -> None:
     assert check(current).appeared.shape[0] == 2
 
 
+def test_dropped_views_are_not_compared() -> None:
+    check, current = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
+    assert not check(current).appeared.isnan().all()
+    check.drop_views()
+    assert check(current).appeared.isnan().all()
+
+
 @pytest.mark.parametrize("rate", [5, 10, 30])
 def test_box_appears_for_the_time_of_each_baseline(rate: int) -> None:
     """The box appears at 2 s, and is newly occupied over each baseline for the time of the baseline."""

@@ -173,7 +173,7 @@ class StaticMaskConfig(Section):
 
     confirm_static_time: float = Field(1.0, ge=0)
     """Time after the first detection for which a person is masked, unless observed at rest, seconds (the paper masks
-    persons until they are classified)."""
+    persons until they are classified). A person without usable depth stays masked."""
     hold_dynamic_time: float = Field(1.0, ge=0)
     """Time for which an object stays dynamic or deforming after the last evidence, seconds: a walking person pauses
     between steps. An object other than a person becomes static as soon as it is observed at rest."""

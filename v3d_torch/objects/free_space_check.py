@@ -81,12 +81,15 @@ class DepthView:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         misalignment: Largest offset of the depth from the colour image that the pose refers to, pixels. It arises when
             the camera turns between both exposures.
+        is_measured: True if the motion of the camera since the previous frame is measured; otherwise the pose is a
+            guess.
     """
 
     stamp: float
     depth: Tensor
     T_cw: Tensor
     misalignment: int = 0
+    is_measured: bool = True
 
     @cached_property
     def missing(self) -> Tensor:
@@ -262,29 +265,30 @@ class FreeSpaceCheck:
         self._stride = max(1, round(camera.width / _COLUMNS))
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
-    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor) -> DepthView:
+    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, is_measured: bool = True) -> DepthView:
         """Make a view. Its misalignment follows from the camera's rotation rate since the last stored view.
 
         Args:
             stamp: Timestamp, seconds.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            is_measured: True if the motion of the camera since the previous frame is measured.
         """
         if not self._views:
-            return DepthView(stamp, depth, T_cw)
+            return DepthView(stamp, depth, T_cw, is_measured=is_measured)
         last = self._views[-1]
         angle = float(np.linalg.norm(cv2.Rodrigues((T_cw @ invert(last.T_cw))[:3, :3].numpy())[0]))
         rotation_rate = angle / max(stamp - last.stamp, _MIN_INTERVAL)
         misalignment = round(self._camera.fx * rotation_rate * self._config.depth_sync_error)
-        return DepthView(stamp, depth, T_cw, misalignment)
+        return DepthView(stamp, depth, T_cw, misalignment, is_measured)
 
     def __call__(self, view: DepthView, *, pose_known: bool = True) -> NewlyOccupied:
         """Compare a view with the stored views.
 
         Args:
             view: Current view.
-            pose_known: True if the pose of the view is measured. With a guessed pose everything would seem to appear;
-                then nothing is compared.
+            pose_known: True if the pose of the view relative to the stored views is known. With a guessed pose
+                everything would seem to appear; then nothing is compared.
 
         Returns:
             Newly occupied pixels, one row per baseline; no row if nothing is compared.
@@ -305,6 +309,10 @@ class FreeSpaceCheck:
         oldest = view.stamp - max(self._config.baselines, default=0.0) - _VIEW_MARGIN
         new = StoredView(view.stamp, view.nearest_depth, T_cw)
         self._views = [stored for stored in self._views if stored.stamp >= oldest] + [new]
+
+    def drop_views(self) -> None:
+        """Forget the stored views, because the pose relative to them is not known."""
+        self._views = []
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the stored views into the corrected world.

@@ -80,9 +80,12 @@ class MotionClassifier:
         """
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
+        if not view.is_measured and self._last_stamp > -torch.inf:
+            self.tracker.start_guess(stamp)
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]
-        pairs = detection_pairs(detected, (*config.voting.baselines, config.chamfer.baseline))
+        baselines = (*config.voting.baselines, config.chamfer.baseline)
+        pairs = detection_pairs(detected, baselines, self.tracker.guessed_since)
 
         # Independent evidence, not in the paper: free space.
         free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
@@ -184,8 +187,9 @@ class MotionClassifier:
             return MotionState.DYNAMIC
         if stamp - track.last_deforming <= config.hold_dynamic_time:
             return MotionState.DEFORMING
-        is_new = track.label in LIVING and stamp - track.first_stamp < config.confirm_static_time
-        if is_new and not at_rest_over_all and not supported:
+        # Without a centroid, for example because the object is too far for its depth, its motion is never measured.
+        is_new = stamp - track.first_stamp < config.confirm_static_time or not track.newest.has_centroid
+        if track.label in LIVING and is_new and not at_rest_over_all and not supported:
             return MotionState.UNKNOWN
         return MotionState.STATIC
 

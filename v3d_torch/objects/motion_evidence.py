@@ -30,19 +30,22 @@ DetectionPairs = dict[Track, tuple[Detection3D, Detection3D]]
 """Earlier and newest detection of each object for which both exist."""
 
 
-def detection_pairs(tracks: Iterable[Track], baselines: Iterable[float]) -> dict[float, DetectionPairs]:
+def detection_pairs(
+    tracks: Iterable[Track], baselines: Iterable[float], since: float = -torch.inf
+) -> dict[float, DetectionPairs]:
     """Collect the pairs of detections to compare.
 
     Args:
         tracks: Tracks that are detected in the frame.
         baselines: Minimum times between the two detections of a pair, seconds.
+        since: Time of the first detection that can be compared, seconds.
 
     Returns:
         Pairs for each baseline.
     """
     tracks = list(tracks)
     return {
-        baseline: {track: pair for track in tracks if (pair := track.detection_pair(baseline)) is not None}
+        baseline: {track: pair for track in tracks if (pair := track.detection_pair(baseline, since)) is not None}
         for baseline in set(baselines)
     }
 

@@ -65,6 +65,11 @@ class Detection3D:
         """True if the centroid is known."""
         return bool(torch.isfinite(self.centroid).all())
 
+    def transform(self, T_new_old: Tensor) -> Detection3D:
+        """Return the detection in another world frame; ``T_new_old`` is float64, shape :math:`(4, 4)`."""
+        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        return Detection3D(self.stamp, R @ self.centroid + t, self.cloud @ R.T.to(self.cloud) + t.to(self.cloud))
+
 
 @dataclass(eq=False)  # compared by identity, so that a track can be a dictionary key
 class Track:
@@ -140,11 +145,12 @@ class Track:
         """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
         return self._filter.state.velocity
 
-    def detection_pair(self, baseline: float) -> tuple[Detection3D, Detection3D] | None:
+    def detection_pair(self, baseline: float, since: float = -torch.inf) -> tuple[Detection3D, Detection3D] | None:
         """Return the newest detection and an earlier one to compare it with.
 
         Args:
             baseline: Minimum time between both detections, seconds; 0 for the detection before the newest.
+            since: Time of the first detection that can be compared, seconds.
 
         Returns:
             Earlier and newest detection, both with a centroid; None if there is no such pair.
@@ -152,7 +158,8 @@ class Track:
         current = self.newest
         for previous in reversed(self.detections[:-1]):
             if current.stamp - previous.stamp >= baseline - STAMP_TOLERANCE:
-                return (previous, current) if previous.has_centroid and current.has_centroid else None
+                comparable = previous.stamp >= since and previous.has_centroid and current.has_centroid
+                return (previous, current) if comparable else None
         return None
 
     def predict_state(self, stamp: float) -> ObjectState:
@@ -277,18 +284,18 @@ class Track:
         """Record that the object deforms in the frame at ``stamp``, seconds."""
         self.last_deforming = stamp
 
-    def apply_world_correction(self, T_new_old: Tensor) -> None:
-        """Transform the track into the corrected world.
+    def apply_world_correction(self, T_new_old: Tensor, since: float = -torch.inf) -> None:
+        """Transform the track, or what was measured since some time, into the corrected world.
 
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+            since: Time of the first detection that is transformed, seconds.
         """
-        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
+        if self.newest.stamp < since:
+            return
         self._filter.apply_world_correction(T_new_old)
-        self.history = [state.transform(T_new_old) for state in self.history]
-        self.detections = [
-            Detection3D(d.stamp, R @ d.centroid + t, d.cloud @ R.T.to(d.cloud) + t.to(d.cloud)) for d in self.detections
-        ]
+        self.history = [state.transform(T_new_old) if state.stamp >= since else state for state in self.history]
+        self.detections = [d.transform(T_new_old) if d.stamp >= since else d for d in self.detections]
 
     def _remember_state(self) -> None:
         """Append the state to the history, at the rate of the history, and drop the states that are too old."""
