@@ -23,7 +23,6 @@ from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.segmentation.coco import UNLABELLED
-from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))

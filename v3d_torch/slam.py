@@ -26,6 +26,7 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
+from v3d_torch.objects.image_scale import scale_to_image
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.objects.newly_occupied import NewlyOccupied
@@ -126,14 +127,15 @@ class V3DSLAM(ReplaceableStages):
         self.estimate_motion = MotionEstimator(config.odometry, config.features, camera, config.seed)
         self.odometry: OdometryStage = Odometry(config, camera, self.estimate_motion)
         # Objects
-        free_space = config.objects.free_space
+        objects = scale_to_image(config.objects, camera)
+        free_space = objects.free_space
         self.free_space_check = FreeSpaceCheck(free_space, camera)
         self.propose_unlabelled: ProposalStage = partial(
             unlabelled_instances, camera=camera, min_area=free_space.min_unlabelled_area
         )
-        self.back_project_instances: BackProjectionStage = InstanceBackProjector(config.objects.clouds, camera)
+        self.back_project_instances: BackProjectionStage = InstanceBackProjector(objects.clouds, camera)
         self.describe_appearance: AppearanceStage = colour_histograms
-        self.classify_motion = MotionClassifier(config.objects, camera)
+        self.classify_motion = MotionClassifier(objects, camera)
         # Camera pose and map
         local_keyframes = config.tracking.local_keyframes
         self.track_map = MapTracker(config.tracking, config.features, camera)

@@ -68,7 +68,8 @@ class CloudConfig(Section):
 
     stride: int = Field(4, gt=0, le=100)
     """Every n-th row and column of a mask becomes points: the network predicts masks in cells of 4 pixels. Up to 4 m
-    the points of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN."""
+    the points of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN. It is scaled to the size of
+    the images, and to a shorter focal length."""
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points, metres: the depth error of a Kinect reaches 0.1 m there, as large as the motion to
     detect."""
@@ -169,7 +170,10 @@ class ChamferConfig(Section):
 
 
 class StaticMaskConfig(Section):
-    """Mask of the static pixels, on which the camera is tracked."""
+    """Mask of the static pixels, on which the camera is tracked.
+
+    Dilations and margins are those for images of 640 columns, and are scaled to the size of the images.
+    """
 
     confirm_static_time: float = Field(1.0, ge=0)
     """Time after the first detection for which a person is masked, unless observed at rest, seconds (the paper masks
