@@ -90,11 +90,11 @@ def choose_camera(
         InputError: If there is no camera, or the camera is invalid.
     """
     preset = _tum_preset(folder)
-    if isinstance(camera, PinholeCamera):
-        chosen = camera
+    if camera is not None:
+        chosen = load_given_camera(camera, image_size)
     else:
-        chosen = _find_camera(camera, folder, published or preset, image_size)
-        check_distortion(chosen, camera or folder)
+        chosen = _camera_of_folder(folder, published or preset, image_size)
+        check_distortion(chosen, folder)
     if chosen.depth_scale is not None:
         return chosen
     is_tum = canonical_name(folder.resolve().name) is not None
@@ -104,13 +104,29 @@ def choose_camera(
     return replace(chosen, depth_scale=depth_scale)
 
 
-def _find_camera(
-    camera: str | Path | None, folder: Path, published: PinholeCamera | None, image_size: ImageSize | None
-) -> PinholeCamera:
-    if camera is not None and not isinstance(camera, str | os.PathLike):
+def load_given_camera(camera: str | Path | PinholeCamera, image_size: ImageSize | None = None) -> PinholeCamera:
+    """Return the camera that the user gave as a camera, the name of a preset or a file.
+
+    Args:
+        camera: Camera, or what `load_camera` loads.
+        image_size: Function that gives the size of the images for a camera file that does not state it.
+
+    Returns:
+        The camera; its ``depth_scale`` is None if it is not stated.
+
+    Raises:
+        InputError: If the camera is of another type or invalid.
+    """
+    if isinstance(camera, PinholeCamera):
+        return camera
+    if not isinstance(camera, str | os.PathLike):
         raise InputError(f"camera is a {type(camera).__name__}; pass a PinholeCamera, the name of a preset or a file")
-    if camera is not None:
-        return load_camera(camera, image_size)
+    loaded = load_camera(camera, image_size)
+    check_distortion(loaded, camera)
+    return loaded
+
+
+def _camera_of_folder(folder: Path, published: PinholeCamera | None, image_size: ImageSize | None) -> PinholeCamera:
     for name in ("camera.yaml", "K.txt"):
         if (folder / name).is_file():
             return load_camera(folder / name, image_size)

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +29,7 @@ from helpers.simulated_realsense import (
     make_intrinsics,
     rs,
 )
-from helpers.tiny_images import as_rgb, colour_of
+from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of
 from typer.testing import CliRunner
 
 from v3d_torch.cli import record, run
@@ -215,6 +216,25 @@ def test_camera_of_another_size_is_an_input_error() -> None:
     stream = RealSenseStream("simulated", SimulatedDevice, "tum_fr3")
     with pytest.raises(InputError, match=r"simulated: sends 64x48 pixels, --camera has 640x480; remove --camera"):
         take_frames(stream, 1)
+
+
+@pytest.mark.parametrize("name", ["camera.yaml", "K.txt"])
+def test_camera_in_a_folder_named_like_the_stream_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    (tmp_path / "simulated").mkdir()
+    text = CAMERA_YAML if name == "camera.yaml" else "30 31 15.5 11.5 1000 32 24"
+    (tmp_path / "simulated" / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    stream = RealSenseStream("simulated", SimulatedDevice)
+    assert stream.camera == PinholeCamera(*COLOUR_K, WIDTH, HEIGHT, depth_scale=1000)
+
+
+def test_given_camera_has_the_depth_scale_of_the_device_unless_it_states_one() -> None:
+    given = PinholeCamera(*COLOUR_K, WIDTH, HEIGHT)
+    for stated, depth_scale in ((None, 1000), (5000, 5000)):
+        stream = RealSenseStream("simulated", SimulatedDevice, replace(given, depth_scale=stated))
+        assert stream.camera == replace(given, depth_scale=depth_scale)
 
 
 @pytest.mark.parametrize(

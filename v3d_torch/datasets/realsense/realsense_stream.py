@@ -6,13 +6,15 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.camera_fields import check_distortion
+from v3d_torch.datasets.cameras import CameraChoice, load_given_camera
 from v3d_torch.datasets.realsense.camera import camera_from_intrinsics, depth_scale_from, import_librealsense
 from v3d_torch.datasets.realsense.device import Device, open_recorded_device
 from v3d_torch.datasets.ros import read_topic_types
@@ -47,10 +49,8 @@ class RealSenseStream:
 
     def __init__(self, name: str, open_device: Callable[[], Device], camera: CameraChoice = None) -> None:
         device = open_device()
-        calibrated = None if camera is not None else camera_from_intrinsics(name, device.intrinsics, device.depth_unit)
         self.name = name
-        depth_scale = depth_scale_from(device.depth_unit)
-        self.camera: PinholeCamera = choose_camera(camera, Path(name), calibrated, depth_scale=depth_scale)
+        self.camera = _choose_camera(name, device, camera)
         self._open_device = open_device
 
     def __iter__(self) -> Iterator[RGBDFrame]:
@@ -114,6 +114,16 @@ class RealSenseStream:
         units = np.asanyarray(depth.get_data())
         metres = self.camera.correct_depth(depth_to_metres(units, depth_scale_from(device.depth_unit)))
         return RGBDFrame(index, stamp, convert_to_rgb(encoding, pixels), metres, camera=self.camera)
+
+
+def _choose_camera(name: str, device: Device, camera: CameraChoice) -> PinholeCamera:
+    """Camera of the user with the depth scale of the device if it states none; without one, that of the device."""
+    if camera is None:
+        calibrated = camera_from_intrinsics(name, device.intrinsics, device.depth_unit)
+        check_distortion(calibrated, name)
+        return calibrated
+    given = load_given_camera(camera)
+    return given if given.depth_scale is not None else replace(given, depth_scale=depth_scale_from(device.depth_unit))
 
 
 def open_realsense_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:
