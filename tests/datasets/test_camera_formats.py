@@ -59,9 +59,10 @@ def test_rational_model_of_ros_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [KALIBR, ROS, ORB_SLAM2.replace("DepthMapFactor: 5000.0", "")])
-def test_depth_scale_and_readout_can_be_added(tmp_path: Path, text: str) -> None:
-    camera = load(tmp_path, f"{text}\ndepth_scale: 1000\nreadout: 0.02\n")
-    assert (camera.depth_scale, camera.readout) == (1000, 0.02)
+def test_values_that_other_programs_do_not_state_can_be_added(tmp_path: Path, text: str) -> None:
+    added = {"depth_scale": 1000, "readout": 0.02, "depth_delay": -0.008, "inverse_depth_offset": 0.004}
+    camera = load(tmp_path, "\n".join([text, *(f"{name}: {value}" for name, value in added.items())]))
+    assert {name: getattr(camera, name) for name in added} == added
 
 
 def test_several_messages_of_a_topic_are_one_camera(tmp_path: Path) -> None:

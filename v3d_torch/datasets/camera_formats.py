@@ -15,7 +15,7 @@ from v3d_torch.io.text import replace_odd_spaces
 
 Fields = dict[str, Any]
 
-_OWN_KEYS = ("depth_scale", "readout")
+_OWN_KEYS = ("depth_scale", "readout", "depth_delay", "inverse_depth_offset")
 """Fields that can be added to the files of other programs, which do not state them."""
 
 _KALIBR_CAMERA = re.compile(r"cam\d+")
