@@ -91,6 +91,21 @@ def test_files_with_other_names_belong_to_frames_in_order(tmp_path: Path) -> Non
         masks(frame(2, 100.0))
 
 
+def test_numbers_in_names_are_compared_as_numbers(tmp_path: Path) -> None:
+    for value in range(1, 13):
+        Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{value}.png")
+    Image.fromarray(ids(np.uint8, 99)).save(tmp_path / "0.jpg")
+    masks = MaskFolder(tmp_path)
+    assert [masks.read(frame(index, 100.0))[1].tolist() for index in range(12)] == [[i] for i in range(1, 13)]
+
+
+def test_folder_is_accepted_as_a_string(tmp_path: Path) -> None:
+    Image.fromarray(ids(np.uint8, 3)).save(tmp_path / "a.png")
+    assert MaskFolder(str(tmp_path)).read(frame(0, 0.0))[1].tolist() == [3]
+    with pytest.raises(InputError, match="gone: contains no PNG files"):
+        MaskFolder(str(tmp_path / "gone"))
+
+
 def test_unusable_id_images_are_rejected_by_path(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="contains no PNG files"):
         MaskFolder(tmp_path)

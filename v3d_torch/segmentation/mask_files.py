@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from v3d_torch.datasets.image_files import list_images
 from v3d_torch.errors import InputError
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.safe_yaml import parse_yaml
@@ -34,7 +35,8 @@ class MaskFolder:
     """Instances from id images: single-channel PNG files, 8 or 16 bit, 0 = background, other values = instance ids.
 
     Files named by timestamp (``1305031102.175304.png``) belong to the nearest frame in time, at most 0.02 s away. Files
-    with other names belong to the frames in sorted order.
+    with other names belong to the frames in the order of their names, in which numbers are compared as numbers: 9.png
+    comes before 10.png.
 
     A file ``labels.yaml`` in the folder gives the COCO class of each id, a line ``4: chair`` for each; ids that it does
     not list are no instances. Without this file, all instances are people.
@@ -50,7 +52,7 @@ class MaskFolder:
         self.folder = folder = Path(folder)
         self._paths: list[Path] = []
         with suppress(OSError):  # for example a name that is too long
-            self._paths = sorted(folder.glob("*.png"))
+            self._paths = [path for path in list_images(folder) if path.suffix.lower() == ".png"]
         if not self._paths:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
         labels = folder / "labels.yaml"
