@@ -71,6 +71,14 @@ def test_file_inside_a_ros2_bag_can_be_opened(kind: Kind, tmp_path: Path) -> Non
     assert_frame(sequence, 2, 2)
 
 
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+def test_folder_of_a_ros2_bag_can_be_named_like_a_ros1_bag(kind: Kind, tmp_path: Path) -> None:
+    make = MessageFactory(kind)
+    sequence = load_sequence(str(make.write(tmp_path / "my.bag", valid_messages(make))))
+    assert isinstance(sequence, BagSequence)
+    assert_frame(sequence, 2, 2)
+
+
 def test_unset_header_stamps_are_replaced_by_arrival_times(tmp_path: Path) -> None:
     messages = valid_messages(ROS2)
     for topic, _, message in messages:
@@ -215,6 +223,14 @@ def test_truncated_bag_is_an_input_error(kind: Kind, keep: float, tmp_path: Path
     with pytest.raises(InputError, match="is damaged or not a bag") as caught:
         list(load_sequence(str(path)))
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["take", "take.v2", "take.bag"])
+def test_damaged_folder_is_repaired_by_the_command_of_ros2(name: str, tmp_path: Path) -> None:
+    path = ROS2.write(tmp_path / name, valid_messages(ROS2))
+    next(path.glob("*.db3")).write_bytes(b"")
+    with pytest.raises(InputError, match=rf"{name}: is damaged or not a bag .*, or repair it with ros2 bag reindex$"):
+        load_sequence(str(path))
 
 
 def test_missing_rosbags_is_an_input_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,13 +32,8 @@ if TYPE_CHECKING:
 _DEPTH_SCALE = 1000.0
 """Units per metre of 16-bit depth: ROS stores millimetres (REP 118)."""
 
-_REPAIR_COMMANDS = {
-    ".bag": "rosbag reindex",
-    ".mcap": "mcap recover",
-    ".db3": "ros2 bag reindex",
-    "": "ros2 bag reindex",
-}
-"""Command that repairs a bag, by file suffix; the folder of a ROS 2 bag has no suffix."""
+_REPAIR_COMMANDS = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
+"""Command that repairs a file, by its suffix."""
 
 
 class BagSequence(ImageSequence):
@@ -151,7 +146,7 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
         raise InputError(f"{path}: reading a bag needs rosbags ({error}); run pip install rosbags") from error
     # The definitions of images and cameras are the same in all versions of ROS 1, and in all of ROS 2. The definitions
     # in the bag are not parsed, so that a malformed definition of an unrelated topic causes no error.
-    is_ros1 = path.suffix == ".bag"
+    is_ros1 = path.suffix == ".bag" and path.is_file()  # the folder of a ROS 2 bag can have any name
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
     if is_ros1:  # rosbags lacks the message of transforms
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
@@ -169,7 +164,7 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
 def _damaged_bag_error(path: Path, error: Exception) -> InputError:
     # rosbags does not wrap the errors of the libraries that it uses for each format.
     cause = str(error).splitlines()[0] if str(error) else type(error).__name__
-    repair = _REPAIR_COMMANDS[path.suffix]
+    repair = _REPAIR_COMMANDS[path.suffix] if path.is_file() else "ros2 bag reindex"
     return InputError(f"{path}: is damaged or not a bag ({cause}); copy it again, or repair it with {repair}")
 
 
