@@ -76,6 +76,27 @@ def test_kind_at_the_start_of_names_is_ignored_in_pairing(root: Path) -> None:
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 1), (1, 0)])
 
 
+def test_names_that_differ_in_leading_zeros_are_paired(root: Path) -> None:
+    """Some names are equal, but the others belong together as well."""
+    numbers = [7, 8, 9, 10, 11, 100]
+    fill(root, [f"rgb/{i}.png" for i in numbers], [f"depth/{i:02d}.png" for i in reversed(numbers)])
+    assert_frames(load_sequence(str(root), options=FPS), [i / 10 for i in range(6)], [(i, 5 - i) for i in range(6)])
+
+
+def test_equal_names_are_preferred_to_names_with_other_zeros(root: Path) -> None:
+    fill(root, ["rgb/1.png", "rgb/02.png", "rgb/2.png"], ["depth/02.png", "depth/2.png", "depth/1.png"])
+    sequence = load_sequence(str(root), options=FPS)
+    assert len(sequence) == 3
+    for frame in sequence:
+        (colour,) = (seed for seed in range(3) if np.array_equal(as_rgb(frame.image), colour_of(seed)))
+        np.testing.assert_allclose(frame.depth[0], depth_of((colour + 2) % 3) / 1000, rtol=1e-6)
+
+
+def test_few_images_without_a_partner_are_left_out(root: Path) -> None:
+    fill(root, [f"rgb/{i}.png" for i in range(11)], [f"depth/{i}.png" for i in range(1, 11)] + ["depth/99.png"])
+    assert_frames(load_sequence(str(root), options=FPS), [i / 10 for i in range(10)], [(i + 1, i) for i in range(10)])
+
+
 @pytest.mark.parametrize(
     ("name", "seconds", "number"),
     [
@@ -108,7 +129,13 @@ def test_images_are_listed_in_numerical_order(tmp_path: Path) -> None:
             ["rgb/a.png", "rgb/b.png"],
             ["depth/x.png"],
             FPS,
-            "has 2 colour and 1 depth images that cannot be paired by name",
+            "has 2 colour and 1 depth images, of which 0 can be paired by name; give the two images of a frame the",
+        ),
+        (
+            ["rgb/1.png", "rgb/2.png", "rgb/3.png"],
+            ["depth/2.png", "depth/3.png", "depth/4.png"],
+            FPS,
+            "has 3 colour and 3 depth images, of which 2 can be paired by name; give the two images of a frame the",
         ),
         (["rgb/10.5.png"], ["depth/11.5.png"], FPS, "no colour image is within 0.02 s"),
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice
@@ -14,6 +15,11 @@ from v3d_torch.io.timestamps import associate
 
 _COLOUR = re.compile(r"rgb|colou?r|image|img|photo", re.IGNORECASE)
 _DEPTH = re.compile(r"depth", re.IGNORECASE)
+_LEADING_ZEROS = re.compile(r"(?<!\d)0+(?=\d)")
+
+_MIN_PAIRED = 0.9
+"""Minimum fraction of the smaller list of images that is paired by name: cameras drop single images, but if more names
+differ, equal names are a coincidence."""
 
 
 class ImageFolder(PairedImages):
@@ -22,8 +28,10 @@ class ImageFolder(PairedImages):
     Colour and depth images are paired by the first rule that applies:
 
     1. by nearest timestamps, if all names are timestamps;
-    2. by names that differ only in the kind, such as ``7_rgb.jpg`` and ``7_depth.png``;
-    3. by their position in the sorted lists of names.
+    2. by names that differ only in the kind, such as ``7_rgb.jpg`` and ``7_depth.png``, or also in leading zeros, such
+       as ``rgb/7.png`` and ``depth/0007.png``; images without a partner are left out, of the kind with fewer images at
+       most a tenth;
+    3. by their position in the sorted lists of names, if no names are equal.
 
     Args:
         folder: Folder of the sequence.
@@ -31,7 +39,8 @@ class ImageFolder(PairedImages):
         fps: Frame rate, Hz; None to read the timestamps from the file names.
 
     Raises:
-        InputError: If there are no pairs, no timestamps or no camera.
+        InputError: If there are no pairs, too few of the images have equal names, or there are no timestamps or no
+            camera.
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None, *, fps: float | None = None) -> None:
@@ -78,20 +87,31 @@ def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Pat
                 " to the same recording"
             )
         return [(list(colour_by_stamp.values())[i], list(depth_by_stamp.values())[j]) for i, j in indices]
-    depth_by_name = {_without_kind(path): path for path in depth}
-    if pairs := [(path, depth_by_name[_without_kind(path)]) for path in colour if _without_kind(path) in depth_by_name]:
+    pairs = max((_pair_by_name(colour, depth, name) for name in (_without_kind, _without_zeros)), key=len)
+    if len(pairs) >= _MIN_PAIRED * min(len(colour), len(depth)):
         return pairs
-    if len(colour) != len(depth):
+    if pairs or len(colour) != len(depth):
         raise InputError(
-            f"{folder}: has {len(colour)} colour and {len(depth)} depth images that cannot be paired by name;"
-            " give the two images of a frame the same name"
+            f"{folder}: has {len(colour)} colour and {len(depth)} depth images, of which {len(pairs)} can be paired by"
+            " name; give the two images of a frame the same name"
         )
     return list(zip(colour, depth, strict=True))
+
+
+def _pair_by_name(colour: list[Path], depth: list[Path], name: Callable[[Path], str]) -> list[tuple[Path, Path]]:
+    """Pair images with equal names, in the order of the colour images."""
+    colour_by_name, depth_by_name = ({name(path): path for path in paths} for paths in (colour, depth))
+    return [(path, depth_by_name[key]) for key, path in colour_by_name.items() if key in depth_by_name]
 
 
 def _without_kind(path: Path) -> str:
     """File name without the words that denote colour or depth."""
     return _DEPTH.sub("", _COLOUR.sub("", path.stem)).strip("-_. ")
+
+
+def _without_zeros(path: Path) -> str:
+    """File name without the words that denote colour or depth, and without leading zeros of numbers."""
+    return _LEADING_ZEROS.sub("", _without_kind(path))
 
 
 def _by_stamp(paths: list[Path]) -> dict[float, Path]:

@@ -221,8 +221,8 @@ CASES = [
         "images that cannot be paired",
         all_of(use_files(without(images(), "depth") | {"depth/a.png": png(depth())}), add_options("--fps", "10")),
         Fails(
-            "{root}/take: has 8 colour and 1 depth images that cannot be paired by name; give the two images of"
-            " a frame the same name"
+            "{root}/take: has 8 colour and 1 depth images, of which 0 can be paired by name; give the two images of a"
+            " frame the same name"
         ),
     ),
     Case(
