@@ -20,12 +20,12 @@ DOWN = np.array([0.3, 0.9, 0.1]) / np.linalg.norm([0.3, 0.9, 0.1])
 """Direction of gravity, frame of the colour camera."""
 
 
-def write_bag(make: MessageFactory, path: Path, extra: list[Message]) -> BagSequence:
+def write_bag(make: MessageFactory, path: Path, extra: list[Message], camera_frame: str = "optical") -> BagSequence:
     k, p = [30.0, 0, 15.5, 0, 31.0, 11.5, 0, 0, 1], [28.0, 0, 15.0, 0, 0, 29.0, 11.0, 0, 0, 0, 1, 0]
     messages: list[Message] = [(INFO, 9.0, make.info(WIDTH, HEIGHT, k, [0.0] * 5, p)), *extra]
     for i in range(2):
-        messages.append((RGB, 20 + i, make.image(10 + i / 10, "rgb8", colour_of(i))))
-        messages.append((DEPTH, 20 + i, make.image(10 + i / 10, "16UC1", depth_of(i))))
+        messages.append((RGB, 20 + i, make.image(10 + i / 10, "rgb8", colour_of(i), frame=camera_frame)))
+        messages.append((DEPTH, 20 + i, make.image(10 + i / 10, "16UC1", depth_of(i), frame=camera_frame)))
     sequence = load_sequence(str(make.write(path / "take", messages)))
     assert isinstance(sequence, BagSequence)
     return sequence
@@ -64,6 +64,17 @@ def test_accelerometer_in_the_frame_of_the_camera_needs_no_transforms(tmp_path: 
 def test_bag_without_accelerometer_has_no_gravity(tmp_path: Path) -> None:
     make = MessageFactory("mcap")
     assert write_bag(make, tmp_path, [])[0].gravity is None
+
+
+@pytest.mark.parametrize(("camera", "imu"), [("", ""), ("optical", ""), ("", "imu")])
+def test_frames_without_names_are_not_taken_as_the_same(
+    camera: str, imu: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make = MessageFactory("mcap")
+    with caplog.at_level(logging.WARNING):
+        assert write_bag(make, tmp_path, measurements(make, -9.81 * DOWN, imu), camera)[0].gravity is None
+    names = [name or "a frame without name" for name in (imu, camera)]
+    assert f"the orientation of {names[0]} on /imu relative to {names[1]} is not in /tf_static" in caplog.text
 
 
 @pytest.mark.parametrize(

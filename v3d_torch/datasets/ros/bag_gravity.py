@@ -52,7 +52,7 @@ def read_gravity(
             return gravity_direction(accelerations @ rotation.T, f"{path}: {topic}")
         _LOG.warning(
             "%s: the orientation of %s on %s relative to %s is not in /tf_static; gravity is not used",
-            path, frame, topic, colour_frame,
+            path, frame or "a frame without name", topic, colour_frame or "a frame without name",
         )  # fmt: skip
     return None
 
@@ -76,8 +76,11 @@ def _read_accelerations(
 def _find_rotation(target: str, source: str, messages: list[Any]) -> NDArray[np.float64] | None:
     """Rotation from frame ``source`` to ``target`` by static transforms, shape (3, 3); None if they are not connected.
 
-    The optical frames of a camera have the same axes, even if no transform connects them.
+    The optical frames of a camera have the same axes, even if no transform connects them. Frames without names are not
+    known to be the same.
     """
+    if not target or not source:
+        return None
     if target == source or (target.endswith("optical_frame") and source.endswith("optical_frame") and not messages):
         return np.eye(3)
     neighbours: dict[str, list[tuple[str, Rotation]]] = {}
