@@ -48,15 +48,14 @@ def calibrate_changed_cameras(
     Raises:
         V3DError: If the sequence is missing or damaged.
     """
+
+    def open_sequence(camera: PinholeCamera) -> RGBDSequence:
+        return select(load_sequence(source, camera=camera))
+
     right = load_sequence(source).camera
     for name, change in CHANGES.items():
         given = change(right)
-
-        def open_sequence(camera: PinholeCamera | None, given: PinholeCamera = given) -> RGBDSequence:
-            return select(load_sequence(source, camera=camera or given))
-
-        yield ChangedCamera(
-            name,
-            given,
-            calibrate_sequence(open_sequence, lambda _: NoSegmentation(), config, lambda *_: lambda *_: None),
+        calibration = calibrate_sequence(
+            open_sequence(given), open_sequence, lambda _: NoSegmentation(), config, lambda *_: lambda *_: None
         )
+        yield ChangedCamera(name, given, calibration)

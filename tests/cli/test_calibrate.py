@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import pytest
 from helpers.commands import assert_error_line
 from helpers.demo_frames import copy_frames
@@ -52,4 +54,18 @@ def test_existing_file_and_unknown_sequence_are_errors(sequence: Path, tmp_path:
         call("--seq", sequence, "--out", tmp_path / "camera.yaml"), "already exists; choose another file with --out"
     )
     assert_error_line(call("--seq", "gone_folder", "--out", tmp_path / "new.yaml"), "gone_folder")
+    assert not (tmp_path / "new.yaml").exists()
+
+
+def test_estimated_depth_scale_and_damaged_ground_truth_are_told(sequence: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "millimetres"
+    shutil.copytree(sequence, folder)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5)
+    camera = load_camera(sequence / "camera.yaml")
+    (folder / "camera.yaml").write_text(camera_text(replace(camera, depth_scale=None)))
+    (folder / "groundtruth.txt").write_text("10 1 2 3 0 0 0 nan\n")
+    done = call("--seq", folder, "--out", tmp_path / "new.yaml")
+    assert "note: millimetres: depth scale 1000 (millimetres), estimated from " in done.stdout
+    assert_error_line(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite")
     assert not (tmp_path / "new.yaml").exists()

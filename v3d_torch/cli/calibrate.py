@@ -14,7 +14,7 @@ from v3d_torch.runtime.imports import quick_imports
 
 if TYPE_CHECKING:
     from v3d_torch.datasets import RGBDSequence
-    from v3d_torch.geometry.camera import PinholeCamera
+    from v3d_torch.datasets.cameras import CameraChoice
 
 app = make_app()
 
@@ -57,6 +57,7 @@ def main(
         from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
         from v3d_torch.runs.interrupts import interrupts_between_frames
         from v3d_torch.runs.kernel_compilation import compile_kernels
+        from v3d_torch.runs.open_sequences import check_groundtruth, print_notes
         from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
         from v3d_torch.segmentation import make_segmenter
 
@@ -64,17 +65,22 @@ def main(
     options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
     overrides = [*(set_ or []), *([f"segmentation.source={segmenter}"] if segmenter is not None else [])]
 
-    def open_sequence(calibrated: PinholeCamera | None) -> RGBDSequence:
-        return load_sequence(seq, data_root=data_root, camera=calibrated or camera, options=options)
+    def open_sequence(camera: CameraChoice) -> RGBDSequence:
+        return load_sequence(seq, data_root=data_root, camera=camera, options=options)
 
     with exit_on_error():
         if out.exists():
             raise OutputError(f"{out}: already exists; choose another file with --out")
         check_writable(out)
         config = load_config(overrides=overrides)
+        with console.status(f"opening {seq}"):
+            sequence = open_sequence(camera)
+        print_notes(sequence, console)
+        check_groundtruth(sequence)  # it determines the depth scale
         compile_kernels(console)
         with progress_bars(console) as progress, interrupts_between_frames() as interrupted:
             calibration = calibrate_sequence(
+                sequence,
                 open_sequence,
                 lambda calibrated: make_segmenter(config, calibrated),
                 config,

@@ -35,12 +35,10 @@ UNITS = {
 }
 """Names of the parameters with their units."""
 
-OpenSequence = Callable[[PinholeCamera | None], RGBDSequence]
-"""Function that opens a sequence with a given camera; None for the camera of the sequence."""
-
 
 def calibrate_sequence(
-    open_sequence: OpenSequence,
+    sequence: RGBDSequence,
+    reopen: Callable[[PinholeCamera], RGBDSequence],
     make_segmenter: Callable[[PinholeCamera], Segmenter],
     config: Config,
     on_run: Callable[[int, int], FrameCallback],
@@ -48,7 +46,8 @@ def calibrate_sequence(
     """Calibrate the camera of a sequence.
 
     Args:
-        open_sequence: Function that opens the sequence.
+        sequence: Sequence with the given camera.
+        reopen: Function that opens the sequence with another camera.
         make_segmenter: Function that makes the segmenter of a run with this camera.
         config: Configuration of the runs.
         on_run: Called before each run with its number, from 1, and the number of frames; returns a function that is
@@ -58,7 +57,6 @@ def calibrate_sequence(
         InputError: If a frame cannot be read.
     """
     set_num_threads(config.threads)
-    sequence = open_sequence(None)
     given = camera = sequence.camera
     previous: Calibration | None = None
     for number in range(1, _MAX_RUNS + 1):
@@ -80,7 +78,7 @@ def calibrate_sequence(
         if _is_converged(calibration, camera, previous):
             break
         previous, camera = calibration, calibration.next_camera
-        sequence = open_sequence(camera)
+        sequence = reopen(camera)
     return calibration
 
 

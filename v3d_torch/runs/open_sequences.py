@@ -45,6 +45,16 @@ def print_notes(source: RGBDStream, console: Console) -> None:
         console.print(f"note: {source.name}: {note}", markup=False, highlight=False)
 
 
+def check_groundtruth(source: RGBDStream) -> None:
+    """Check that the ground truth of a source could be read, for a command whose results depend on it.
+
+    Raises:
+        InputError: If the source has a ground truth that could not be read.
+    """
+    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
+        raise source.groundtruth_error
+
+
 def open_sequences(
     names: Sequence[str], data_root: Path | None, console: Console, *, skip_broken: bool = False
 ) -> dict[str, RGBDSequence]:
@@ -60,8 +70,7 @@ def open_sequences(
     sequences: dict[str, RGBDSequence] = {}
     for name in dict.fromkeys(names):
         sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
-        if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
-            raise sequence.groundtruth_error  # runs are compared by their scores, so all need readable ground truth
+        check_groundtruth(sequence)  # runs are compared by their scores
         if sequence.name in sequences:
             raise InputError(f"{name}: another sequence has the same name, {sequence.name}; run them separately")
         sequences[sequence.name] = sequence
