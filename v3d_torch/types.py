@@ -239,7 +239,7 @@ class Trajectory:
         T_wc: Camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
 
     Raises:
-        InputError: If the values are not numbers of these shapes.
+        InputError: If the values are not numbers of these shapes, or the stamps do not increase.
     """
 
     stamps: Tensor
@@ -260,6 +260,13 @@ class Trajectory:
                     " of shape (N, 4, 4)"
                 )
             object.__setattr__(self, name, value.to(torch.float64))
+        increases = self.stamps[1:] > self.stamps[:-1]
+        if not bool(increases.all()):
+            before, after = self.stamps[int(increases.int().argmin()) :][:2].tolist()
+            raise InputError(
+                f"stamps of a trajectory do not increase ({after:.6f} s follows {before:.6f} s); sort the poses by"
+                " time, and give each time once and in float64"
+            )
 
     def __len__(self) -> int:
         return self.stamps.shape[0]

@@ -166,6 +166,9 @@ def test_trajectory_is_created_from_arrays_and_lists(tmp_path: Path) -> None:
         (np.zeros((2, 1)), np.zeros((2, 4, 4)), r"stamps of a trajectory have shape \(2, 1\); give"),
         (["then", "now"], np.zeros((2, 4, 4)), "stamps of a trajectory are not numbers"),
         (None, None, "stamps of a trajectory"),
+        ([1, 3, 2.5, 2], np.zeros((4, 4, 4)), r"stamps .* do not increase \(2.500000 s follows 3.000000 s\); sort the"),
+        ([1, 1], np.zeros((2, 4, 4)), r"stamps .* do not increase \(1.000000 s follows 1.000000 s\); sort the poses"),
+        ([1, np.nan], np.zeros((2, 4, 4)), r"stamps of a trajectory do not increase \(nan s follows 1.000000 s\)"),
     ],
 )
 def test_invalid_trajectory_arguments_are_rejected(stamps: object, T_wc: object, message: str) -> None:
