@@ -44,6 +44,10 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("objects=3", "valid dictionary"),
         ("seed=[", "not valid YAML"),
         ("segmentation.height=481", "multiple of 32"),
+        ("objects.free_space.baselines=[-0.3]", "free_space.baselines.0: input should be greater than or equal to 0"),
+        ("objects.free_space.baselines=[0.3,11]", "free_space.baselines.1: input should be less than or equal to 10"),
+        ("dense_odometry.halvings=[-1]", "dense_odometry.halvings.0: input should be greater than or equal to 0"),
+        ("dense_odometry.halvings=[13]", "dense_odometry.halvings.0: input should be less than or equal to 12"),
     ],
 )
 def test_invalid_override_is_rejected_with_a_fix(override: str, message: str) -> None:

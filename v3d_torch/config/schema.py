@@ -131,9 +131,9 @@ class FreeSpaceConfig(Section):
 
     enabled: bool = True
     """False for the paper's literal rules."""
-    baselines: tuple[float, ...] = (0.3, 0.9)
+    baselines: tuple[Annotated[float, Field(ge=0, le=10)], ...] = (0.3, 0.9)
     """Times between the depth images that are compared, seconds: a walking person moves 0.3 m in the first, a slow one
-    in the second."""
+    in the second. Depth images are stored for the longest one."""
     min_unlabelled_area: float = Field(0.02, gt=0)
     """Minimum area of an unlabelled moving region, square metres: a hand with its forearm. Infinite in the ablation."""
     max_depth: float = Field(6.0, gt=0)
@@ -253,7 +253,7 @@ class OdometryConfig(Section):
 class DenseOdometryConfig(Section):
     """Camera motion between two frames from all pixels, used when features fail."""
 
-    halvings: tuple[int, ...] = (4, 2, 1)
+    halvings: tuple[Annotated[int, Field(ge=0, le=12)], ...] = (4, 2, 1)
     """Number of times that the image is halved for each pyramid level, coarse to fine. A shift of 60 pixels between
     frames is about 4 pixels at the coarsest level."""
     iterations: int = Field(10, gt=0)

@@ -275,7 +275,11 @@ CASES = [
         Fails("--set: features.levels: input should be less than or equal to 20, got 100"),
     ),
     Case("--set with no baselines", setting("objects.voting.baselines=[]"), Succeeds()),
-    Case("--set with negative baselines", setting("objects.free_space.baselines=[-1]"), Succeeds()),
+    Case(
+        "--set with negative baselines",
+        setting("objects.free_space.baselines=[-1]"),
+        Fails("--set: objects.free_space.baselines.0: input should be greater than or equal to 0, got -1"),
+    ),
     Case(
         "--set with a tiny voxel size",
         setting("dense_map.voxel_size=1e-30"),
