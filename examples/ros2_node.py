@@ -73,10 +73,15 @@ class SlamNode(Node):
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
         stamps = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
-        rgb, measured = decode_colour_message(colour, COLOUR), decode_depth_message(depth, DEPTH)
-        frame = v3d.RGBDFrame.from_arrays(
-            *(self._count, stamps[0], rgb.permute(1, 2, 0), measured, self.camera), depth_delay=stamps[1] - stamps[0]
-        )
+        try:
+            rgb, measured = decode_colour_message(colour, COLOUR), decode_depth_message(depth, DEPTH)
+            frame = v3d.RGBDFrame.from_arrays(
+                *(self._count, stamps[0], rgb.permute(1, 2, 0), measured, self.camera),
+                depth_delay=stamps[1] - stamps[0],
+            )
+        except v3d.InputError as error:
+            self.get_logger().warning(f"a frame is skipped: {error}")
+            return
         self._count += 1
         self.frames.put(frame)
 
@@ -86,11 +91,19 @@ class SlamNode(Node):
         self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
 
 
+def spin(node: SlamNode) -> None:
+    """Receive images until ROS is shut down, and then end the frames, also if ``rclpy.spin`` raises an exception."""
+    try:
+        rclpy.spin(node)
+    finally:
+        node.frames.put(None)
+
+
 def main() -> None:
     """Run until ROS is shut down."""
     rclpy.init()
     node = SlamNode()
-    Thread(target=lambda: (rclpy.spin(node), node.frames.put(None)), daemon=True).start()
+    Thread(target=spin, args=(node,), daemon=True).start()
     v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)
 
 

