@@ -27,6 +27,7 @@ from typer.testing import Result
 from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.runs.result_folder import clear_earlier_results
 
 OBJECT_FILES = {"figures/voting.png", "figures/clusters.png", "figures/objects.png"}
 """Files that are written if objects were detected and voted on."""
@@ -94,6 +95,18 @@ def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
     log = (first_out / "run.log").read_text().splitlines()
     assert any(line.endswith("readout: 0.0000 s, as the camera states") for line in log)
     assert sum("frame" in line and "tracked" in line for line in log) == 30
+
+
+def test_every_file_of_a_run_is_removed_before_the_next_one(sequence: Path, tmp_path: Path) -> None:
+    """A file that is not in the list of results would stay, and the report would show it."""
+    arguments = (*with_masks(sequence), "--save-masks", "--mesh", "--occupancy", "--out", "out")
+    done = call_here(*arguments, cwd=tmp_path)
+    assert (done.exit_code, done.stderr) == (0, "")
+    written = files_in(tmp_path / "out")
+    assert written >= RUN_FILES | OBJECT_FILES | {"mesh.ply", "occupancy.npz", "figures/occupancy.png"}
+    assert any(name.startswith("masks/") for name in written)
+    clear_earlier_results(tmp_path / "out")
+    assert files_in(tmp_path / "out") == {"run.log"}
 
 
 def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Path, tmp_path: Path) -> None:
