@@ -187,6 +187,59 @@ def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole
     assert_same_results(out, whole_run)
 
 
+# --- map files
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
+def test_interrupted_run_keeps_an_earlier_map_file_until_it_is_resumed(
+    sequence: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    out, room = tmp_path / "out", tmp_path / "room.map"
+    room.write_bytes(b"the map of yesterday")
+    done = interrupt_run(sequence, out, 4, "--save-map", str(room))
+    assert_error_line(done, f"interrupted after 5 of {FRAMES} frames", f"; resume with --resume {out})")
+    assert f"warning: {room}: was not overwritten, because the run ended early\n" in done.stdout
+    assert room.read_bytes() == b"the map of yesterday"
+    done = call("--resume", out)
+    assert done.exit_code == 0 and "was not overwritten" not in done.stdout, done.stderr
+    assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
+
+
+def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
+    sequence: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    out, room = tmp_path / "out", tmp_path / "maps" / "room.map"
+
+    def remove_folder() -> None:
+        room.parent.rmdir()
+        room.parent.write_text("")
+
+    with at_frame(10, remove_folder):
+        done = call(
+            *run_arguments(sequence, out, "--save-masks", "--serial", "--save-map", str(room), *CHECKPOINT_EVERY_FRAME)
+        )
+    assert_error_line(done, f"{room}: cannot be written", f"frames before are in {out}; resume with --resume {out})")
+    assert "ATE rmse" in done.stdout
+    assert (out / "map.ply").read_bytes() == (whole_run / "map.ply").read_bytes()
+    room.parent.unlink()
+    done = call("--resume", out)
+    assert done.exit_code == 0, done.stderr
+    assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
+    assert_same_results(out, whole_run)
+
+
+def test_run_without_keyframes_keeps_an_earlier_map_file(sequence: Path, tmp_path: Path) -> None:
+    dark, room = tmp_path / "dark", tmp_path / "room.map"
+    shutil.copytree(sequence, dark)
+    for path in (dark / "rgb").iterdir():
+        path.write_bytes(base.png(np.zeros_like(cv2.imread(str(path)))))
+    room.write_bytes(b"the map of yesterday")
+    done = call(*run_arguments(dark, tmp_path / "out", "--save-map", str(room)))
+    assert_error_line(done, "the colour images are uniform")
+    assert f"warning: {room}: was not overwritten, because the map of this run has no keyframes\n" in done.stdout
+    assert room.read_bytes() == b"the map of yesterday"
+
+
 # --- mistakes of the user
 
 

@@ -21,7 +21,7 @@ from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
-from v3d_torch.mapping.map_io import load_map, save_map
+from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
@@ -145,11 +145,11 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
 
 
 def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, display: Display) -> None:
-    """Open the inputs, run, save the map and print the summary."""
+    """Open the inputs, run and print the summary."""
     console = Console(soft_wrap=True)
-    map_file, masks = _path(request.save_map), _path(request.masks)
-    if map_file is not None:
-        check_writable(map_file)
+    if request.save_map is not None:
+        check_writable(Path(request.save_map))
+    masks = _path(request.masks)
     sequence = _open_sequence(request, console)
     print_notes(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
@@ -177,8 +177,6 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         )
     except OutputError as error:
         raise OutputError(f"{error}{_way_to_resume(folder)}") from error
-    if map_file is not None:
-        save_map(map_file, pipeline.slam.map, pipeline.views)
     _print_summary(request, display, folder, pipeline, evaluation, console)
 
 

@@ -13,10 +13,11 @@ from v3d_torch.config import RollingShutterConfig
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.datasets.image_sequence import ImageSequence
+from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_text
-from v3d_torch.mapping.map_io import StoredMap
+from v3d_torch.mapping.map_io import StoredMap, save_map
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
@@ -73,6 +74,7 @@ class Run:
         system = CheckedSLAM if config.check_numerics else V3DSLAM
         slam = system(sequence.camera, segment, config, None if known_map is None else known_map.map)
         self._folder = folder
+        self._map_file = None if request.save_map is None else Path(request.save_map)
         self.pipeline = Pipeline(
             sequence,
             slam,
@@ -95,7 +97,8 @@ class Run:
             on_frame: Called after each frame; a KeyboardInterrupt that it raises ends the run between two frames.
 
         Returns:
-            The scores, if there is ground truth. If the run ended early, ``pipeline.record.failure`` is the reason.
+            The scores, if there is ground truth. If the run ended early, or the map file cannot be written,
+            ``pipeline.record.failure`` is the reason, and the checkpoint stays.
 
         Raises:
             OutputError: If the results cannot be written.
@@ -103,10 +106,7 @@ class Run:
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
         if isinstance(sequence, ImageSequence) and sequence.depth_scale_note is not None:
-            _LOG.warning(sequence.depth_scale_note)
-            warnings = self.pipeline.record.warnings
-            if sequence.depth_scale_note not in warnings:  # as in a resumed run
-                warnings.append(sequence.depth_scale_note)
+            self._warn(sequence.depth_scale_note)
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"
@@ -121,11 +121,32 @@ class Run:
         _LOG.info("readout: %s", describe_readout(slam.map.readout, slam.config.rolling_shutter))
         from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
 
+        if self._map_file is not None:
+            self._save_map(self._map_file)
         evaluation = write_results(self._folder, self.pipeline, point_map)
         self._autosave.discard()
         if record.failure:
             _LOG.error(record.failure)
         return evaluation
+
+    def _save_map(self, path: Path) -> None:
+        """Write the map file, unless the map of an earlier run would be replaced by a part of a map."""
+        record, sparse_map = self.pipeline.record, self.pipeline.slam.map
+        if path.exists() and record.failure is not None:
+            self._warn(f"{path}: was not overwritten, because the run ended early")
+        elif path.exists() and not sparse_map.active_keyframes:
+            self._warn(f"{path}: was not overwritten, because the map of this run has no keyframes")
+        else:
+            try:
+                save_map(path, sparse_map, self.pipeline.views)
+            except OutputError as error:  # the other results are written nevertheless
+                record.failure = record.failure or str(error)
+
+    def _warn(self, warning: str) -> None:
+        """Log and record a warning; a resumed run has recorded it already."""
+        _LOG.warning(warning)
+        if warning not in self.pipeline.record.warnings:
+            self.pipeline.record.warnings.append(warning)
 
 
 def describe_readout(readout: Readout, expected: RollingShutterConfig) -> str:
