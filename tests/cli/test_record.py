@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,10 +16,14 @@ import torch
 from helpers.bags import DEPTH, INFO, RGB, MessageFactory
 from helpers.commands import assert_error_line
 from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of, save
+from helpers.walls import CAMERA, Slide
+from rich.console import Console
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.record import app
+from v3d_torch.cli.record_command import record_all
 from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.types import RGBDFrame
 
 K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
 LISTS = {"rgb.txt", "depth.txt", "associations.txt", "camera.yaml"}
@@ -104,6 +110,21 @@ def test_ctrl_c_leaves_complete_folder(tmp_path: Path) -> None:
     files = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     stamps = [f"{stamp:.6f}.png" for stamp in saved.stamps.tolist()]
     assert files == LISTS | {f"{kind}/{stamp}" for kind in ("rgb", "depth") for stamp in stamps}
+
+
+def test_interrupt_while_waiting_for_a_frame_returns_the_number_of_frames(tmp_path: Path) -> None:
+    """A second Ctrl-C ends a source that waits and that cannot be stopped."""
+
+    class Waiting:
+        name, camera, groundtruth = "waiting", CAMERA, None
+
+        def __iter__(self) -> Iterator[RGBDFrame]:
+            yield from (wall[0], wall[1])
+            raise KeyboardInterrupt
+
+    wall = Slide(0, 12, step=6)
+    assert record_all(Waiting(), tmp_path / "out", threading.Event(), Console(quiet=True)) == 2
+    assert len(load_sequence(str(tmp_path / "out"))) == 2
 
 
 def test_nonempty_folder_and_missing_camera_are_errors(tmp_path: Path) -> None:

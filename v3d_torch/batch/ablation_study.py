@@ -150,7 +150,7 @@ def _run(
     try:
         request = RunRequest(sequence.name, config)
         pipeline, _ = run_with_progress(
-            lambda: Run(request, sequence, segment, folder, save_checkpoints=False), folder, console
+            lambda: Run(request, sequence, segment, folder, save_checkpoints=False), sequence, folder, console
         )
     except OutputError:
         raise

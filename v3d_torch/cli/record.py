@@ -62,7 +62,7 @@ def main(
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
         print_notes(source, console)
-        with interrupts_between_frames() as interrupted:
+        with interrupts_between_frames(source) as interrupted:
             if static:
                 frames, failure = record_static(
                     source, out, load_config(find_config(config or FULL)), interrupted, console

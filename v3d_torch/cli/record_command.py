@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sized
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 
@@ -25,7 +26,7 @@ from v3d_torch.types import RGBDFrame
 
 
 def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Console) -> int:
-    """Write all frames of a source.
+    """Write all frames of a source. A KeyboardInterrupt while it waits for a frame ends the recording, too.
 
     Args:
         source: Frames.
@@ -40,7 +41,7 @@ def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Conso
         InputError: If a frame cannot be read.
         OutputError: If the folder is not empty, or a file cannot be written.
     """
-    with TUMWriter(out, source.camera, source.groundtruth) as writer:
+    with TUMWriter(out, source.camera, source.groundtruth) as writer, suppress(KeyboardInterrupt):
         for frame in track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal):
             writer.add(frame)
             if interrupted.is_set():

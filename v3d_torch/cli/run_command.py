@@ -171,6 +171,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     try:
         pipeline, evaluation = run_with_progress(
             lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
+            sequence,
             folder,
             console,
             checkpoint,

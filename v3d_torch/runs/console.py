@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from v3d_torch.datasets import RGBDStream
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import Checkpoint
@@ -20,12 +21,17 @@ from v3d_torch.runs.run import Run
 
 
 def run_with_progress(
-    make_run: Callable[[], Run], folder: Path, console: Console, checkpoint: Checkpoint | None = None
+    make_run: Callable[[], Run],
+    sequence: RGBDStream,
+    folder: Path,
+    console: Console,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[Pipeline, Evaluation | None]:
     """Execute a run with a progress bar on the console and a log file in its folder.
 
     Args:
         make_run: Function that creates the run; called after the files of an earlier run were removed.
+        sequence: Sequence of the run; Ctrl-C stops a live one.
         folder: Folder of the results.
         console: Console for the progress bar.
         checkpoint: Checkpoint that the run resumes from; None if it starts with the first frame.
@@ -41,9 +47,8 @@ def run_with_progress(
     compile_kernels(console)
     log = log_to(folder / "run.log", append=checkpoint is not None)
     warnings = show_warnings(partial(console.print, markup=False))
-    with progress_bars(console) as progress, interrupts_between_frames() as interrupted, log, warnings:
+    with progress_bars(console) as progress, interrupts_between_frames(sequence) as interrupted, log, warnings:
         run = make_run()
-        sequence = run.pipeline.sequence
         total = len(sequence) if isinstance(sequence, Sized) else None
         done = 0 if checkpoint is None else checkpoint.frames
         evaluation = run(TrackingBar(progress, total, interrupted, done))

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+
+import pytest
+from helpers.walls import CAMERA
+
+from v3d_torch.runs.interrupts import interrupts_between_frames
+from v3d_torch.types import RGBDFrame
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
+
+
+class WaitingCamera:
+    """`LiveStream` whose first frame never comes."""
+
+    name, camera, groundtruth = "waiting", CAMERA, None
+
+    def __init__(self) -> None:
+        self.stopped = threading.Event()
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        self.stopped.wait(20)
+        yield from ()
+
+    def captured_at(self, frame: RGBDFrame) -> float:
+        return frame.stamp
+
+    def stop(self) -> None:
+        self.stopped.set()
+
+
+def press_ctrl_c() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_first_ctrl_c_ends_a_camera_that_sends_nothing() -> None:
+    camera = WaitingCamera()
+    with interrupts_between_frames(camera) as interrupted:
+        threading.Timer(0.1, press_ctrl_c).start()
+        assert list(camera) == []
+        assert interrupted.is_set() and camera.stopped.is_set()
+
+
+def test_second_ctrl_c_interrupts_at_once() -> None:
+    with interrupts_between_frames() as interrupted:
+        press_ctrl_c()
+        assert interrupted.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            press_ctrl_c()
+
+
+def test_camera_is_not_stopped_without_ctrl_c() -> None:
+    camera, before = WaitingCamera(), signal.getsignal(signal.SIGINT)
+    threads = threading.active_count()
+    with interrupts_between_frames(camera) as interrupted:
+        watching = threading.enumerate()
+    for thread in watching[threads:]:
+        thread.join(5)
+    assert not interrupted.is_set() and not camera.stopped.is_set()
+    assert signal.getsignal(signal.SIGINT) == before and threading.active_count() == threads
