@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, canonical_name, download_url, short_name
+from v3d_torch.datasets.sequence_names import (
+    PAPER_SEQUENCES,
+    SEQUENCES,
+    canonical_name,
+    download_url,
+    folder_label,
+    short_name,
+)
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
@@ -44,6 +51,21 @@ def test_abbreviated_name_gives_full_name(alias: str, expected: str) -> None:
 )
 def test_unknown_or_ambiguous_name_gives_none(name: str) -> None:
     assert canonical_name(name) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["room", "plant", "office", "floor", "cabinet", "dishes", "person", "360", "desk2", "tum/room", "large_loop"],
+)
+def test_common_name_without_camera_is_not_a_sequence(name: str) -> None:
+    assert canonical_name(name) is None and short_name(name) == name
+
+
+def test_only_a_folder_with_the_camera_in_its_name_is_renamed() -> None:
+    for folder in ("room", "walking_xyz", "s_static", "fr1", "my_fr1_room", "afr3"):
+        assert folder_label(folder) == folder
+    for folder in ("rgbd_dataset_freiburg3_walking_xyz", "fr3_w_xyz", "FR3-walking-xyz", "freiburg_3_walking_xyz"):
+        assert folder_label(folder) == "fr3/w/xyz"
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"]), max_size=30))  # the default alphabet takes seconds to compute

@@ -67,6 +67,10 @@ def test_sequence_with_several_names_matches_once(root: Path) -> None:
     assert matching_sequences(["fr?_xyz"], root) == ["fr1_xyz", "fr2/xyz"]  # fr1_xyz is a folder in the data root
 
 
+def test_folder_with_a_common_name_is_not_a_sequence_of_the_benchmark(root: Path) -> None:
+    assert matching_sequences(["room", "fr1/room"], root) == ["room", "fr1/room"]
+
+
 def test_pattern_without_match_is_error(root: Path) -> None:
     for pattern in ("walks_*", "fr4/*", "walk_note*", str(root / "none*")):
         with pytest.raises(InputError, match="matches no sequence") as raised:

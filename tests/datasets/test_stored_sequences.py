@@ -267,8 +267,15 @@ def test_sequence_is_found_by_name_in_root_environment_and_cache(
     assert len(load_sequence("fr3/walking_xyz", download=False)) == 3
 
 
-def test_any_folder_in_data_root_is_found_by_its_name(folder: Path) -> None:
-    assert load_sequence("sequence", data_root=folder.parent).name == "sequence"
+@pytest.mark.parametrize("name", ["sequence", "room", "walking_xyz"])
+def test_any_folder_in_data_root_is_found_and_keeps_its_name(name: str, folder: Path) -> None:
+    folder.rename(folder.with_name(name))
+    assert load_sequence(name, data_root=folder.parent).name == name
+
+
+def test_common_name_without_such_a_folder_is_not_downloaded() -> None:
+    with pytest.raises(InputError, match=r"^room: is not a file, .* did you mean .*fr1/room"):
+        load_sequence("room")
 
 
 def test_demo_is_rendered_to_the_cache(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,10 +46,11 @@ SEQUENCES: tuple[str, ...] = tuple(
 )
 """Full names of all sequences of the benchmark, which are the names of their folders."""
 
+_PEOPLE = ("sitting", "walking")
+"""First words of the names of sequences with moving people, which are all of camera 3."""
+
 PAPER_SEQUENCES: tuple[str, ...] = tuple(
-    f"{_PREFIX}freiburg3_{people}_{motion}"
-    for people in ("sitting", "walking")
-    for motion in ("xyz", "halfsphere", "static", "rpy")
+    f"{_PREFIX}freiburg3_{people}_{motion}" for people in _PEOPLE for motion in ("xyz", "halfsphere", "static", "rpy")
 )
 """Full names of the eight sequences of the paper's evaluation (Sec. IV)."""
 
@@ -84,24 +85,27 @@ _SHORT_TAILS = {
 def canonical_name(name: str) -> str | None:
     """Full name of a TUM sequence from any common spelling.
 
+    The camera can be left out for the sequences of sitting and walking people only: a name such as ``room`` or
+    ``office`` is too common to mean a sequence of the benchmark.
+
     Args:
-        name: Name such as ``fr3/w/xyz``, ``fr3_walking_xyz``, ``freiburg3-walking-xyz``, ``walking_xyz`` (if the
-            sequence exists for one camera only) or the full name.
+        name: Name such as ``fr3/w/xyz``, ``fr3_walking_xyz``, ``freiburg3-walking-xyz``, ``walking_xyz`` or the full
+            name.
 
     Returns:
-        Full name such as ``rgbd_dataset_freiburg3_walking_xyz``; None if no sequence, or more than one, has this name.
+        Full name such as ``rgbd_dataset_freiburg3_walking_xyz``; None if no sequence has this name.
     """
     text = re.sub(r"[\s/\\.\-_]+", "_", name.strip().lower()).strip("_").removeprefix("tum_").removeprefix(_PREFIX)
     match = re.fullmatch(r"(?:(?:freiburg|fr)_?([123])_)?(.+)", text)
     if match is None:
         return None
-    camera = f"freiburg{match[1]}" if match[1] else r"freiburg\d"
     words = [_ABBREVIATIONS.get(word, word) for word in match[2].split("_")]
+    if match[1] is None and words[0] not in _PEOPLE:
+        return None
     validation = ["validation"] if words[-1] == "validation" else []
     tail = "_".join(words[: len(words) - len(validation)])
-    tail = "_".join([_SHORT_TAILS.get(tail, tail), *validation])
-    found = [full for full in SEQUENCES if re.fullmatch(_PREFIX + camera + "_" + re.escape(tail), full)]
-    return found[0] if len(found) == 1 else None
+    full = "_".join([f"{_PREFIX}freiburg{match[1] or 3}", _SHORT_TAILS.get(tail, tail), *validation])
+    return full if full in SEQUENCES else None
 
 
 def short_name(name: str) -> str:
@@ -112,6 +116,20 @@ def short_name(name: str) -> str:
     camera, tail = full.removeprefix(_PREFIX).replace("freiburg", "fr").split("_", maxsplit=1)
     tail = re.sub(r"^(s|w)(?:itting|alking)_", r"\1/", tail).replace("/halfsphere", "/half")
     return f"{camera}/{tail}"
+
+
+def folder_label(folder: str) -> str:
+    """Name of a sequence in tables, from the name of its folder.
+
+    A folder is renamed only if its name contains the camera: ``walking_xyz`` can be a recording of the user.
+
+    Args:
+        folder: Name of the folder.
+
+    Returns:
+        Short name if the folder has the name of a TUM sequence with its camera; the name of the folder otherwise.
+    """
+    return short_name(folder) if re.search(r"fr(?:eiburg)?[^a-z0-9]*[123]", folder.lower()) else folder
 
 
 def download_url(full_name: str) -> str:

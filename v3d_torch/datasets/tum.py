@@ -12,7 +12,7 @@ from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
-from v3d_torch.datasets.sequence_names import short_name
+from v3d_torch.datasets.sequence_names import folder_label
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -54,7 +54,7 @@ class TUMSequence(PairedImages):
             camera,
             lambda: read_trajectory(groundtruth) if groundtruth.is_file() else None,
             published=published,
-            name=short_name(folder.resolve().name) if name is None else name,
+            name=folder_label(folder.resolve().name) if name is None else name,
         )
 
     def motion_mask(self, index: int) -> Tensor | None:
