@@ -39,6 +39,19 @@ def test_depth_is_exact_and_out_of_range_is_zero(tmp_path: Path) -> None:
     assert torch.equal(far == 0, units >= 35535)
 
 
+def test_gravity_of_the_first_frame_is_kept(tmp_path: Path) -> None:
+    camera = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=1000)
+    down = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    image, depth = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.ones(1, HEIGHT, WIDTH)
+    frames = [RGBDFrame(index, 12.5 + index, image, depth, gravity=down) for index in range(2)]
+    with TUMWriter(tmp_path / "out", camera) as writer:
+        for frame in frames:
+            writer.add(frame)
+    first, second = load_sequence(str(tmp_path / "out"))
+    assert first.gravity is not None and second.gravity is None
+    torch.testing.assert_close(first.gravity, down)
+
+
 def test_file_in_place_of_folder_is_error(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")
     for folder in (tmp_path / "taken", tmp_path / "taken" / "below"):

@@ -34,6 +34,15 @@ def test_recording_is_a_sequence_without_depth_where_something_moves(tmp_path: P
     torch.testing.assert_close(estimate.T_wc, T_WC, rtol=0, atol=1e-8)
 
 
+def test_measured_gravity_is_kept(tmp_path: Path) -> None:
+    (image, *_) = posed_images()
+    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    with TUMWriter(tmp_path / "out", CAMERA) as writer:
+        StaticRecording(writer).add(replace(image.frame, gravity=down), image.static)
+    gravity = load_sequence(str(tmp_path / "out"))[0].gravity
+    assert gravity is not None and torch.equal(gravity, down)
+
+
 def test_masks_are_not_taken_for_true_masks(tmp_path: Path) -> None:
     (image, *_) = posed_images()
     with TUMWriter(tmp_path / "out", CAMERA) as writer:

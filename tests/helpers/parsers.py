@@ -16,6 +16,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import icl_nuim, openloris
 from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.depth_files import read_depth_file
+from v3d_torch.datasets.gravity_file import read_gravity_file
 from v3d_torch.datasets.images import decode_colour, decode_depth, read_colour
 from v3d_torch.datasets.lists import read_associations, read_image_list
 from v3d_torch.datasets.matrix_files import read_matrix, read_poses
@@ -99,6 +100,7 @@ PARSERS: dict[str, Parser] = {
     "image list": from_file("rgb.txt", read_image_list),
     "associations": from_file("associations.txt", read_associations),
     "trajectory": from_file("groundtruth.txt", read_trajectory),
+    "gravity": from_file("gravity.txt", lambda path: read_gravity_file(path, 1.5)),
     "matrix": from_file("pose.txt", read_matrix),
     "pose": from_file("pose.txt", lambda path: read_poses({0.0: path})),
     "camera.yaml": from_file("camera.yaml", load_camera),
@@ -162,5 +164,7 @@ def assert_valid(result: object) -> None:
         assert math.isfinite(result.cx + result.cy + sum(result.distortion))
         assert min(result.fx, result.fy, result.width, result.height) >= 1
         assert result.depth_scale is None or result.depth_scale >= 1
+    elif isinstance(result, torch.Tensor) and result.shape == (3,):
+        torch.testing.assert_close(result.norm(), torch.ones((), dtype=torch.float64))
     elif isinstance(result, torch.Tensor):
         assert result.ndim == 3 and (result.dtype == torch.uint8 or bool((result >= 0).all()))

@@ -169,6 +169,7 @@ SEEDS: dict[str, list[bytes]] = {
     "image list": [_LIST],
     "associations": [b"1.5 rgb/1.png 1.51 depth/1.png\n2 rgb/a 2.png 2.0 depth/a, b.png\n"],
     "trajectory": [_POSES, b"1403636579763555584 0 0 0 0 0 0 1\n"],
+    "gravity": [b"# stamp gx gy gz\n1.5 0.6 0.0 -0.8\n", b"1.5,0,1,0\n"],
     "matrix": [_POSE, b"525 0 319.5\n0 525 239.5\n0 0 1\n"],
     "pose": [_POSE, _POSE.replace(b"-inf", b"1")],
     "camera.yaml": [_CAMERA, *(text.encode() for text, _ in FILES.values())],

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from helpers.simulated_realsense import SimulatedDevice
 from typer.testing import CliRunner
 
@@ -26,6 +27,9 @@ COMMANDS = re.findall(r"^v3d-torch ([^#\n]*)", PAGE, re.MULTILINE)
 RECORDED = 8
 """Frames of the recording."""
 
+DOWN = torch.tensor([0.0, 0.8, 0.6], dtype=torch.float64)
+"""Gravity in the frame of the camera."""
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -35,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.chdir(folder)
         patch.setattr(
             "v3d_torch.datasets.realsense.realsense_camera.open_live_device",
-            lambda *request: SimulatedDevice(scale=5, still=True),
+            lambda *request: SimulatedDevice(scale=5, still=True, accelerations=-9.8 * DOWN.numpy()[None]),
         )
         for command in COMMANDS:
             arguments = command.split()
@@ -75,7 +79,9 @@ def test_page_has_commands_for_camera_and_recording() -> None:
 @pytest.mark.parametrize(("out", "bag"), [("drive", "drive.mcap"), ("replay", "replay.mcap")])
 def test_commands_write_the_files_of_the_page(folder: Path, out: str, bag: str) -> None:
     metrics = json.loads((folder / out / "metrics.json").read_text())
-    assert metrics["failure"] is None and metrics["latency"]["median"] > 0 and "T_lw" in metrics
+    assert metrics["failure"] is None and metrics["latency"]["median"] > 0 and metrics["T_lw"] is not None
+    gravity = torch.tensor(metrics["gravity"], dtype=torch.float64)
+    torch.testing.assert_close(gravity, DOWN, rtol=0, atol=0.01)
     assert (folder / bag).stat().st_size > 0
     assert {"states.parquet", "occupancy.bt"} <= {path.name for path in (folder / out).iterdir()}
 

@@ -9,6 +9,7 @@ from kornia_rs import io
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.gravity_file import GRAVITY_FILE, read_gravity_file
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
@@ -21,7 +22,8 @@ from v3d_torch.geometry.camera import PinholeCamera
 class TUMSequence(PairedImages):
     """Sequence with ``associations.txt``, or ``rgb.txt`` and ``depth.txt``.
 
-    Ground truth is read from ``groundtruth.txt``. A subfolder ``masks`` can contain ground-truth motion masks for
+    Ground truth is read from ``groundtruth.txt``, and the direction of gravity at the first frame from ``gravity.txt``,
+    which `TUMWriter` writes if it was measured. A subfolder ``masks`` can contain ground-truth motion masks for
     evaluation, with the names of the depth images.
 
     Args:
@@ -56,6 +58,8 @@ class TUMSequence(PairedImages):
             published=published,
             name=folder_label(folder.resolve().name) if name is None else name,
         )
+        if (gravity := folder / GRAVITY_FILE).is_file():
+            self.gravity = read_gravity_file(gravity, float(self.stamps[0]))
 
     def motion_mask(self, index: int) -> Tensor | None:
         """Read the ground-truth motion mask of frame ``index``; None if there is no such file.

@@ -9,6 +9,7 @@ from types import TracebackType
 import numpy as np
 
 from v3d_torch.datasets.camera_text import camera_text
+from v3d_torch.datasets.gravity_file import write_gravity_file
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import SATURATED_DEPTH
@@ -64,7 +65,12 @@ class TUMWriter:
         return len(self._written)
 
     def add(self, frame: RGBDFrame) -> None:
-        """Write the images of a frame. Depth beyond the 16-bit range is written as 0, no measurement."""
+        """Write the images of a frame, and the gravity of the first frame to ``gravity.txt`` if it was measured.
+
+        Depth beyond the 16-bit range is written as 0, no measurement.
+        """
+        if frame.gravity is not None and not self._written:
+            write_gravity_file(self.folder, frame.stamp, frame.gravity)
         stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self._depth_scale)
         units[units >= SATURATED_DEPTH] = 0
