@@ -263,7 +263,17 @@ def test_memory_is_bounded_on_a_long_drive(caplog: pytest.LogCaptureFixture) -> 
     assert near.max() > 2.0 * 59 and near.min() > 2.0 * 20  # the farthest were removed
 
 
-def test_window_around_the_camera_is_never_forgotten() -> None:
+def test_window_around_the_camera_is_never_forgotten(caplog: pytest.LogCaptureFixture) -> None:
+    """It is reported once, and no block is copied."""
     occupancy = OccupancyMap(OccupancyConfig(max_blocks=1, window_radius=6.0))
     add_view(occupancy, 0, EYE)
-    assert len(occupancy.blocks) > 10
+    blocks = occupancy.blocks.log_odds.data_ptr()
+    for _ in range(3):
+        add_view(occupancy, 0, EYE)
+    assert len(occupancy.blocks) > 10 and occupancy.blocks.log_odds.data_ptr() == blocks
+    (message,) = (record.getMessage() for record in caplog.records)
+    assert message == (
+        f"occupancy map: all {len(occupancy.blocks)} blocks within 6.0 m of the camera are kept, although"
+        " occupancy.max_blocks is 1; set larger voxels (occupancy.voxel_size is 0.05 m), or a larger"
+        " occupancy.max_blocks"
+    )

@@ -50,6 +50,7 @@ class OccupancyMap:
         self.blocks = VoxelBlocks()
         self.sensor_model = SensorModel.from_config(config)
         self._nearest: NearestVoxels | None = None  # of the occupied voxels; None after they changed
+        self._is_full_window_reported = False
 
     @property
     def is_empty(self) -> bool:
@@ -185,9 +186,24 @@ class OccupancyMap:
         gap = cube_gap(camera, self.blocks.coordinates, side)
         kept = max(int(_KEPT_FRACTION * self.config.max_blocks), 1)
         limit = max(float(gap.kthvalue(kept).values), self.config.window_radius)
-        before = len(self.blocks)
-        self.blocks.keep(gap <= limit)
-        _LOG.warning(
-            "occupancy map: %d of %d blocks were removed, all farther than %.1f m from the camera (occupancy.max_blocks"
-            " is %d)", before - len(self.blocks), before, limit, self.config.max_blocks
-        )  # fmt: skip
+        is_kept = gap <= limit
+        before, after = len(self.blocks), int(is_kept.sum())
+        if after < before:
+            self.blocks.keep(is_kept)
+        if after > self.config.max_blocks:
+            self._report_full_window(after)
+        else:
+            _LOG.warning(
+                "occupancy map: %d of %d blocks were removed, all farther than %.1f m from the camera"
+                " (occupancy.max_blocks is %d)", before - after, before, limit, self.config.max_blocks
+            )  # fmt: skip
+
+    def _report_full_window(self, count: int) -> None:
+        """Warn once that more blocks than the maximum are within the window."""
+        if not self._is_full_window_reported:
+            _LOG.warning(
+                "occupancy map: all %d blocks within %.1f m of the camera are kept, although occupancy.max_blocks is"
+                " %d; set larger voxels (occupancy.voxel_size is %g m), or a larger occupancy.max_blocks",
+                count, self.config.window_radius, self.config.max_blocks, self.config.voxel_size,
+            )  # fmt: skip
+        self._is_full_window_reported = True
