@@ -13,6 +13,7 @@ import torch
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.evaluate import app, main
+from v3d_torch.datasets.tum_extents import EXTENTS
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.evaluation import evaluate
 from v3d_torch.geometry.se3 import se3_exp
@@ -65,6 +66,20 @@ def test_sequence_is_guessed_from_path(files: tuple[str, str], tmp_path: Path) -
     named = tmp_path / "rgbd_dataset_freiburg3_walking_rpy.txt"
     named.write_bytes(Path(files[0]).read_bytes())
     assert "0.0354" in call(str(named), files[1]).stdout
+
+
+@pytest.mark.parametrize(("count", "label"), [(827, "this result "), (60, "this result (part: 60 of 827 frames)")])
+def test_part_of_a_sequence_is_marked_in_the_papers_table(count: int, label: str, tmp_path: Path) -> None:
+    frames, poses, length = EXTENTS["fr3/w/xyz"]
+    assert poses is not None and length is not None
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(poses.number, 1, 1)
+    T_wc[:, 0, 3] = torch.linspace(0, length, poses.number, dtype=torch.float64)
+    stamps = torch.linspace(poses.first, poses.last, poses.number, dtype=torch.float64)
+    write_trajectory(tmp_path / "groundtruth.txt", Trajectory(stamps, T_wc))
+    stamps = torch.linspace(frames.first, frames.last, frames.number, dtype=torch.float64)[:count]
+    write_trajectory(tmp_path / "estimate.txt", Trajectory(stamps, T_wc[:count]))
+    result = call(str(tmp_path / "groundtruth.txt"), str(tmp_path / "estimate.txt"), "--sequence", "fr3_w_xyz")
+    assert result.exit_code == 0 and label in result.stdout
 
 
 def test_unit_of_rpe_contains_other_delta(files: tuple[str, str]) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from v3d_torch.datasets import PAPER_SEQUENCES, short_name
 from v3d_torch.datasets.lists import read_image_list
-from v3d_torch.datasets.tum_extents import EXTENTS, describe_difference
+from v3d_torch.datasets.tum_extents import EXTENTS, describe_difference, describe_estimate_difference
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
@@ -118,3 +118,37 @@ def test_other_ground_truth_is_recognised() -> None:
         difference = describe_difference(replace(sequence, groundtruth=other))
         assert difference is not None and difference.startswith("other ground truth: ") and found in difference
         assert difference.endswith("not 2884 over 6.62 m")
+
+
+def estimate_at(stamps: Tensor) -> Trajectory:
+    """Estimate at the origin."""
+    return Trajectory(stamps, torch.eye(4, dtype=torch.float64).repeat(len(stamps), 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("selected", "difference"),
+    [
+        (slice(None), None),
+        (slice(0, 60), "part: 60 of 827 frames"),
+        (slice(None, None, 2), "part: 414 of 827 frames"),
+    ],
+)
+def test_part_is_recognised_from_an_estimate(selected: slice, difference: str | None) -> None:
+    sequence = whole()
+    truth = sequence.groundtruth
+    assert truth is not None
+    estimate = estimate_at(sequence.stamps[selected])
+    assert describe_estimate_difference("fr3_w_xyz", estimate, truth) == difference
+    assert describe_estimate_difference("my_desk", estimate, truth) is None
+    if difference is None:
+        cut = describe_estimate_difference("fr3/w/xyz", estimate, Trajectory(truth.stamps[:300], truth.T_wc[:300]))
+        assert cut is not None and cut.startswith("other ground truth: 300 poses")
+
+
+def test_estimate_with_colour_images_without_depth_is_no_other_recording() -> None:
+    """All colour images of fr3/w/xyz are 859, of which 827 have depth."""
+    first, last = EXTENTS["fr3/w/xyz"].frames[1:]
+    truth = whole().groundtruth
+    assert truth is not None
+    estimate = estimate_at(torch.linspace(first, last, 859, dtype=torch.float64))
+    assert describe_estimate_difference("fr3/w/xyz", estimate, truth) is None

@@ -43,6 +43,7 @@ def main(
     from rich.console import Console
 
     with quick_imports():
+        from v3d_torch.datasets.tum_extents import describe_estimate_difference
         from v3d_torch.datasets.tum_trajectory import read_trajectory
         from v3d_torch.errors import InputError, V3DError
         from v3d_torch.evaluation import evaluate
@@ -68,9 +69,11 @@ def main(
     console.print(_error_table(evaluation))
     for note in evaluation.notes:
         console.print(f"note: {note}")
-    name = sequence or find_paper_sequence(groundtruth.as_posix()) or find_paper_sequence(estimate.as_posix())
-    if name is not None and (table := make_paper_table(name, evaluation)) is not None:
-        console.print(table)
+    texts = (groundtruth.as_posix(), estimate.as_posix()) if sequence is None else (sequence,)
+    name = next(filter(None, map(find_paper_sequence, texts)), None)
+    if name is not None:
+        difference = describe_estimate_difference(name, poses, truth)
+        console.print(make_paper_table(name, evaluation, difference))
 
 
 def _error_table(evaluation: Evaluation) -> Table:

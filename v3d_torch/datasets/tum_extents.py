@@ -92,8 +92,31 @@ def describe_difference(sequence: RGBDStream) -> str | None:
     frames = Span(len(sequence), float(stamps[0]), float(stamps[-1]))
     if difference := _compare(frames, extent.frames, "frames"):
         return difference
-    truth = sequence.groundtruth
-    if truth is None or extent.poses is None or extent.path_length is None:
+    return None if sequence.groundtruth is None else _compare_truth(sequence.groundtruth, extent)
+
+
+def describe_estimate_difference(name: str, estimate: Trajectory, groundtruth: Trajectory) -> str | None:
+    """Describe how the sequence of an estimate differs from a sequence of the TUM benchmark.
+
+    Args:
+        name: Name of the sequence of the benchmark.
+        estimate: Estimated poses, which can include colour images without depth.
+        groundtruth: True poses.
+
+    Returns:
+        Text as that of `describe_difference`; None if the sequences agree, or if the extent is not known.
+    """
+    extent = EXTENTS.get(short_name(name))
+    if extent is None or len(estimate) == 0:
+        return None
+    number = min(len(estimate), extent.frames.number)
+    poses = Span(number, float(estimate.stamps[0]), float(estimate.stamps[-1]))
+    return _compare(poses, extent.frames, "frames") or _compare_truth(groundtruth, extent)
+
+
+def _compare_truth(truth: Trajectory, extent: Extent) -> str | None:
+    """Describe how true poses differ from those of the benchmark; None if they do not, or if those are not known."""
+    if extent.poses is None or extent.path_length is None:
         return None
     poses = Span(len(truth), float(truth.stamps[0]), float(truth.stamps[-1]))
     length = _path_length(truth)
