@@ -27,11 +27,8 @@ import v3d_torch as v3d
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.export.ros.run_messages import Message, RunMessages
 
-COLOUR, DEPTH = "camera/color/image_raw", "camera/aligned_depth_to_color/image_raw"
-INFO = "camera/color/camera_info"
-
-GRID_INTERVAL = 90
-"""Tracked frames between two grids: a grid takes a tenth of a second."""
+COLOUR, DEPTH, INFO = "camera/color/image_raw", "camera/aligned_depth_to_color/image_raw", "camera/color/camera_info"
+GRID_INTERVAL = 90  # tracked frames between two grids: a grid takes a tenth of a second
 
 
 class SlamNode(Node):
@@ -42,25 +39,26 @@ class SlamNode(Node):
         config = self.declare_parameter("config", "realtime").value
         overrides = self.declare_parameter("set", ["occupancy.enabled=true"]).value
         _, info = wait_for_message(CameraInfo, self, INFO)
-        K = info.k
-        self.camera = v3d.PinholeCamera(
-            *(K[0], K[4], K[2], K[5], info.width, info.height),
-            tuple(info.d),
-            depth_scale=1000,  # REP 118: whole numbers are millimetres
-            distortion_model=info.distortion_model,
-        )
+        pinhole = *info.k[[0, 4, 2, 5]], info.width, info.height, tuple(info.d)
+        units = 1000  # REP 118: millimetres
+        self.camera = v3d.PinholeCamera(*pinhole, depth_scale=units, distortion_model=info.distortion_model)
         self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
         self._count = 0
         self._messages = RunMessages(self.camera)
         self._store = get_typestore(Stores.ROS2_HUMBLE)
         self._topics = {}
-        colour, depth = (
-            message_filters.Subscriber(self, Image, topic, qos_profile=qos_profile_sensor_data)
-            for topic in (COLOUR, DEPTH)
-        )
-        self._images = message_filters.ApproximateTimeSynchronizer([colour, depth], queue_size=5, slop=0.02)
+        qos = {"qos_profile": qos_profile_sensor_data}
+        subscribers = [message_filters.Subscriber(self, Image, topic, **qos) for topic in (COLOUR, DEPTH)]
+        self._images = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=5, slop=0.02)
         self._images.registerCallback(self._add_frame)
+
+    def receive(self) -> None:
+        """Receive images until ROS is shut down; then the frames end, also if ``rclpy.spin`` raises an exception."""
+        try:
+            rclpy.spin(self)
+        finally:
+            self.frames.put(None)
 
     def publish_result(self, result: v3d.LiveResult) -> None:
         """Publish the messages of a tracked frame, and sometimes the grid."""
@@ -74,16 +72,14 @@ class SlamNode(Node):
     def _add_frame(self, colour: Image, depth: Image) -> None:
         stamps = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
         try:
-            rgb, measured = decode_colour_message(colour, COLOUR), decode_depth_message(depth, DEPTH)
-            frame = v3d.RGBDFrame.from_arrays(
-                *(self._count, stamps[0], rgb.permute(1, 2, 0), measured, self.camera),
-                depth_delay=stamps[1] - stamps[0],
-            )
+            rgb, measured = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
+            images = rgb, measured, self.camera
+            frame = v3d.RGBDFrame.from_arrays(self._count, stamps[0], *images, depth_delay=stamps[1] - stamps[0])
         except v3d.InputError as error:
             self.get_logger().warning(f"a frame is skipped: {error}")
-            return
-        self._count += 1
-        self.frames.put(frame)
+        else:
+            self._count += 1
+            self.frames.put(frame)
 
     def _publish(self, topic: str, message: Message) -> None:
         if topic not in self._topics:
@@ -91,19 +87,11 @@ class SlamNode(Node):
         self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
 
 
-def spin(node: SlamNode) -> None:
-    """Receive images until ROS is shut down, and then end the frames, also if ``rclpy.spin`` raises an exception."""
-    try:
-        rclpy.spin(node)
-    finally:
-        node.frames.put(None)
-
-
 def main() -> None:
     """Run until ROS is shut down."""
     rclpy.init()
     node = SlamNode()
-    Thread(target=spin, args=(node,), daemon=True).start()
+    Thread(target=node.receive, daemon=True).start()
     v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)
 
 
