@@ -38,6 +38,7 @@ from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig, TrackerConfig
 from v3d_torch.geometry.camera import BackProjector
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.objects.frame_objects import MotionState
 
 PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
@@ -205,6 +206,21 @@ def test_id_after_leaving_the_image_depends_on_the_gap(seed: int, turn: float, s
     assert len(before) == len(after) == 1
     assert (before == after) is same
     assert run.state_fraction(1, MotionState.STATIC) == 0
+
+
+@SEEDS
+def test_equal_chairs_keep_their_ids_while_the_camera_looks_elsewhere(seed: int) -> None:
+    def glance(t: Tensor) -> Tensor:
+        away = 1.4 * ((t - 1.0) / 0.4).clamp(0, 1) * ((5.4 - t) / 0.4).clamp(0, 1)
+        turn = torch.zeros(len(t), 6, dtype=torch.float64)
+        turn[:, 4] = away
+        return handheld(t) @ se3_exp(turn)
+
+    chairs = [chair(stand(x, 3.0)) for x in (-0.7, 0.1, 0.9)]
+    run = simulate(*chairs, seconds=6.4, rate=8.0, seed=seed, camera=glance, network=Network(shuffled=True))
+    for thing in range(3):
+        assert len(run.ids(thing, until=1.0)) == 1
+        assert run.ids(thing, since=5.5) == run.ids(thing, until=1.0)
 
 
 @pytest.mark.parametrize(("seed", "rate"), [(0, 8.0), (1, 8.0), (0, 30.0)])

@@ -107,6 +107,13 @@ def test_prediction_with_decay_stops_within_the_time_constant() -> None:
     assert later.sigmas[1] == pytest.approx(1.5 * math.sqrt(0.7 / 2))  # speed of a person
 
 
+def test_object_at_rest_is_predicted_where_it_was() -> None:
+    state = make_state()
+    later = state.predict_at_rest(100.0)
+    assert later.stamp == 100.0 and torch.equal(later.position, state.position)
+    assert not later.velocity.any() and later.sigmas == (state.sigmas[0], 0.0)
+
+
 def test_variance_of_the_motion_is_that_of_a_prediction_from_a_known_position() -> None:
     state = replace(make_state(), variances=(0.0, 0.0, 2.0))
     assert state.motion_variance(0.4) == pytest.approx(state.predict(1.4).variances[0])

@@ -7,7 +7,8 @@ from helpers.two_views import CAMERA, two_views
 
 from v3d_torch.config import Config
 from v3d_torch.features.features import Features
-from v3d_torch.odometry.motion_estimator import MotionEstimator
+from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.odometry.motion_estimator import MIN_INTERVAL, MotionEstimator, RelativeMotion
 
 
 def test_convention_motion_maps_points_of_a_to_b() -> None:
@@ -33,6 +34,15 @@ def test_motion_is_deterministic() -> None:
     assert first is not None
     assert second is not None
     assert torch.equal(first.T_ba, second.T_ba)
+
+
+def test_speed_is_bounded_also_between_frames_that_were_received_at_once() -> None:
+    twist = torch.tensor([0.03, 0, 0, 0, 0.02, 0], dtype=torch.float64)
+    motion = RelativeMotion(se3_exp(twist), torch.zeros(0, 2, dtype=torch.int64))
+    assert motion.is_plausible(1 / 30, 5.0) and motion.is_plausible(0.002, 5.0)
+    assert not motion.is_plausible(0.002, 2.0)
+    torch.testing.assert_close(motion.velocity(1 / 30), 30 * twist)
+    torch.testing.assert_close(motion.velocity(0.002), twist / MIN_INTERVAL)
 
 
 def test_no_motion_without_depth_or_matches() -> None:

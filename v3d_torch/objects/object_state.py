@@ -88,6 +88,14 @@ class ObjectState:
         position, velocity = self.position + self.velocity * reach, self.velocity * decay
         return replace(self, stamp=stamp, position=position, velocity=velocity, variances=variances)
 
+    def predict_at_rest(self, stamp: float) -> ObjectState:
+        """Predict the state of an object that does not move: it is where it was, as accurately as it was known.
+
+        Args:
+            stamp: Timestamp, seconds.
+        """
+        return replace(self, stamp=stamp, velocity=self.velocity * 0, variances=(self.variances[0], 0.0, 0.0))
+
     def transform(self, T_new_old: Tensor) -> ObjectState:
         """Transform the state into another world frame; the covariance is the same in all of them.
 

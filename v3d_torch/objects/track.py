@@ -184,10 +184,13 @@ class Track:
     def predict_return(self, stamp: float) -> ObjectState:
         """Predict the state of an object that is not observed any more, see `ObjectState.predict_with_decay`.
 
+        An object that cannot move is where it was.
+
         Args:
             stamp: Timestamp, seconds.
         """
-        return self._filter.state.predict_with_decay(stamp, _VELOCITY_TIME)
+        state = self._filter.state
+        return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
 
     def centroid_sigma(self, detection: Detection3D) -> float:
         """Return the standard deviation of each coordinate of the centroid of a detection, metres."""

@@ -26,6 +26,10 @@ error of the points adds to the pixel error."""
 _MAX_ROTATION_RATE = 6.3
 """Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
 
+MIN_INTERVAL = 0.01
+"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
+each other come from a computer that received two frames at once, and the camera has moved for longer."""
+
 
 @dataclass(frozen=True)
 class RelativeMotion:
@@ -49,20 +53,21 @@ class RelativeMotion:
         """Mean twist per second.
 
         Args:
-            elapsed: Time between the views, seconds.
+            elapsed: Time between the views, seconds; at least `MIN_INTERVAL` is assumed.
 
         Returns:
             Metres and radians per second, float64, shape :math:`(6,)`.
         """
-        return self.twist / elapsed
+        return self.twist / max(elapsed, MIN_INTERVAL)
 
     def is_plausible(self, elapsed: float, max_speed: float) -> bool:
         """Check whether a handheld camera or a camera on a robot can move this fast.
 
         Args:
-            elapsed: Time between the views, seconds.
+            elapsed: Time between the views, seconds; at least `MIN_INTERVAL` is assumed.
             max_speed: Maximum speed of a camera, m/s.
         """
+        elapsed = max(elapsed, MIN_INTERVAL)
         distance, angle = float(self.twist[:3].norm()), float(self.twist[3:].norm())
         return distance <= max_speed * elapsed and angle <= _MAX_ROTATION_RATE * elapsed
 

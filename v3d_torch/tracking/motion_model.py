@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.odometry.motion_estimator import MIN_INTERVAL
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
@@ -89,7 +90,7 @@ class MotionModel:
         elif pose.status is TrackingStatus.LOST:
             self.velocity = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:
-            self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / elapsed
+            self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / max(elapsed, MIN_INTERVAL)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the velocity."""
