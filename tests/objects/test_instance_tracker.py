@@ -352,6 +352,15 @@ def test_resting_furniture_is_lost_after_the_maximum_time_and_keeps_its_id() -> 
     assert track is lost and track.first_stamp == track.newest.stamp
 
 
+def test_walker_without_centroids_is_expected_to_stop() -> None:
+    track_boards = BoardTracker()
+    for k in range(30):
+        (track,) = track_boards(Board(-0.6 + k / 30))
+    last, stamp = track.newest.centroid, track.newest.stamp
+    assert float((track.predict_state(stamp + 0.4).position - last).norm()) == pytest.approx(0.4, abs=0.1)
+    assert float((track.predict_state(stamp + 20).position - last).norm()) < 1.0
+
+
 def test_tracker_restores_resting_and_lost_tracks() -> None:
     track_boards = BoardTracker(10.0)
     track_thrice(track_boards, Board(-0.8, label=DOG))

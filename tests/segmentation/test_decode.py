@@ -67,6 +67,15 @@ def test_max_instances_keeps_the_best_scores() -> None:
     )
 
 
+def test_max_instances_keeps_people_and_animals_first() -> None:
+    boxes = torch.tensor([[10.0 * i, 0, 10.0 * i + 9, 9] for i in range(6)])
+    chair, person, dog = 56, 0, 16
+    labels, scores = [chair, person, chair, dog, chair, person], [0.9, 0.3, 0.8, 0.35, 0.7, 0.26]
+    instances = decode_whole(*raw_output(boxes, labels, scores), max_instances=4)
+    assert instances.labels.tolist() == [chair, dog, person, person]
+    torch.testing.assert_close(instances.boxes, boxes[[0, 3, 1, 5]])
+
+
 def test_no_prediction_or_empty_mask_gives_no_instance() -> None:
     empty = decode_whole(*raw_output(torch.zeros(0, 4), [], []))
     assert (len(empty), empty.masks.shape, empty.boxes.shape) == (0, (0, HEIGHT, WIDTH), (0, 4))

@@ -43,8 +43,8 @@ class SegmentationConfig(Section):
     upright: bool = True
     """True to rotate the images of a rolled camera upright before segmentation (false in the paper)."""
     max_instances: int = Field(32, gt=0)
-    """Maximum number of instances in an image; those with the highest scores are kept. It bounds memory and is far
-    above the number of objects in a room."""
+    """Maximum number of instances in an image; people and animals are kept first, then the highest scores. It bounds
+    memory and is far above the number of objects in a room."""
     interval: int = Field(1, gt=0)
     """Every n-th frame of a sequence is segmented. In the frames between, masks are moved with the objects and refined
     from the depth."""

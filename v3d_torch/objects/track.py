@@ -27,6 +27,10 @@ _VELOCITY_TIME = 0.7
 """Time constant of the velocity of an object that is not observed, seconds: most people stop or turn within a second.
 Together with the acceleration noise it implies a speed of about 1 m/s."""
 
+_MAX_EXTRAPOLATION = 0.5
+"""Time for which an object without a measured centroid is expected to keep its velocity, seconds: about a step of a
+person."""
+
 _MIN_CONFIRMED_SCORE = 0.75
 """Sum of the scores of the detections from which an object is confirmed: one strong detection or some weak ones."""
 
@@ -165,10 +169,14 @@ class Track:
     def predict_state(self, stamp: float) -> ObjectState:
         """Predict position and velocity with constant velocity (paper, Sec. II).
 
+        An object whose centroid has not been measured for longer, for example because it is too far for its depth, does
+        not go on for ever, see `predict_return`.
+
         Args:
             stamp: Timestamp, seconds.
         """
-        return self._filter.state.predict(stamp)
+        state = self._filter.state
+        return state.predict(stamp) if stamp - state.stamp <= _MAX_EXTRAPOLATION else self.predict_return(stamp)
 
     def predict_cloud(self, stamp: float) -> Tensor:
         """Predict the cloud: the newest cloud, moved with constant velocity.

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from v3d_torch.kernels import mask_upsampling as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.segmentation.coco import LIVING
 from v3d_torch.segmentation.inference import NetworkOutput
 from v3d_torch.segmentation.letterbox import CELL, Window
 from v3d_torch.segmentation.suppression import non_maximum_suppression
@@ -38,7 +39,8 @@ def decode(
         score_threshold: Minimum class score.
         iou_threshold: Intersection over union above which two boxes of one class are the same instance; None disables
             suppression, for one-to-one heads.
-        max_instances: Maximum number of instances; those with the best scores are kept.
+        max_instances: Maximum number of instances. People and animals are kept first, because who is missed is not
+            masked; then those with the best scores.
 
     Returns:
         Instances in the image, best score first, each with at least one pixel.
@@ -53,15 +55,22 @@ def decode(
     if iou_threshold is not None:
         keep = non_maximum_suppression(boxes, labels, iou_threshold)
         boxes, labels, scores, coefficients = boxes[keep], labels[keep], scores[keep], coefficients[:, keep]
-    boxes, labels, scores = window.to_image(boxes[:max_instances]), labels[:max_instances], scores[:max_instances]
+    if len(boxes) > max_instances:
+        keep = _most_important(labels, max_instances)
+        boxes, labels, scores, coefficients = boxes[keep], labels[keep], scores[keep], coefficients[:, keep]
+    boxes = window.to_image(boxes)
 
     rows, columns = _needed_prototypes(boxes, window)
     prototypes = output.prototypes(rows, columns)
-    masks = assemble_masks(
-        coefficients[:, :max_instances].T, prototypes, boxes, window, first=(rows.start, columns.start)
-    )
+    masks = assemble_masks(coefficients.T, prototypes, boxes, window, first=(rows.start, columns.start))
     not_empty = masks.view(torch.uint8).flatten(1).amax(dim=1).bool()
     return Instances(masks=masks, labels=labels, scores=scores, boxes=boxes)[not_empty]
+
+
+def _most_important(labels: Tensor, count: int) -> Tensor:
+    """Return the indices of people and animals first, then of the best scores; in the order of the scores."""
+    is_thing = ~torch.isin(labels, torch.tensor(sorted(LIVING)))
+    return is_thing.to(torch.uint8).argsort(stable=True)[:count].sort().values
 
 
 def _assemble_masks_compiled(
