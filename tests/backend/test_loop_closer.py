@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -19,7 +20,7 @@ from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
-from v3d_torch.tracking.map_tracker import MapTracker
+from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5)
 LAP = 24
@@ -135,9 +136,9 @@ class Camera:
         return float(torch.stack(self.true_poses)[:, :3, 3].diff(dim=0).norm(dim=1).sum())
 
 
-def make_loop_closer(config: Config) -> LoopCloser:
+def make_loop_closer(config: Config, tracker_type: type[MapTracker] = MapTracker) -> LoopCloser:
     motion = MotionEstimator(config.odometry, config.features, CAMERA, config.seed)
-    tracker = MapTracker(config.tracking, config.features, CAMERA)
+    tracker = tracker_type(config.tracking, config.features, CAMERA)
     return LoopCloser(config.loop, motion, tracker, config.tracking.local_keyframes)
 
 
@@ -228,6 +229,31 @@ def test_place_with_few_of_its_visible_landmarks_is_no_loop() -> None:
             camera.step(room, lap_pose(len(camera.true_poses)), every=12)
         loop_counts[overrides] = camera.loop_closer.loop_count
     assert loop_counts[()] == 0 and loop_counts[("loop.min_inlier_ratio=0",)] > 0
+
+
+class FirstRatioLowTracker(MapTracker):
+    """Tracker that repeats the visible landmarks of the first pose that it finds, so that its inlier ratio is low."""
+
+    is_first = True
+
+    def __call__(self, *args: Any) -> MapTracking | None:
+        tracking = super().__call__(*args)
+        if tracking is not None and self.is_first:
+            self.is_first = False
+            return replace(tracking, visible=tracking.visible.repeat(100))
+        return tracking
+
+
+def test_candidate_with_a_low_inlier_ratio_does_not_end_the_search(drifted: Camera) -> None:
+    newest = drifted.map.keyframes[LAP + 2]
+    places = []
+    for tracker_type in (MapTracker, FirstRatioLowTracker):
+        loop_closer = make_loop_closer(load_config(), tracker_type)
+        loop_closer.rebuild_database(drifted.map.keyframes[: newest.index])
+        correction = loop_closer.detect_loop(newest, drifted.map, drifted.map.T_cw)
+        assert correction is not None
+        places.append(correction.place.keyframe.index)
+    assert places[0] != places[1] and max(places) <= 5  # both are at the beginning of the first lap
 
 
 def test_different_rooms_form_no_loop() -> None:

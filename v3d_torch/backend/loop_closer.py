@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,17 +112,7 @@ class LoopCloser:
             The first candidate that passes verification: a relative motion to its keyframe is found, and enough
             landmarks around the keyframe match. None if no candidate passes.
         """
-        for index, _ in self._database.query(features.descriptors, self._config.candidates, exclude):
-            keyframe = sparse_map.keyframes[index]
-            motion = self._motion(keyframe.features, features)
-            if motion is None:
-                continue
-            local = sparse_map.local_map(keyframe.observed_landmarks, self._local_keyframes)
-            propagated = motion.propagate_landmarks(keyframe.landmarks, len(features))
-            tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, propagated)
-            if tracking is not None and tracking.count >= self._config.min_inliers:
-                return PlaceMatch(keyframe, tracking)
-        return None
+        return next(self._verified_places(features, sparse_map, exclude), None)
 
     def detect_loop(self, keyframe: Keyframe, sparse_map: SparseMap, T_cw: Tensor) -> LoopCorrection | None:
         """Detect a loop that ends at a keyframe and optimise the pose graph with it; the map does not change.
@@ -162,16 +152,31 @@ class LoopCloser:
             other.disconnected &= place.keyframe.disconnected
         return invert(keyframe.T_cw) @ previous_T_cw
 
+    def _verified_places(
+        self, features: Features, sparse_map: SparseMap, exclude: Iterable[int]
+    ) -> Iterator[PlaceMatch]:
+        """Verify the candidates one after another, best first, and yield those that pass; see `relocalise`."""
+        for index, _ in self._database.query(features.descriptors, self._config.candidates, exclude):
+            keyframe = sparse_map.keyframes[index]
+            motion = self._motion(keyframe.features, features)
+            if motion is None:
+                continue
+            local = sparse_map.local_map(keyframe.observed_landmarks, self._local_keyframes)
+            propagated = motion.propagate_landmarks(keyframe.landmarks, len(features))
+            tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, propagated)
+            if tracking is not None and tracking.count >= self._config.min_inliers:
+                yield PlaceMatch(keyframe, tracking)
+
     def _detect_revisit(self, keyframe: Keyframe, sparse_map: SparseMap) -> PlaceMatch | None:
         """Find a place whose keyframe is neither recent nor covisible; None soon after another loop."""
         if sparse_map.loops and keyframe.index - sparse_map.loops[-1].j < self._config.min_keyframe_gap:
             return None
         covisible = sparse_map.count_shared_landmarks(keyframe.observed_landmarks).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_keyframe_gap, keyframe.index + 1)
-        place = self.relocalise(keyframe.features, sparse_map, {*covisible, *recent})
-        if place is None or place.tracking.count < self._config.min_inlier_ratio * len(place.tracking.visible):
-            return None
-        return place
+        for place in self._verified_places(keyframe.features, sparse_map, {*covisible, *recent}):
+            if place.tracking.count >= self._config.min_inlier_ratio * len(place.tracking.visible):
+                return place
+        return None
 
     def _optimise_poses(self, sparse_map: SparseMap, T_cw: Tensor, loops: Sequence[Loop]) -> Tensor:
         """Optimise the poses of the active keyframes by the pose graph of covisibility and loops, shape (K, 4, 4)."""
