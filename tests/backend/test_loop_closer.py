@@ -30,6 +30,9 @@ BEFORE_LOOP = 19
 DRIFT = torch.tensor([0.002, 0.005, 0.002, 0.0005, 0.002, 0.0005], dtype=torch.float64)
 """Error of the motion between two keyframes, which are 0.26 m apart: translation in metres, rotation in radians."""
 
+WRONG_GUESS = torch.tensor([0.4, 0, 0.3, 0, 0.35, 0], dtype=torch.float64)
+"""Error of the guessed motion of a lost camera: translation in metres, rotation in radians."""
+
 
 class Room:
     """Points on the walls of a room of 5 x 5 x 2.6 m, each with a random descriptor."""
@@ -89,15 +92,13 @@ class Camera:
         self._points: list[Tensor] = []  # for each keyframe, the indices of the points of its features
         self._first_tracked = 0  # first keyframe of which landmarks are tracked
 
-    def step(
-        self, room: Room, T_wc: Tensor, *, disconnected: bool = False, guess: Tensor | None = None, every: int = 1
-    ) -> Keyframe:
+    def step(self, room: Room, T_wc: Tensor, *, part: int = 0, guess: Tensor | None = None, every: int = 1) -> Keyframe:
         """Move to a pose, with drift in the estimated motion, and insert a keyframe there.
 
         Args:
             room: Room that the camera observes.
             T_wc: True pose of the keyframe.
-            disconnected: True if only a guess joins the keyframe to the rest of the map.
+            part: Part of the map to which the keyframe belongs.
             guess: Error of the estimated motion in place of the drift, for a camera that was lost and tracks no
                 landmarks; None if the camera was not lost.
             every: Use every n-th feature.
@@ -118,7 +119,7 @@ class Camera:
         keyframe = self.map.insert_keyframe(
             len(self.true_poses), len(self.true_poses) / 3, T_cw, features, known[points]
         )
-        keyframe.disconnected = disconnected
+        keyframe.part = part
         self.true_poses.append(T_wc)
         correction = self.loop_closer.detect_loop(keyframe, self.map, self.map.T_cw)
         self.corrections.append(None if correction is None else self.loop_closer.correct_loop(correction, self.map))
@@ -321,20 +322,19 @@ def test_relocalisation_fails_with_too_few_features() -> None:
 def test_loop_joins_the_disconnected_part_of_the_map() -> None:
     camera, room = Camera(), Room(seed=1)
     for k in range(BEFORE_LOOP):
-        camera.step(room, lap_pose(k), disconnected=k > 12)
+        camera.step(room, lap_pose(k), part=int(k > 12))
     assert camera.loop_closer.loop_count == 0
     assert any(keyframe.disconnected for keyframe in camera.map.keyframes)
     while camera.corrections[-1] is None:
-        camera.step(room, lap_pose(len(camera.true_poses)), disconnected=True)
+        camera.step(room, lap_pose(len(camera.true_poses)), part=1)
     assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
 
 
 def test_loop_corrects_a_wrong_guess_without_deforming_the_map() -> None:
     """A lost camera is guessed half a metre off: only the loop determines the relative pose of the two parts."""
     camera, room = Camera(), Room(seed=1)
-    guess = torch.tensor([0.4, 0, 0.3, 0, 0.35, 0], dtype=torch.float64)
     for k in range(2 * LAP):
-        camera.step(room, lap_pose(k), disconnected=k >= 12, guess=guess if k == 12 else None)
+        camera.step(room, lap_pose(k), part=int(k >= 12), guess=WRONG_GUESS if k == 12 else None)
         if camera.corrections[-1] is not None:
             break
         if k == 11:
@@ -344,6 +344,44 @@ def test_loop_corrects_a_wrong_guess_without_deforming_the_map() -> None:
     assert camera.loop_closer.loop_count == 1
     torch.testing.assert_close(camera.errors()[:12], before, rtol=0, atol=1e-3)
     assert camera.errors()[12:].max() < 0.1  # drift between the loop and keyframe 12
+
+
+def test_loop_of_a_camera_that_was_lost_twice_joins_only_the_part_at_its_end() -> None:
+    """Parts 0, 1 and 2 begin at keyframes 0, 8 and 16; the second lap passes part 0, and then part 1."""
+    camera, room = Camera(), Room(seed=1)
+    while camera.loop_closer.loop_count < 1:
+        k = len(camera.true_poses)
+        camera.step(room, lap_pose(k), part=min(k // 8, 2), guess=WRONG_GUESS if k in (8, 16) else None)
+        if k == 15:
+            guessed = camera.map.T_cw[8:]
+    assert camera.map.loops[0].i < 8 and camera.map.loops[0].j > 16
+    assert [keyframe.part for keyframe in camera.map.keyframes] == 8 * [0] + 8 * [1] + (k - 15) * [0]
+    torch.testing.assert_close(camera.map.T_cw[8:16], guessed, rtol=0, atol=1e-9)
+    errors = camera.errors()
+    assert errors[8] > 0.4 and errors[:8].max() < 0.1 and errors[16:].max() < 0.1
+    while camera.loop_closer.loop_count < 2:
+        camera.step(room, lap_pose(len(camera.true_poses)))
+    assert 8 <= camera.map.loops[1].i < 16
+    assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert camera.errors().max() < 0.1
+
+
+def test_loop_between_two_disconnected_parts_joins_them_to_one_disconnected_part() -> None:
+    """A camera that was lost is carried to another room and is lost again there."""
+    camera = Camera()
+    for k in range(4):
+        camera.step(Room(seed=1), lap_pose(k))
+    room = Room(seed=2)
+    for k in range(LAP + 4):
+        camera.step(room, lap_pose(k), part=1 + k // 12, guess=WRONG_GUESS if k in (0, 12) else None)
+        if camera.corrections[-1] is not None:
+            break
+    assert camera.loop_closer.loop_count == 1
+    assert [keyframe.part for keyframe in camera.map.keyframes] == 4 * [0] + (k + 1) * [1]
+    positions = invert(camera.map.T_cw[4:])[:, :3, 3]
+    true_positions = torch.stack(camera.true_poses[4:])[:, :3, 3]
+    error = torch.pdist(positions) - torch.pdist(true_positions)
+    assert error.abs().max() < 0.1
 
 
 def test_loop_closing_is_deterministic(closed: Camera) -> None:

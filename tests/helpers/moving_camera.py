@@ -19,9 +19,9 @@ TWIST = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.4, -0.3], dtype=torch.float64)  # m
 twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(lambda v: torch.tensor(v, dtype=torch.float64))
 
 
-def keyframe(T_cw: Tensor = EYE, stamp: float = 0.0, landmarks: int = 0, disconnected: bool = False) -> Keyframe:
+def keyframe(T_cw: Tensor = EYE, stamp: float = 0.0, landmarks: int = 0, part: int = 0) -> Keyframe:
     """A keyframe at a pose that observes the first ``landmarks`` landmarks, without features."""
-    return Keyframe(0, 0, stamp, T_cw, no_features(), torch.arange(landmarks), disconnected)
+    return Keyframe(0, 0, stamp, T_cw, no_features(), torch.arange(landmarks), part)
 
 
 def frame_pose(

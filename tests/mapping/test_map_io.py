@@ -47,7 +47,7 @@ def random_map(keyframes: int = 4, seed: int = 0) -> StoredMap:
         landmarks[:matched] = torch.arange(matched)
         T_cw = se3_exp(torch.randn(6, generator=generator, dtype=torch.float64))
         keyframe = sparse_map.insert_keyframe(7 * index, 0.7 * index, T_cw, features, landmarks)
-        keyframe.disconnected = index == 2
+        keyframe.part = index if index >= 2 else 0
         image = torch.randint(0, 256, (3, 240, 320), generator=generator, dtype=torch.uint8)
         depth = 5 * torch.rand(1, 240, 320, generator=generator)
         views.add(keyframe, image, depth, torch.rand(240, 320, generator=generator) > 0.5)
@@ -82,7 +82,7 @@ def test_loaded_map_equals_the_saved_map(keyframes: int, tmp_path: Path) -> None
     loaded = load_map(write_map(tmp_path, stored), CAMERA, CONFIG)
     assert_same(stored, loaded)
     for before, after in zip(stored.map.keyframes, loaded.map.keyframes, strict=True):
-        assert (after.index, after.stamp, after.disconnected) == (before.index, before.stamp, before.disconnected)
+        assert (after.index, after.stamp, after.part) == (before.index, before.stamp, before.part)
         assert after.frame == -1 and after.is_from_earlier_run and not before.is_from_earlier_run
         assert torch.equal(after.landmarks, before.landmarks)
         for name, column in vars(before.features).items():
@@ -211,7 +211,7 @@ def test_invalid_readout_is_rejected(readout: object, tmp_path: Path) -> None:
         load_map(path, CAMERA, CONFIG)
 
 
-@pytest.mark.parametrize("version", [3, 5])
+@pytest.mark.parametrize("version", [3, 6])
 def test_map_of_another_version_is_rejected_with_cause_and_fix(version: int, tmp_path: Path) -> None:
     path = write_map(tmp_path, random_map(1))
     with np.load(path) as file:
@@ -219,11 +219,24 @@ def test_map_of_another_version_is_rejected_with_cause_and_fix(version: int, tmp
     header = changed_header(path, version=version, camera=None)
     rewrite(path, about=header, landmark__active=None, landmark__alive=active)
     message = (
-        rf"room\.map: has version {version} of the map format, but this program reads version 4;"
+        rf"room\.map: has version {version} of the map format, but this program reads versions 4 and 5;"
         r" make the map again with --save-map, or use the program version that wrote it$"
     )
     with pytest.raises(InputError, match=message):
         load_map(path, CAMERA, CONFIG)
+
+
+def test_disconnected_keyframes_of_version_4_are_one_part(tmp_path: Path) -> None:
+    stored = random_map()
+    path = write_map(tmp_path, stored)
+    flags = np.array([keyframe.disconnected for keyframe in stored.map.keyframes])
+    header = changed_header(path, version=4)
+    rewrite(path, about=header, keyframe__part=None, keyframe__disconnected=flags)
+    loaded = load_map(path, CAMERA, CONFIG)
+    assert [keyframe.part for keyframe in loaded.map.keyframes] == [0, 0, 1, 1]
+    for keyframe in stored.map.keyframes[2:]:
+        keyframe.part = 1
+    assert_same(stored, loaded)
 
 
 @pytest.mark.parametrize(
@@ -266,6 +279,7 @@ def test_map_with_other_settings_is_rejected(setting: str, tmp_path: Path) -> No
         ("feature/sigma_ratio", 3, 0.0),
         ("observation/sigma_ratio", 3, -1.0),
         ("landmark/keyframe", 2, 4),
+        ("keyframe/part", 1, -1),
         ("keyframe/feature_count", 1, 19),
         ("keyframe/reference", 1, 9),
         ("keyframe/T_cw", 1, np.nan),

@@ -82,6 +82,32 @@ def test_lost_camera_starts_a_disconnected_part_of_the_map_after_the_delay() -> 
     assert feed.mapper.map.keyframes[-1].disconnected  # because its reference keyframe is
 
 
+def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:
+    feed = FrameFeeder(restart_after=0.5, max_keyframe_interval=5)
+    assert feed(0, LOST)
+    while len(feed.mapper.map.keyframes) < 2:
+        feed(0, LOST)
+    while len(feed.mapper.map.keyframes) < 3:
+        feed(300)
+    while len(feed.mapper.map.keyframes) < 4:
+        feed(0, LOST)
+    while len(feed.mapper.map.keyframes) < 5:
+        feed(300)
+    assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 1, 1, 2, 2]
+    assert feed.mapper.map.covisibility_edges(1000).tolist() == [[1, 2], [3, 4]]
+
+
+def test_part_that_a_lost_camera_starts_after_parts_were_joined_has_an_unused_id() -> None:
+    feed = FrameFeeder(restart_after=0.5)
+    assert feed(0, LOST)
+    while len(feed.mapper.map.keyframes) < 3:
+        feed(0, LOST)
+    feed.mapper.map.join_parts(0, 1)
+    while len(feed.mapper.map.keyframes) < 4:
+        feed(0, LOST)
+    assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 0, 2, 3]
+
+
 def test_restart_delay_begins_when_a_covered_camera_is_uncovered() -> None:
     feed = FrameFeeder(restart_after=0.5)
     assert feed(0, LOST)

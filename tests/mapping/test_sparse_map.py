@@ -108,6 +108,26 @@ def test_covisibility_equals_plain_counting(observed_sets: tuple[SparseMap, list
     assert sparse_map.covisibility_edges(7).tolist() == pairs
 
 
+def test_consecutive_keyframes_of_different_parts_have_no_edge() -> None:
+    sparse_map = make_map()
+    for part in (0, 0, 1, 1, 2, 2, 0, 0):
+        insert(sparse_map, []).part = part
+    assert sparse_map.covisibility_edges(1).tolist() == [[0, 1], [2, 3], [4, 5], [6, 7]]
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "parts"), [(0, 2, [0, 1, 0]), (2, 0, [0, 1, 0]), (2, 1, [0, 1, 1]), (1, 1, [0, 1, 2])]
+)
+def test_joined_parts_have_the_lower_id(a: int, b: int, parts: list[int]) -> None:
+    sparse_map = make_map()
+    for part in range(3):
+        insert(sparse_map, []).part = part
+    assert sparse_map.unused_part == 3
+    sparse_map.join_parts(a, b)
+    assert [keyframe.part for keyframe in sparse_map.keyframes] == parts
+    assert [keyframe.disconnected for keyframe in sparse_map.keyframes] == [part > 0 for part in parts]
+
+
 def test_local_map_is_the_active_landmarks_of_the_most_covisible_keyframes(
     observed_sets: tuple[SparseMap, list[set[int]]],
 ) -> None:

@@ -73,7 +73,7 @@ def test_every_nth_reliable_frame_is_added() -> None:
     assert drive.mapper._store.frames == [0, 3, 6]
     drive.add(17, 19, TrackingStatus.ODOMETRY)
     assert drive.mapper._store.frames == [0, 3, 6, 18]
-    drive.keyframes[1].disconnected = True
+    drive.keyframes[1].part = 1
     drive.add(19, 31, TrackingStatus.ODOMETRY)
     assert drive.mapper._store.frames == [0, 3, 6, 18]
 

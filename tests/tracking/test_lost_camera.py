@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 
 import pytest
 import torch
-from helpers.walls import Slide
+from helpers.walls import CAMERA, Slide
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import TrackingStatus
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -22,6 +24,7 @@ import lost
 CONFIG = load_config(None, ("segmentation.source=none",))
 BEFORE, AFTER = 20, 12
 TRACKED, LOST, ODOMETRY = TrackingStatus.TRACKED, TrackingStatus.LOST, TrackingStatus.ODOMETRY
+DISCONNECTED = TrackingStatus.DISCONNECTED
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +56,25 @@ def test_interrupted_camera_is_found_again_and_flags_unreliable_poses(
     assert scored.worst < 0.1
     assert scored.ate <= max(1.5 * scored.reference, 1e-3)
     assert all(result.online[k] is LOST for k, index in enumerate(case.shown) if index == interruptions.COVERED)
+
+
+def test_part_without_a_loop_stays_disconnected_when_a_loop_joins_a_later_part() -> None:
+    """The camera is lost twice, closes a loop from the third part of the map to the first, and returns to the second.
+
+    The parts show columns 0 to 520, 960 to 1440, and 840 to 0 of the wall.
+    """
+    overrides = ("mapping.restart_after=0.3", "mapping.max_keyframe_interval=4", "loop.min_keyframe_gap=2")
+    slam = V3DSLAM(CAMERA, config=load_config(None, ("segmentation.source=none", *overrides)))
+    statuses = []
+    for path in (Slide(0, 200), Slide(960, 1120), Slide(520, 0), Slide(960, 1120)):
+        for index in range(len(path)):
+            count = len(slam.poses)
+            slam(replace(path[index], index=count, stamp=count / 10))
+        statuses.append(slam.poses.status)
+    assert statuses == [TRACKED, DISCONNECTED, TRACKED, DISCONNECTED]
+    assert slam.loop_closer.loop_count == 1
+    parts = [keyframe.part for keyframe in slam.map.keyframes]
+    assert [part for part, _ in groupby(parts)] == [0, 1, 0, 1]
 
 
 class TestCases:

@@ -146,7 +146,7 @@ def test_lost_frames_linked_by_measured_motions_become_odometry() -> None:
 
 def test_lost_frames_found_in_a_disconnected_part_are_disconnected() -> None:
     camera = begin_lost(3)
-    camera.append(0.3, frame_pose(true_pose(3)), keyframe(true_pose(3), disconnected=True), STEP)
+    camera.append(0.3, frame_pose(true_pose(3)), keyframe(true_pose(3), part=1), STEP)
     assert camera.poses.statuses == 4 * [TrackingStatus.DISCONNECTED]
 
 
@@ -214,7 +214,7 @@ def test_first_keyframe_of_a_lost_camera_is_tracked() -> None:
 
 def test_frames_of_a_disconnected_keyframe_are_disconnected() -> None:
     camera = Camera()
-    guess = keyframe(disconnected=True)
+    guess = keyframe(part=1)
     camera.append(0.0, frame_pose(EYE, TrackingStatus.LOST), keyframe(), new=guess)
     camera.append(0.1, frame_pose(EYE), guess)
     camera.append(0.2, frame_pose(EYE, TrackingStatus.ODOMETRY), guess)

@@ -135,7 +135,7 @@ class LoopCloser:
         return LoopCorrection(place, loop, self._optimise_poses(sparse_map, T_cw, [*sparse_map.loops, loop]))
 
     def correct_loop(self, correction: LoopCorrection, sparse_map: SparseMap) -> Tensor:
-        """Correct keyframes and landmarks of the map in place and fuse the landmarks on both sides of the loop.
+        """Correct keyframes and landmarks of the map in place, and join parts and landmarks on both sides of the loop.
 
         Returns:
             Transform ``T_new_old`` from the old to the corrected world frame at the keyframe at which the loop ends,
@@ -147,9 +147,7 @@ class LoopCloser:
         self.loop_count += 1
         sparse_map.move_keyframes(correction.T_cw)
         sparse_map.fuse_landmarks(keyframe, place.tracking.landmarks)
-        # The loop connects the disconnected part of the map to the rest, unless the place itself is disconnected.
-        for other in sparse_map.keyframes:
-            other.disconnected &= place.keyframe.disconnected
+        sparse_map.join_parts(place.keyframe.part, keyframe.part)
         return invert(keyframe.T_cw) @ previous_T_cw
 
     def _verified_places(

@@ -65,7 +65,7 @@ def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
 def covisibility_edges(tables: MapTables, min_shared: int) -> Tensor:
     """Find the edges of the pose graph: pairs of covisible keyframes, and pairs of consecutive active keyframes.
 
-    There is no edge between consecutive keyframes if the camera was lost between them: their relative pose is unknown.
+    There is no edge between consecutive keyframes of different parts of the map: their relative pose is unknown.
 
     Args:
         tables: Data of the map.
@@ -92,6 +92,6 @@ def _covisible_pairs(tables: MapTables, min_shared: int) -> Tensor:
 def _consecutive_pairs(tables: MapTables) -> Tensor:
     active = tables.active_keyframes
     index = torch.tensor([keyframe.index for keyframe in active], dtype=torch.int64)
-    disconnected = torch.tensor([keyframe.disconnected for keyframe in active], dtype=torch.bool)
-    connected = disconnected[:-1] == disconnected[1:]
-    return torch.stack([index[:-1][connected], index[1:][connected]], dim=1)
+    part = torch.tensor([keyframe.part for keyframe in active], dtype=torch.int64)
+    is_same = part[:-1] == part[1:]
+    return torch.stack([index[:-1][is_same], index[1:][is_same]], dim=1)

@@ -22,7 +22,8 @@ class Keyframe:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`; changed by bundle adjustment and loop correction.
         features: Features on static pixels; empty once the keyframe is culled.
         landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
-        disconnected: True if the pose of the keyframe relative to the rest of the map is only a guess.
+        part: ID of the part of the map to which the keyframe belongs. Part 0 is where the map starts. A lost camera
+            starts another part, whose pose relative to the other parts is only a guess until a loop joins two parts.
         reference: Index of the reference keyframe. A culled keyframe moves rigidly with its reference keyframe; every
             other keyframe is its own reference.
     """
@@ -33,7 +34,7 @@ class Keyframe:
     T_cw: Tensor
     features: Features
     landmarks: Tensor
-    disconnected: bool = False
+    part: int = 0
     reference: int = -1
 
     def __post_init__(self) -> None:
@@ -44,6 +45,11 @@ class Keyframe:
     def is_culled(self) -> bool:
         """True if the keyframe was culled: it has no observations, but frames and landmarks still use its pose."""
         return self.reference != self.index
+
+    @property
+    def disconnected(self) -> bool:
+        """True if the pose of the keyframe relative to the start of the map is only a guess."""
+        return self.part != 0
 
     @property
     def is_from_earlier_run(self) -> bool:

@@ -37,7 +37,7 @@ def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
         keyframes.append(
             stamp=torch.tensor([keyframe.stamp], dtype=torch.float64),
             T_cw=keyframe.T_cw[None],
-            disconnected=torch.tensor([keyframe.disconnected]),
+            part=torch.tensor([keyframe.part]),
             reference=torch.tensor([keyframe.reference]),
             feature_count=torch.tensor([len(keyframe.features)]),
         )
@@ -84,7 +84,7 @@ def fill_from_columns(columns: Columns, tables: MapTables, views: StaticViews) -
             T_cw=keyframes["T_cw"][index],
             features=Features(**own),
             landmarks=landmarks,
-            disconnected=bool(keyframes["disconnected"][index]),
+            part=int(keyframes["part"][index]),
             reference=int(keyframes["reference"][index]),
         )
         tables.keyframes.append(keyframe)
@@ -122,6 +122,7 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
         return "keyframe/feature_count does not add up to the number of features"
     camera, keyframes, landmarks = sparse_map.camera, lengths["keyframe"], lengths["landmark"]
     for name, minimum, end in (
+        ("keyframe/part", 0, keyframes),
         ("keyframe/feature_count", 0, lengths["feature"] + 1),
         ("keyframe/reference", 0, keyframes),
         ("feature/pixel", 0, torch.tensor([camera.width, camera.height])),
@@ -147,7 +148,7 @@ def _empty_tables() -> tuple[TensorTable, TensorTable]:
     keyframes = TensorTable(
         stamp=((), torch.float64),
         T_cw=((4, 4), torch.float64),
-        disconnected=((), torch.bool),
+        part=((), torch.int64),
         reference=((), torch.int64),
         feature_count=((), torch.int64),
     )

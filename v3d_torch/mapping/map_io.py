@@ -6,25 +6,29 @@ Covisibility and the keyframe database are not stored, because they are computed
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.io.array_file import open_array_file, write_array_file
+from v3d_torch.io.array_file import ArrayFile, open_array_file, write_array_file
 from v3d_torch.io.paths import StrPath
 from v3d_torch.mapping.map_columns import OPTIONAL_COLUMNS, fill_from_columns, find_inconsistency, to_columns
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import Readout
 
-_FORMAT, _VERSION = "v3d_torch map", 4
+_FORMAT, _VERSION = "v3d_torch map", 5
+
+_VERSION_WITHOUT_PARTS = 4
+"""Version of files that do not tell the disconnected parts of a map apart; they are read as one part."""
 
 _FIX = "give a file written by --save-map"
 
@@ -85,7 +89,7 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     """Read a map file.
 
     Args:
-        path: Path of a file written by `save_map`.
+        path: Path of a file written by `save_map`, of this or the previous version of the format.
         camera: Camera of the current run, which must be the camera of the map.
         config: Configuration of the current run, with the feature settings of the map.
 
@@ -97,23 +101,34 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     with open_array_file(path, _FORMAT, "a map file", _FIX) as file:
         _check_compatibility(path, file.about, camera, config)
         stored.map.readout = Readout.from_dict(file.about["readout"])
-        names = [name for name in to_columns(stored.map, stored.views) if name in file or name not in OPTIONAL_COLUMNS]
-        columns = {name: torch.from_numpy(file.read(name)) for name in names}
-        for name in OPTIONAL_COLUMNS:
-            uv = columns[f"{name.split('/')[0]}/uv"]
-            columns.setdefault(name, torch.ones_like(uv))
+        columns = _read_columns(file, to_columns(stored.map, stored.views))
     if (problem := find_inconsistency(columns, stored.map, stored.views)) is not None:
         raise InputError(f"{path}: is a damaged map file ({problem}); {_FIX}")
     fill_from_columns(columns, stored.map, stored.views)
     return stored
 
 
+def _read_columns(file: ArrayFile, names: Iterable[str]) -> dict[str, Tensor]:
+    """Read the columns of a file, and complete those that it lacks."""
+    columns: dict[str, Tensor] = {}
+    for name in names:
+        if name == "keyframe/part" and file.about["version"] == _VERSION_WITHOUT_PARTS:
+            columns[name] = torch.from_numpy(file.read("keyframe/disconnected")).to(torch.int64)
+        elif name in file or name not in OPTIONAL_COLUMNS:
+            columns[name] = torch.from_numpy(file.read(name))
+    for name in OPTIONAL_COLUMNS:
+        uv = columns[f"{name.split('/')[0]}/uv"]
+        columns.setdefault(name, torch.ones_like(uv))
+    return columns
+
+
 def _check_compatibility(path: Path, about: Mapping[str, Any], camera: PinholeCamera, config: Config) -> None:
     """Raise InputError if a map is of a different version, camera or configuration."""
-    if about["version"] != _VERSION:
+    if about["version"] not in (_VERSION_WITHOUT_PARTS, _VERSION):
         raise InputError(
-            f"{path}: has version {about['version']} of the map format, but this program reads version {_VERSION};"
-            " make the map again with --save-map, or use the program version that wrote it"
+            f"{path}: has version {about['version']} of the map format, but this program reads versions"
+            f" {_VERSION_WITHOUT_PARTS} and {_VERSION}; make the map again with --save-map, or use the program version"
+            " that wrote it"
         )
     map_camera = PinholeCamera(**about["camera"])
     if not _is_same_camera(map_camera, camera):

@@ -88,6 +88,22 @@ class MapTables:
         """Index of the reference keyframe of each keyframe, int64, shape :math:`(K,)`."""
         return torch.tensor([keyframe.reference for keyframe in self.keyframes], dtype=torch.int64)
 
+    @property
+    def unused_part(self) -> int:
+        """ID of a part without keyframes, see `Keyframe`; not 0, which is the part where the map starts."""
+        return max((keyframe.part for keyframe in self.keyframes), default=0) + 1
+
+    def join_parts(self, a: int, b: int) -> None:
+        """Join two parts, see `Keyframe`, in place; the joined part has the lower of both IDs.
+
+        Args:
+            a: ID of a part.
+            b: ID of a part; if it is the same, nothing changes.
+        """
+        for keyframe in self.keyframes:
+            if keyframe.part == max(a, b):
+                keyframe.part = min(a, b)
+
     def state_dict(self) -> dict[str, Any]:
         """Return the data of the map by attribute name, as live objects."""
         return {

@@ -50,7 +50,8 @@ class Mapper:
         if not self._needs_keyframe(frame, features, pose):
             return None
         keyframe = self.map.insert_keyframe(frame.index, frame.stamp, pose.T_cw, features, pose.landmarks)
-        keyframe.disconnected = reference is not None and (pose.status is TrackingStatus.LOST or reference.disconnected)
+        if reference is not None:
+            keyframe.part = self.map.unused_part if pose.status is TrackingStatus.LOST else reference.part
         self._most_tracked, self._untracked_since = 0, None
         self._fuse_landmarks(self.map, keyframe)
         return keyframe

@@ -53,7 +53,7 @@ class StateEstimator:
         self._covariance = _UNKNOWN  # of the last pose
         self._known_covariance = _UNKNOWN  # the same without growth since the motion was last measured
         self._last_measured = -torch.inf
-        self._part_covariance_w = torch.zeros(6, 6, dtype=torch.float64)  # of the disconnected part of the map
+        self._part_covariance_w = torch.zeros(6, 6, dtype=torch.float64)  # of the newest disconnected part
 
     def __call__(
         self, pose: FramePose, motion: CameraMotion, poses: PoseHistory, owners: Tensor, references: Tensor | None
