@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.walk_run import CAMERA as WALK_CAMERA
+from helpers.walk_run import CONFIG as WALK_CONFIG
+from helpers.walk_run import Walk, segment_red
 from PIL import Image
 from torch import Tensor
 
@@ -18,11 +21,11 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.level_frame import level_frame
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.occupancy.floor import Floor
-from v3d_torch.odometry.odometry import TrackedFrame
-from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.segmentation.coco import UNLABELLED
+from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
+from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
+from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.types import FramePose, TrackingStatus
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))
@@ -230,6 +233,40 @@ def test_views_before_a_loss_are_compared_only_when_the_camera_is_found(demo: RG
     assert [index for index, status in enumerate(statuses) if status is TrackingStatus.LOST] == [*lost]
     # The pose of a frame is known if the frame before it was found; the first frame has no motion.
     assert compared == [False, True, True, True, False, False, True]
+
+
+def test_objects_seen_by_a_lost_camera_move_into_the_map_when_it_is_found() -> None:
+    walk, offset = Walk(), se3_exp(torch.tensor([0.3, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64))
+
+    def places(lost: tuple[int, ...]) -> dict[float, Tensor]:
+        """Return the centroids of the person in the world frame by their times, after frame 10."""
+        slam = V3DSLAM(WALK_CAMERA, UprightSegmenter(segment_red), WALK_CONFIG)
+        odometry, track_camera = slam.odometry, slam.track_camera
+
+        def guess(previous: TrackedFrame | None, current: TrackedFrame, *rest: Any) -> CameraMotion:
+            motion = odometry(previous, current, *rest)
+            if current.frame.index not in lost[:1]:
+                return motion
+            return replace(motion, T_cp=offset @ motion.T_cp, pairs=motion.pairs[:0], is_measured=False)
+
+        class Track:
+            reference_keyframe = staticmethod(track_camera.reference_keyframe)
+
+            def __call__(self, features: Features, depth: Tensor, T_cw: Tensor, *rest: Any) -> FramePose:
+                if len(slam.poses) in lost:
+                    return FramePose(TrackingStatus.LOST, T_cw, torch.full((len(features),), -1))
+                return track_camera(features, depth, T_cw, *rest)
+
+        slam.odometry, slam.track_camera = guess, Track()
+        for index in range(11):
+            slam(walk[index])
+        people = [track for track in slam.classify_motion.tracker.tracks if track.label == PERSON]
+        return {detection.stamp: detection.centroid for track in people for detection in track.detections}
+
+    plain, found = places(()), places((8, 9))
+    assert found.keys() >= {0.8, 0.9, 1.0} and found.keys() == plain.keys()
+    for stamp, centroid in found.items():
+        torch.testing.assert_close(centroid, plain[stamp], rtol=0, atol=0.03)
 
 
 def test_array_instead_of_a_frame_is_rejected(demo: RGBDSequence) -> None:

@@ -283,7 +283,7 @@ class V3DSLAM(ReplaceableStages):
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
             T_cw, was_lost = self._compose_pose(motion), self.poses.status is TrackingStatus.LOST
-            view = self.free_space_check.make_view(frame.stamp, depth, T_cw, is_measured=motion.is_measured)
+            view = self.free_space_check.make_view(frame.stamp, depth, T_cw, has_motion=motion.is_measured)
             occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
         segmentation = self._wait_for_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
@@ -305,12 +305,13 @@ class V3DSLAM(ReplaceableStages):
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
-            keyframe = self._extend_map(frame, static, pose, motion)
+            part = self.poses.part
+            keyframe = self._extend_map(frame, static, pose, motion, view)
+            if self.poses.part != part:  # the pose relative to the stored views is a guess
+                self.free_space_check.drop_views()
             has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
-            elif keyframe is not None:  # the first one of a part of the map whose pose relative to the rest is a guess
-                self.free_space_check.drop_views()
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, velocity of the camera
@@ -425,16 +426,15 @@ class V3DSLAM(ReplaceableStages):
         return instances.concatenate(self.propose_unlabelled(occupied, instances, view.depth))
 
     def _extend_map(
-        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
+        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion, view: DepthView
     ) -> Keyframe | None:
         """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
-        reference = self.track_camera.reference_keyframe(pose)
+        part, reference = self.poses.part, self.track_camera.reference_keyframe(pose)
         keyframe = self.mapper(frame, features, pose, reference)
-        T_map_guess = invert(pose.T_cw) @ self._compose_pose(motion)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
         self._apply_world_correction(T_new_old)
         if pose.status is not TrackingStatus.LOST and T_new_old is None:
-            self.classify_motion.tracker.end_guess(T_map_guess)
+            self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ view.T_cw, all_tracks=self.poses.part != part)
         self._update_gravity(frame, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)

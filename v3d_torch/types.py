@@ -25,6 +25,10 @@ from v3d_torch.geometry.depth_scale import estimate_depth_scale
 from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.geometry.se3 import interpolate
 
+MIN_INTERVAL = 0.01
+"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
+each other come from a computer that received two frames at once, and the camera has moved for longer."""
+
 
 @dataclass(frozen=True)
 class RGBDFrame:

@@ -7,7 +7,7 @@ resolution. This is the resolution of a network's masks, so that an error of one
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path as FilePath
@@ -431,7 +431,7 @@ class ObjectStage:
     ) -> FrameObjects:
         """Process a frame. The clouds use ``cloud_depth`` if it is given, everything else uses ``depth``."""
         guess = guess or Guess(T_wc)
-        view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), is_measured=guess.is_measured)
+        view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), has_motion=guess.is_measured)
         newly_occupied = self._free_space_check(view, pose_known=guess.is_measured and not self._is_lost)
         min_area = self._config.free_space.min_unlabelled_area
         unlabelled = unlabelled_instances(newly_occupied, instances, depth, self._camera, min_area)
@@ -468,6 +468,7 @@ def simulate(
     network: Network | None = None,
     pose_error: bool = False,
     guessed: range = range(0),
+    unmeasured: Container[int] | None = None,
     overrides: tuple[str, ...] = (),
     config: FilePath | None = None,
 ) -> Run:
@@ -481,8 +482,9 @@ def simulate(
         camera: True camera-to-world poses at given times, (B,) to (B, 4, 4).
         network: Errors of the segmentation; contour errors only by default.
         pose_error: True to pass poses with the error of `perturb_poses`.
-        guessed: Frames with a guessed pose: the motion before the first one is not measured, and the camera is found
-            again in the last one.
+        guessed: Frames with a guessed pose; the camera is found again in the last one.
+        unmeasured: Those of them before which the motion is not measured; None for the first one. Each guess has an
+            error of its own.
         overrides: Overrides of the configuration.
         config: Configuration file.
     """
@@ -496,12 +498,14 @@ def simulate(
     settings = load_config(config, (*SCALE, *overrides))
     smooth = DepthSmoother(settings.depth.kernel_size, settings.depth.sigma, settings.depth.edge_ratio)
     stage = ObjectStage(settings.objects)
-    frames = []
+    frames, error = [], torch.eye(4, dtype=torch.float64)
     for i, stamp in enumerate(t.tolist()):
         instances, detected = network(owner[i], list(things), stamp, generator)
         guess = None
         if i in guessed:
-            guess = Guess(GUESS_ERROR @ poses[i], is_measured=i > guessed.start, is_found=i + 1 == guessed.stop)
+            is_measured = i not in (guessed[:1] if unmeasured is None else unmeasured)
+            error = error if is_measured else GUESS_ERROR @ error
+            guess = Guess(error @ poses[i], is_measured, is_found=i + 1 == guessed.stop)
         result = stage(stamp, instances, smooth(depth[i][None])[0], poses[i], guess=guess)
         frames.append(Frame(stamp, owner[i], detected, result))
     return Run(frames)

@@ -359,12 +359,23 @@ def test_walker_is_dynamic_despite_pose_error(seed: int) -> None:
     assert_static(run, 0, 1)
 
 
-@pytest.mark.parametrize("guessed", [range(12, 13), range(12, 13 + 6)], ids=["one frame", "half a second"])
-def test_guessed_poses_make_no_static_object_dynamic(guessed: range) -> None:
+@pytest.mark.parametrize(
+    ("guessed", "unmeasured"),
+    [(range(12, 13), {12}), (range(12, 18), {12}), (range(12, 18), {12, 13, 16})],
+    ids=["one frame", "half a second", "half a second with three guesses"],
+)
+def test_guessed_poses_make_no_static_object_dynamic(guessed: range, unmeasured: set[int]) -> None:
     things = (LEFT_CHAIR, RIGHT_CHAIR, person(stand(0.1, 2.7)))
-    run = simulate(*things, seconds=2.5, guessed=guessed)
+    run = simulate(*things, seconds=2.5, guessed=guessed, unmeasured=unmeasured)
     assert_static(run, 0, 1, 2, max_fraction=0.0)
     assert all(len(run.ids(thing)) == 1 for thing in range(3))
+    for thing in range(3):
+        before, after = run.counted_frames(thing, until=0.99)[-1].find(thing), run.counted_frames(thing, since=1.6)
+        for frame in after[:3]:
+            found = frame.find(thing)
+            assert before is not None and found is not None
+            assert float((found.state.position - before.state.position).norm()) < 0.08
+            assert float(found.state.velocity.norm()) < 0.4
 
 
 def test_walker_stays_dynamic_after_guessed_poses() -> None:

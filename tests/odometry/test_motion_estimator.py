@@ -8,7 +8,8 @@ from helpers.two_views import CAMERA, two_views
 from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.odometry.motion_estimator import MIN_INTERVAL, MotionEstimator, RelativeMotion
+from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion
+from v3d_torch.types import MIN_INTERVAL
 
 
 def test_convention_motion_maps_points_of_a_to_b() -> None:

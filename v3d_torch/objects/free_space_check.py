@@ -28,6 +28,7 @@ from v3d_torch.kernels import nearest_depth as depth_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import STAMP_TOLERANCE
+from v3d_torch.types import MIN_INTERVAL
 
 _POSE_ERROR = 0.01
 """Reprojection error of a view's pose, as a fraction of the image width: 0.6 degrees of a Kinect's field of view."""
@@ -38,9 +39,6 @@ _COLUMNS = 160
 _VIEW_MARGIN = 0.2
 """Views are kept for this much longer than the longest baseline, seconds: at 5 frames per second, the newest view that
 is at least as old as the baseline can be one frame interval older."""
-
-_MIN_INTERVAL = 1e-3
-"""Shortest time between two views, seconds: lower bound of a divisor."""
 
 
 class SpaceView(Protocol):
@@ -81,7 +79,7 @@ class DepthView:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         misalignment: Largest offset of the depth from the colour image that the pose refers to, pixels. It arises when
             the camera turns between both exposures.
-        is_measured: True if the motion of the camera since the previous frame is measured; otherwise the pose is a
+        has_motion: True if the motion of the camera since the previous frame is measured; otherwise the pose is a
             guess.
     """
 
@@ -89,7 +87,7 @@ class DepthView:
     depth: Tensor
     T_cw: Tensor
     misalignment: int = 0
-    is_measured: bool = True
+    has_motion: bool = True
 
     @cached_property
     def missing(self) -> Tensor:
@@ -265,22 +263,22 @@ class FreeSpaceCheck:
         self._stride = max(1, round(camera.width / _COLUMNS))
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
-    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, is_measured: bool = True) -> DepthView:
+    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, has_motion: bool = True) -> DepthView:
         """Make a view. Its misalignment follows from the camera's rotation rate since the last stored view.
 
         Args:
             stamp: Timestamp, seconds.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-            is_measured: True if the motion of the camera since the previous frame is measured.
+            has_motion: True if the motion of the camera since the previous frame is measured.
         """
         if not self._views:
-            return DepthView(stamp, depth, T_cw, is_measured=is_measured)
+            return DepthView(stamp, depth, T_cw, has_motion=has_motion)
         last = self._views[-1]
         angle = float(np.linalg.norm(cv2.Rodrigues((T_cw @ invert(last.T_cw))[:3, :3].numpy())[0]))
-        rotation_rate = angle / max(stamp - last.stamp, _MIN_INTERVAL)
+        rotation_rate = angle / max(stamp - last.stamp, MIN_INTERVAL)
         misalignment = round(self._camera.fx * rotation_rate * self._config.depth_sync_error)
-        return DepthView(stamp, depth, T_cw, misalignment, is_measured)
+        return DepthView(stamp, depth, T_cw, misalignment, has_motion)
 
     def __call__(self, view: DepthView, *, pose_known: bool = True) -> NewlyOccupied:
         """Compare a view with the stored views.

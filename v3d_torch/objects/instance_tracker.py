@@ -67,8 +67,8 @@ class InstanceTracker(torch.nn.Module):
         tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
         resting: Tracks that cannot move by themselves and were missed for at most the maximum time.
         lost: Confirmed tracks that were missed for longer.
-        guessed_since: Time since which the world frame of the detections is a guess, because a motion of the camera was
-            not measured, seconds; minus infinity if it is known.
+        comparable_since: Time of the first detection that can be compared with the newest ones, seconds: before it, a
+            motion of the camera was not measured.
     """
 
     def __init__(self, config: TrackerConfig, camera: PinholeCamera, voxel_size: float) -> None:
@@ -82,7 +82,8 @@ class InstanceTracker(torch.nn.Module):
         self.tracks: list[Track] = []
         self.resting: list[Track] = []
         self.lost: list[Track] = []
-        self.guessed_since = -torch.inf
+        self.comparable_since = -torch.inf
+        self._is_guess = False  # the world frame of the detections since then
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the tracks and the next id, for ``state_dict()``."""
@@ -92,7 +93,8 @@ class InstanceTracker(torch.nn.Module):
             "lost": list(self.lost),
             "next_id": self._next_id,
             "last_stamp": self._last_stamp,
-            "guessed_since": self.guessed_since,
+            "comparable_since": self.comparable_since,
+            "is_guess": self._is_guess,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -104,7 +106,7 @@ class InstanceTracker(torch.nn.Module):
         self.tracks, self.resting = list(state["tracks"]), list(state["resting"])
         self.lost = list(state["lost"])
         self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
-        self.guessed_since = state["guessed_since"]
+        self.comparable_since, self._is_guess = state["comparable_since"], state["is_guess"]
 
     def forward(
         self,
@@ -163,24 +165,29 @@ class InstanceTracker(torch.nn.Module):
             track.apply_world_correction(T_new_old)
 
     def start_guess(self, stamp: float) -> None:
-        """Record that the world frame of the detections from now on is a guess, until `end_guess`.
+        """Record that the motion of the camera before a frame was not measured.
+
+        Detections from now on are not compared with earlier ones, and their world frame is a guess until `end_guess`.
 
         Args:
-            stamp: Timestamp of the first of these detections, seconds.
+            stamp: Timestamp of the frame, seconds.
         """
-        self.guessed_since = stamp
+        self.comparable_since, self._is_guess = stamp, True
 
-    def end_guess(self, T_map_guess: Tensor) -> None:
+    def end_guess(self, T_map_guess: Tensor, *, all_tracks: bool = False) -> None:
         """Transform the detections since `start_guess` into the map, in which the camera was found.
 
         Args:
             T_map_guess: Transform from the guessed world frame to the world frame of the map, float64, shape
                 :math:`(4, 4)`.
+            all_tracks: True to transform all detections, because they were made in another part of the map.
         """
-        if self.guessed_since > -torch.inf:
+        if all_tracks:
+            self.apply_world_correction(T_map_guess)
+        elif self._is_guess:
             for track in (*self.tracks, *self.resting, *self.lost):
-                track.apply_world_correction(T_map_guess, self.guessed_since)
-            self.guessed_since = -torch.inf
+                track.apply_world_correction(T_map_guess, self.comparable_since)
+        self._is_guess = False
 
     def _match(self, predicted: PredictedTracks, detected: DetectedInstances) -> dict[int, Track]:
         """Match instances to tracks in stages; return the track of each instance that continues one, by its index."""

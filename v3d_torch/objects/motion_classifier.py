@@ -80,12 +80,12 @@ class MotionClassifier:
         """
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
-        if not view.is_measured and self._last_stamp > -torch.inf:
+        if not view.has_motion and self._last_stamp > -torch.inf:
             self.tracker.start_guess(stamp)
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]
         baselines = (*config.voting.baselines, config.chamfer.baseline)
-        pairs = detection_pairs(detected, baselines, self.tracker.guessed_since)
+        pairs = detection_pairs(detected, baselines, self.tracker.comparable_since)
 
         # Independent evidence, not in the paper: free space.
         free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)

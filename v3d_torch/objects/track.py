@@ -131,6 +131,7 @@ class Track:
 
     def __post_init__(self, config: TrackerConfig) -> None:
         self.history: list[ObjectState] = []
+        self._config = config
         self._filter = ConstantVelocityKalmanFilter(config)
         self._max_points = 1
 
@@ -176,7 +177,8 @@ class Track:
             stamp: Timestamp, seconds.
         """
         state = self._filter.state
-        return state.predict(stamp) if stamp - state.stamp <= _MAX_EXTRAPOLATION else self.predict_return(stamp)
+        moving = state.predict(min(stamp, state.stamp + _MAX_EXTRAPOLATION))
+        return moving if moving.stamp == stamp else self._predict_stop(moving, stamp)
 
     def predict_cloud(self, stamp: float) -> Tensor:
         """Predict the cloud: the newest cloud, moved with constant velocity.
@@ -197,8 +199,7 @@ class Track:
         Args:
             stamp: Timestamp, seconds.
         """
-        state = self._filter.state
-        return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
+        return self._predict_stop(self._filter.state, stamp)
 
     def centroid_sigma(self, detection: Detection3D) -> float:
         """Return the standard deviation of each coordinate of the centroid of a detection, metres."""
@@ -302,11 +303,18 @@ class Track:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
             since: Time of the first detection that is transformed, seconds.
         """
-        if self.newest.stamp < since:
-            return
-        self._filter.apply_world_correction(T_new_old)
         self.history = [state.transform(T_new_old) if state.stamp >= since else state for state in self.history]
         self.detections = [d.transform(T_new_old) if d.stamp >= since else d for d in self.detections]
+        if since == -torch.inf:
+            self._filter.apply_world_correction(T_new_old)
+        elif self._filter.state.stamp >= since:  # it has mixed both world frames
+            self._filter = ConstantVelocityKalmanFilter(self._config)
+            for detection in self.detections:
+                if detection.stamp >= since:
+                    self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
+
+    def _predict_stop(self, state: ObjectState, stamp: float) -> ObjectState:
+        return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
 
     def _remember_state(self) -> None:
         """Append the state to the history, at the rate of the history, and drop the states that are too old."""

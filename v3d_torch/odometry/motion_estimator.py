@@ -15,6 +15,7 @@ from v3d_torch.features.matching import match_descriptors
 from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_log
+from v3d_torch.types import MIN_INTERVAL
 
 _EPIPOLAR_THRESHOLD = 2.0
 """Maximum Sampson distance of epipolar inliers, pixels: twice the localisation error of a feature."""
@@ -25,10 +26,6 @@ error of the points adds to the pixel error."""
 
 _MAX_ROTATION_RATE = 6.3
 """Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
-
-MIN_INTERVAL = 0.01
-"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
-each other come from a computer that received two frames at once, and the camera has moved for longer."""
 
 
 @dataclass(frozen=True)

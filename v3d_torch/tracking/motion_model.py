@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
-from v3d_torch.odometry.motion_estimator import MIN_INTERVAL
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.pose_history import PoseHistory
-from v3d_torch.types import FramePose, TrackingStatus
+from v3d_torch.types import MIN_INTERVAL, FramePose, TrackingStatus
 
 MAX_EXTRAPOLATION = 0.2
 """Maximum time over which a velocity is extrapolated, seconds: a handheld camera changes its motion within that time. A

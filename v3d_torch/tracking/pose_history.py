@@ -51,6 +51,7 @@ class PoseHistory:
         self._entries: list[PoseEntry] = []
         self.last_localised = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
+        self._place: Keyframe | None = None  # nearest to the last frame that was found
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -80,6 +81,11 @@ class PoseHistory:
     def keyframe(self) -> Keyframe | None:
         """Keyframe to which the pose of the last frame is relative; None if there is none."""
         return self._entries[-1].keyframe if self._entries else None
+
+    @property
+    def part(self) -> int:
+        """ID of the part of the map in which the camera was last found, see `Keyframe`; 0 if it was not found."""
+        return 0 if self._place is None else self._place.part
 
     @property
     def has_motion(self) -> bool:
@@ -122,14 +128,14 @@ class PoseHistory:
         if new is None:
             entry = PoseEntry(stamp, status, reference, _relative(pose.T_cw, reference), motion.is_measured)
             if pose.count:
-                self.observed_landmarks = pose.observed_landmarks
+                self.observed_landmarks, self._place = pose.observed_landmarks, reference
         else:
             if new.disconnected:
                 status = TrackingStatus.DISCONNECTED
             elif status is TrackingStatus.LOST:
                 status = TrackingStatus.TRACKED  # the first keyframe of the map
             entry = PoseEntry(stamp, status, new, torch.eye(4, dtype=torch.float64), motion.is_measured)
-            self.observed_landmarks = new.observed_landmarks
+            self.observed_landmarks, self._place = new.observed_landmarks, new
         self._entries.append(entry)
         if status is not TrackingStatus.LOST:
             self.last_localised = stamp
@@ -167,12 +173,13 @@ class PoseHistory:
             "entries": self._entries,
             "last_localised": self.last_localised,
             "observed_landmarks": self.observed_landmarks,
+            "place": self._place,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
         self._entries, self.last_localised = list(state["entries"]), state["last_localised"]
-        self.observed_landmarks = state["observed_landmarks"]
+        self.observed_landmarks, self._place = state["observed_landmarks"], state["place"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""
