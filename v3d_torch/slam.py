@@ -73,9 +73,9 @@ class V3DSLAM(ReplaceableStages):
 
     Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
     signature; the results of the replacement are checked. `estimate_motion`, `track_map` and `loop_closer` are also
-    used inside other stages, which keep their own references to the original. `preprocess` runs
-    the stages that depend only on the frame, and can run ahead of `track`. Hooks see the
-    arguments and results of stages, see `register_stage_hook`.
+    used inside other stages, which keep their own references to the original. `preprocess` runs the stages that depend
+    only on the frame, and can run ahead of `track`. Hooks see the arguments and results of stages, see
+    `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.

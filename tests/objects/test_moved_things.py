@@ -18,7 +18,7 @@ from v3d_torch.types import Instances, RGBDFrame
 
 CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0, readout=0.0)
 RATE = 10
-FRAMES = range(6, 30)
+FRAMES = range(1, 30)  # the longer baseline of the free-space check is reached before the box is carried
 BOX, STILL_CHAIR = 3, 9
 
 
@@ -57,7 +57,7 @@ def box_of(mask: Tensor) -> list[float]:
 
 def test_box_without_a_class_is_left_out_while_it_is_carried(masked: dict[int, dict[int, float]]) -> None:
     carried = [fraction for number, fraction in masked[BOX].items() if 1.0 <= number / RATE < PUT_DOWN]
-    assert min(carried) > 0.4
+    assert min(carried) > 0.7
 
 
 def test_box_that_is_put_down_is_static_within_a_second(masked: dict[int, dict[int, float]]) -> None:

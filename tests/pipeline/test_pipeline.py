@@ -74,6 +74,7 @@ def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> N
 def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
     no_margins = [
         *("objects.clouds.stride=1", "objects.static_mask.depth_margin=0", "objects.static_mask.dilation=0"),
+        "objects.static_mask.surface_margin=0",
         "objects.free_space.enabled=false",
     ]
     config = load_config(overrides=[*no_margins, "objects.static_mask.confirm_static_time=100"])
