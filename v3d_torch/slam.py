@@ -305,10 +305,7 @@ class V3DSLAM(ReplaceableStages):
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
-            part = self.poses.part
             keyframe = self._extend_map(frame, static, pose, motion, view)
-            if self.poses.part != part:  # the pose relative to the stored views is a guess
-                self.free_space_check.drop_views()
             has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
@@ -433,8 +430,11 @@ class V3DSLAM(ReplaceableStages):
         keyframe = self.mapper(frame, features, pose, reference)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
         self._apply_world_correction(T_new_old)
+        is_elsewhere = self.poses.part != part
+        if is_elsewhere:  # the pose relative to the stored views is a guess
+            self.free_space_check.drop_views()
         if pose.status is not TrackingStatus.LOST and T_new_old is None:
-            self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ view.T_cw, all_tracks=self.poses.part != part)
+            self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ view.T_cw, all_tracks=is_elsewhere)
         self._update_gravity(frame, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)
