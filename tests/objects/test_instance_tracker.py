@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.track import Track
@@ -513,6 +513,23 @@ def test_detections_are_bounded_by_the_history() -> None:
     assert len(track.detections) == 31
     assert track.newest.stamp - track.detections[0].stamp == pytest.approx(1.0)
     assert track.first_stamp == 0.0
+
+
+@pytest.mark.parametrize("all_tracks", [False, True])
+def test_end_of_a_guess_moves_what_was_seen_since_or_all(all_tracks: bool) -> None:
+    track_boards, offset = BoardTracker(), HERE.clone()
+    offset[0, 3] = 0.3
+    for frame in range(8):
+        if frame == 5:
+            track_boards.tracker.start_guess(frame / 30)
+        depth, instances = render([Board(0.0)], HERE)
+        (track,) = track_boards.track(depth, instances, frame / 30, T_wc=offset if frame >= 5 else HERE)
+    track_boards.tracker.end_guess(invert(offset), all_tracks=all_tracks)
+    places = [round(float(detection.centroid[0]), 2) for detection in track.detections]
+    assert places == (5 * [-0.3] + 3 * [0.0] if all_tracks else 8 * [0.0])
+    track_boards.tracker.end_guess(offset)  # no guess any more
+    assert [round(float(detection.centroid[0]), 2) for detection in track.detections] == places
+    assert all_tracks or float(track.velocity.norm()) < 0.05
 
 
 @settings(max_examples=10, deadline=None)

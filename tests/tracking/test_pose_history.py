@@ -14,6 +14,8 @@ from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.types import TrackingStatus
 
+TRACKED, ODOMETRY, LOST = TrackingStatus.TRACKED, TrackingStatus.ODOMETRY, TrackingStatus.LOST
+
 # --- lost frames
 
 
@@ -54,6 +56,27 @@ def test_interpolated_rotations_equal_scipy() -> None:
         camera.append(stamp, frame_pose(T_cw, TrackingStatus.LOST if index in (1, 2) else TrackingStatus.TRACKED), None)
     R_cw = camera.trajectory().T_wc[:, :3, :3].mT.numpy()
     np.testing.assert_allclose(R_cw, Slerp([0.0, 1.0], ends)(stamps).as_matrix(), atol=1e-9)
+
+
+def test_part_is_that_in_which_the_camera_was_last_found() -> None:
+    camera, parts = Camera(), []
+    start, other = keyframe(), keyframe(part=1)
+    assert camera.poses.part == 0
+    for index, (place, status, landmarks) in enumerate(
+        [
+            (start, TRACKED, (0, 1)),
+            (other, LOST, ()),
+            (other, TRACKED, (2,)),
+            (start, ODOMETRY, ()),
+            (start, TRACKED, (1,)),
+        ]
+    ):
+        camera.append(0.1 * index, frame_pose(EYE, status, landmarks), place)
+        parts.append(camera.poses.part)
+    assert parts == [0, 0, 1, 1, 0]
+    camera.append(0.5, frame_pose(EYE, TRACKED, (2,)), other)
+    other.part = 0  # a loop joins the parts
+    assert camera.poses.part == 0
 
 
 def test_lost_frames_at_the_ends_keep_their_prediction() -> None:
