@@ -17,13 +17,15 @@ from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.occupancy.up_direction import estimate_up
+from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runs.state import STATE_CLASSES
 from v3d_torch.tracking.pose_history import PoseEntry, PoseHistory
-from v3d_torch.types import TrackingStatus
+from v3d_torch.types import FramePose, TrackingStatus
 
 CONFIG = OccupancyConfig(interval=1)
 ALL = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
 POSES = looking_around(36)
+HERE = torch.eye(4, dtype=torch.float64)
 SHIFT = se3_exp(torch.tensor([0.2, 0.0, 0.1, 0.0, 0.1, 0.0], dtype=torch.float64))
 
 
@@ -41,7 +43,7 @@ class Drive:
         last_localised = self.entries[-1].stamp if self.entries else -torch.inf
         observed = torch.zeros(0, dtype=torch.int64)
         history.load_state_dict(
-            {"entries": self.entries, "last_localised": last_localised, "observed_landmarks": observed}
+            {"entries": self.entries, "last_localised": last_localised, "observed_landmarks": observed, "place": None}
         )
         return history
 
@@ -126,6 +128,25 @@ def test_correction_during_a_rebuild_is_applied_afterwards() -> None:
     truth.correct()
     truth.add(0, 32)
     assert same_map(drive.mapper.map, truth.mapper.map)
+
+
+def test_places_of_removed_views_stay_in_the_map_after_a_correction() -> None:
+    mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 20}), CAMERA)
+    start, poses = keyframe(HERE), PoseHistory()
+    motion = CameraMotion(HERE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), True)
+    for index in range(40):  # along a wall
+        T_cw = HERE.clone()
+        T_cw[0, 3] = -0.6 * index
+        poses.append(index / 30, FramePose(TrackingStatus.TRACKED, T_cw, torch.zeros(1).long()), motion, start, None)
+        mapper(torch.full((1, CAMERA.height, CAMERA.width), 2.0), ALL, poses)
+    assert len(mapper._store) <= 20
+    before = mapper.map.occupied_points[:, 0]
+    start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.0, 0.04, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    mapper.correct(poses)
+    after = mapper.map.occupied_points[:, 0]
+    assert float(before.max() - before.min()) > 24
+    assert abs(float(after.min() - before.min())) < 0.1 and abs(float(after.max() - before.max())) < 0.1
+    assert len(after.div(0.4).floor().unique()) == len(before.div(0.4).floor().unique())  # without gaps
 
 
 def test_number_of_stored_views_is_bounded_also_during_a_rebuild() -> None:

@@ -40,6 +40,8 @@ class ViewStore:
         frames: Position of each view's frame in the pose history.
         T_cw: World-to-camera pose with which each view was added to the occupancy map, float64, shape
             :math:`(N, 4, 4)`.
+        has_removed_far: True if views were removed because they were far from the camera, so that the other views do
+            not show all places.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -47,6 +49,7 @@ class ViewStore:
         self.views: list[RangeView] = []
         self.frames: list[int] = []
         self.T_cw = torch.zeros(0, 4, 4, dtype=torch.float64)
+        self.has_removed_far = False
 
     def __len__(self) -> int:
         return len(self.views)
@@ -81,6 +84,7 @@ class ViewStore:
             order = torch.nonzero(kept)[:, 0]
             order = order[(centres[order] - centres[-1]).norm(dim=1).argsort(stable=True)]
             kept[order[limit:]] = False
+            self.has_removed_far = True
             _LOG.warning("occupancy map: the %d views farthest from the camera were removed", len(order) - limit)
         self.T_cw = self.T_cw[kept]
         self.views = [view for view, keep in zip(self.views, kept.tolist(), strict=True) if keep]
@@ -89,11 +93,13 @@ class ViewStore:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the views."""
-        return {"views": self.views, "frames": self.frames, "T_cw": self.T_cw}
+        own = {"views": self.views, "frames": self.frames, "T_cw": self.T_cw}
+        return {**own, "has_removed_far": self.has_removed_far}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the views of `state_dict`."""
         self.views, self.frames, self.T_cw = list(state["views"]), list(state["frames"]), state["T_cw"]
+        self.has_removed_far = state["has_removed_far"]
 
     def _newest_per_cell(self, side: float) -> Tensor:
         """Mask of the newest view in each cell of poses, bool, (N,)."""

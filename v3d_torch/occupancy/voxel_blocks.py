@@ -94,6 +94,14 @@ class VoxelBlocks:
         """Remove all blocks except those in a bool mask; the others keep their order."""
         self.load_state_dict({"coordinates": self.coordinates[mask], "log_odds": self.log_odds[mask]})
 
+    def add_missing(self, other: VoxelBlocks) -> None:
+        """Add the blocks of another grid that do not exist in this one."""
+        missing = self.find(other.coordinates) < 0
+        if bool(missing.any()):
+            first = len(self)
+            self._append(other.coordinates[missing])
+            self._log_odds[first : len(self)] = other.log_odds[missing]
+
     def voxels_where(self, mask: Tensor) -> Tensor:
         """Coordinates of voxels.
 
