@@ -23,7 +23,7 @@ COUNT = 12
 @pytest.fixture(autouse=True)
 def no_intrinsics(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the calibration by the map."""
-    monkeypatch.setattr(camera_calibration, "SelfCalibration", lambda *_: None)
+    monkeypatch.setattr(camera_calibration, "SelfCalibration", lambda *_, **__: None)
     monkeypatch.setattr(camera_calibration, "ParameterSelection", lambda _: SimpleNamespace(estimates=()))
     monkeypatch.setattr(camera_calibration, "better_focal_lengths", lambda _, camera, __: (camera.fx, camera.fy))
 

@@ -36,6 +36,10 @@ _MIN_VIEWS = 5
 _SIGNIFICANCE = 3.0
 """Number of standard deviations by which focal lengths must differ from those of a run to be those of the next."""
 
+_MAX_KEYFRAMES, _MAX_VIEWS = 200, 300
+"""Maximum number of keyframes, the newest, and of views, evenly spread: memory grows with keyframes times landmarks,
+and more of them hardly make the estimates more accurate."""
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -79,7 +83,7 @@ def calibrate_camera(
         config: Configuration of the run.
     """
     estimates = [
-        *ParameterSelection(SelfCalibration(tables, camera, config, given)).estimates,
+        *ParameterSelection(SelfCalibration(tables, camera, config, given, max_keyframes=_MAX_KEYFRAMES)).estimates,
         _estimate_delay(views, trajectory, camera, given),
         *_estimate_scale(groundtruth, trajectory, camera, given),
     ]
@@ -102,7 +106,7 @@ def _estimate_delay(
     views: StaticViews, trajectory: Trajectory, camera: PinholeCamera, given: PinholeCamera
 ) -> Estimate:
     """Estimate the delay of depth from occlusion boundaries and edges of the colour images."""
-    alignment = EdgeAlignment(views, trajectory, camera.depth_delay)
+    alignment = EdgeAlignment(views, trajectory, camera.depth_delay, max_views=_MAX_VIEWS)
     value, sigma = math.nan, math.inf
     if len(alignment) >= _MIN_VIEWS:
         starts = alignment.search(), torch.zeros(3, dtype=torch.float64)
