@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 import os
 import runpy
 import subprocess
@@ -114,6 +115,22 @@ def test_code_is_kept_in_a_private_folder(
     folder = compiler._code_folder.__wrapped__()  # without the folder found earlier
     assert folder.is_relative_to(parent.format(tmp_path)) and folder.is_dir()
     assert folder.stat().st_mode & 0o022 == 0
+
+
+@needs_numba
+@pytest.mark.parametrize("cache", ["{}/cache", "{}/file/cache"], ids=["cache folder", "temporary folder"])
+def test_user_without_a_name_has_a_folder(tmp_path: Path, cache: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with the user id of another machine in a container."""
+
+    def no_name() -> str:
+        raise KeyError("getpwuid(): uid not found: 1000")
+
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(getpass, "getuser", no_name)
+    monkeypatch.delenv("NUMBA_CACHE_DIR")  # of the tests
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setenv("V3D_CACHE", cache.format(tmp_path))
+    assert compiler._code_folder.__wrapped__().is_relative_to(tmp_path)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import importlib.util
 import os
@@ -217,12 +216,14 @@ def _code_folder() -> Path:
     files = sorted(Path(__file__).parent.glob("*.py"))
     version = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    # Without a cache folder, as in a container with a read-only home, use the system's temporary folder.
-    temporary = Path(tempfile.gettempdir()) / f"v3d_torch-{getpass.getuser()}"
-    for parent in (Path(chosen) if chosen else cache_dir() / "kernels", temporary / "kernels"):
-        if _make_private(parent / version):
-            return parent / version
-    return Path(tempfile.mkdtemp(prefix="v3d_torch-"))
+    folder = (Path(chosen) if chosen else cache_dir() / "kernels") / version
+    if _make_private(folder):
+        return folder
+    # Without a cache folder, as in a container with a read-only home, use the system's temporary folder. A container's
+    # user may have no name, and Windows has a temporary folder for each user.
+    owner = f"v3d_torch-{os.getuid()}" if hasattr(os, "getuid") else "v3d_torch"
+    folder = Path(tempfile.gettempdir()) / owner / "kernels" / version
+    return folder if _make_private(folder) else Path(tempfile.mkdtemp(prefix="v3d_torch-"))
 
 
 def _make_private(folder: Path) -> bool:
