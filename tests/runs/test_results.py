@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import math
 from dataclasses import replace
@@ -23,7 +24,9 @@ from v3d_torch.evaluation import evaluate
 from v3d_torch.occupancy.occupancy_io import load_occupancy
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.runs.results import write_results
+from v3d_torch.runs import results as results_module
+from v3d_torch.runs.metrics_file import read_metrics
+from v3d_torch.runs.results import write_intermediate_results, write_results
 from v3d_torch.runs.run import describe_readout
 
 
@@ -84,6 +87,21 @@ def test_metrics_have_the_documented_keys(results: Path, run: Pipeline) -> None:
     assert 50 < metrics["peak_memory_mb"] < 20_000
     assert metrics["seed"] == 0 and metrics["versions"]["torch"] == torch.__version__
     assert max(metrics["seconds_per_stage"].values()) <= metrics["seconds"]  # stages overlap
+
+
+def test_library_of_another_distribution_has_no_version(
+    run: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with onnxruntime-gpu instead of onnxruntime."""
+
+    def version_of(distribution: str) -> str:
+        return importlib.metadata.version("absent" if distribution == "onnxruntime" else distribution)
+
+    monkeypatch.setattr(results_module, "version", version_of)
+    monkeypatch.setattr(results_module, "_versions", results_module._versions.__wrapped__)
+    write_intermediate_results(tmp_path, run)
+    versions = read_metrics(tmp_path / "metrics.json").versions
+    assert versions["onnxruntime"] is None and versions["torch"] == torch.__version__
 
 
 def test_frame_table_has_status_keyframe_and_stage_times(results: Path, run: Pipeline) -> None:

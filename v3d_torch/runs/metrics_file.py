@@ -41,7 +41,7 @@ class Metrics(BaseModel):
     peak_memory_mb: float | None
     seed: int
     masks: dict[str, Any] | None = None
-    versions: dict[str, str]
+    versions: dict[str, str | None]
     machine: dict[str, Any]
 
 

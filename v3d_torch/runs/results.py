@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sized
 from contextlib import suppress
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import pyarrow as pa
@@ -223,13 +223,17 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
 
 
 @cache
-def _versions() -> dict[str, str]:
-    """Return the versions of the package, of Python and of the libraries."""
-    return {
-        "v3d-torch": version("v3d-torch"),
-        "python": platform.python_version(),
-        **{name: version(name) for name in _LIBRARIES},
-    }
+def _versions() -> dict[str, str | None]:
+    """Return the versions of the package, of Python and of the libraries; None for those that are not installed."""
+    python = platform.python_version()
+    return {"v3d-torch": _version("v3d-torch"), "python": python, **{name: _version(name) for name in _LIBRARIES}}
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:  # another distribution has the same module, as onnxruntime-gpu
+        return None
 
 
 def _peak_memory_mb() -> float | None:
