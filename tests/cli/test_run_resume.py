@@ -24,10 +24,14 @@ from typer.testing import CliRunner, Result
 
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
-from v3d_torch.cli import run
+from v3d_torch.cli import run, run_command
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets import load_sequence
+from v3d_torch.errors import OutputError
 from v3d_torch.io.state_file import VERSION
+from v3d_torch.mapping.map_io import load_map
+from v3d_torch.pipeline import ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT
 from v3d_torch.runs.stored_run import read_run
 
@@ -198,16 +202,35 @@ def test_interrupted_run_keeps_an_earlier_map_file_until_it_is_resumed(
     room.write_bytes(b"the map of yesterday")
     done = interrupt_run(sequence, out, 4, "--save-map", str(room))
     assert_error_line(done, f"interrupted after 5 of {FRAMES} frames", f"; resume with --resume {out})")
-    assert f"warning: {room}: was not overwritten, because the run ended early\n" in done.stdout
+    beside = tmp_path / "room.partial.map"
+    warning = f"warning: {room}: was not overwritten, because the run ended early; its map is saved to {beside}\n"
+    assert warning in done.stdout
     assert room.read_bytes() == b"the map of yesterday"
+    assert load_map(beside, load_sequence(str(sequence)).camera, Config()).map.active_keyframes
     done = call("--resume", out)
     assert done.exit_code == 0 and "was not overwritten" not in done.stdout, done.stderr
     assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
 
 
-def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
-    sequence: Path, whole_run: Path, tmp_path: Path
+def test_viewer_that_fails_after_the_last_frame_does_not_keep_the_map_from_being_saved(
+    sequence: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def fail(*_: object) -> None:
+        raise OutputError("demo.rrd: cannot be written")
+
+    room = tmp_path / "room.map"
+    room.write_bytes(b"the map of yesterday")
+    monkeypatch.setattr(ViewerGroup, "finish", fail)
+    assert_error_line(call(*run_arguments(sequence, tmp_path / "out", "--save-map", str(room))), "demo.rrd: cannot be")
+    assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
+
+
+@pytest.mark.parametrize("options", [CHECKPOINT_EVERY_FRAME, ()], ids=["with checkpoints", "too short for checkpoints"])
+def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
+    sequence: Path, whole_run: Path, tmp_path: Path, options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    differences: list[str | None] = []
+    monkeypatch.setattr(run_command, "make_paper_table", lambda _, __, difference: differences.append(difference))
     out, room = tmp_path / "out", tmp_path / "maps" / "room.map"
 
     def remove_folder() -> None:
@@ -215,9 +238,8 @@ def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
         room.parent.write_text("")
 
     with at_frame(10, remove_folder):
-        done = call(
-            *run_arguments(sequence, out, "--save-masks", "--serial", "--save-map", str(room), *CHECKPOINT_EVERY_FRAME)
-        )
+        done = call(*run_arguments(sequence, out, "--save-masks", "--serial", "--save-map", str(room), *options))
+    assert differences == [None]  # not a part of the sequence
     assert_error_line(done, f"{room}: cannot be written", f"frames before are in {out}; resume with --resume {out})")
     assert "ATE rmse" in done.stdout
     assert (out / "map.ply").read_bytes() == (whole_run / "map.ply").read_bytes()
@@ -478,7 +500,6 @@ def test_run_in_loaded_map_resumes_without_the_map_file(sequence: Path, whole_ru
 
 
 def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
-    from v3d_torch.datasets import load_sequence
     from v3d_torch.pipeline import Pipeline
     from v3d_torch.runs.checkpoint import write_checkpoint
     from v3d_torch.runs.request import RunRequest

@@ -216,7 +216,7 @@ def _print_summary(
     record = pipeline.record
     difference = describe_difference(pipeline.sequence)
     console.print(_summary_table(pipeline, evaluation, difference))
-    if record.failure is not None:
+    if record.failure is not None and len(pipeline.slam.poses) + len(record.broken) < pipeline.frame_count:
         difference = difference or f"part: {len(pipeline.slam.poses)} of {pipeline.frame_count} frames"
     paper = None if evaluation is None else make_paper_table(pipeline.sequence.name, evaluation, difference)
     if paper is not None:

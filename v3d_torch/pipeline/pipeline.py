@@ -223,7 +223,7 @@ class Pipeline:
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
-        self._warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
+        self.warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
         trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
@@ -233,6 +233,13 @@ class Pipeline:
         except V3DError as error:
             self.record.failure = self.record.failure or str(error)
         return point_map
+
+    def warn(self, warnings: Iterable[str]) -> None:
+        """Log and record warnings; a resumed run may have recorded them already."""
+        for warning in warnings:
+            _LOG.warning(warning)
+            if warning not in self.record.warnings:
+                self.record.warnings.append(warning)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the run between two frames: system, records and views."""
@@ -304,14 +311,8 @@ class Pipeline:
     def _check_plausibility(self) -> None:
         """Check whether camera and depth agree with the map so far, and record contradictions."""
         slam, sizes = self.slam, self.record.people_sizes
-        self._warn(check_plausibility(slam.map, self.views, sizes, slam.poses.trajectory(), slam.camera, slam.config))
+        self.warn(check_plausibility(slam.map, self.views, sizes, slam.poses.trajectory(), slam.camera, slam.config))
         self.record.was_checked = True
-
-    def _warn(self, warnings: Iterable[str]) -> None:
-        """Log and record warnings."""
-        for warning in warnings:
-            _LOG.warning(warning)
-            self.record.warnings.append(warning)
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
         """Keep the most dynamic frame, and frames at equal intervals, which increase during a live stream."""

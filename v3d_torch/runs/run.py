@@ -98,7 +98,7 @@ class Run:
 
         Returns:
             The scores, if there is ground truth. If the run ended early, or the map file cannot be written,
-            ``pipeline.record.failure`` is the reason, and the checkpoint stays.
+            ``pipeline.record.failure`` is the reason, and the last checkpoint stays.
 
         Raises:
             OutputError: If the results cannot be written.
@@ -106,7 +106,7 @@ class Run:
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
         if isinstance(sequence, ImageSequence) and sequence.depth_scale_note is not None:
-            self._warn(sequence.depth_scale_note)
+            self.pipeline.warn([sequence.depth_scale_note])
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"
@@ -115,6 +115,7 @@ class Run:
             on_frame(frame, result)
 
         record = self.pipeline(log_and_save)
+        is_whole = record.failure is None  # also if a viewer cannot write its file afterwards
         self._autosave.end()
         point_map = self.pipeline.flush()
         slam = self.pipeline.slam
@@ -122,31 +123,30 @@ class Run:
         from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
 
         if self._map_file is not None:
-            self._save_map(self._map_file)
+            self._save_map(self._map_file, is_whole=is_whole)
         evaluation = write_results(self._folder, self.pipeline, point_map)
         self._autosave.discard()
         if record.failure:
             _LOG.error(record.failure)
         return evaluation
 
-    def _save_map(self, path: Path) -> None:
-        """Write the map file, unless the map of an earlier run would be replaced by a part of a map."""
-        record, sparse_map = self.pipeline.record, self.pipeline.slam.map
-        if path.exists() and record.failure is not None:
-            self._warn(f"{path}: was not overwritten, because the run ended early")
-        elif path.exists() and not sparse_map.active_keyframes:
-            self._warn(f"{path}: was not overwritten, because the map of this run has no keyframes")
-        else:
-            try:
-                save_map(path, sparse_map, self.pipeline.views)
-            except OutputError as error:  # the other results are written nevertheless
-                record.failure = record.failure or str(error)
-
-    def _warn(self, warning: str) -> None:
-        """Log and record a warning; a resumed run has recorded it already."""
-        _LOG.warning(warning)
-        if warning not in self.pipeline.record.warnings:
-            self.pipeline.record.warnings.append(warning)
+    def _save_map(self, path: Path, *, is_whole: bool) -> None:
+        """Write the map file; a part of a map is written beside a map file that exists, and does not replace it."""
+        pipeline, target = self.pipeline, path
+        if path.exists() and not pipeline.slam.map.active_keyframes:
+            pipeline.warn([f"{path}: was not overwritten, because the map of this run has no keyframes"])
+            return
+        if path.exists() and not is_whole:
+            target = path.with_name(f"{path.stem}.partial{path.suffix}")
+            pipeline.warn([f"{path}: was not overwritten, because the run ended early; its map is saved to {target}"])
+        try:
+            save_map(target, pipeline.slam.map, pipeline.views)
+        except OutputError as error:  # the other results are written nevertheless
+            if is_whole:
+                pipeline.record.failure = pipeline.record.failure or str(error)
+                self._autosave.end()  # a short run has no checkpoint yet, from which the map can be saved again
+            else:
+                pipeline.warn([str(error)])
 
 
 def describe_readout(readout: Readout, expected: RollingShutterConfig) -> str:
