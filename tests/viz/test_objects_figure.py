@@ -70,6 +70,16 @@ def test_objects_of_few_frames_are_not_drawn() -> None:
     assert draw(table_of((1, MotionState.STATIC), frames=4)) == []
 
 
+def test_only_the_most_important_of_many_objects_have_a_name() -> None:
+    """Those that moved, then those with the most frames."""
+    table = table_of(*((number, MotionState.STATIC) for number in range(1, 200)), (200, MotionState.DYNAMIC))
+    image = torch.zeros(3, 2, 2, dtype=torch.uint8)
+    longest = FrameObjects([object_at(0.8, 150, 150, MotionState.STATIC)], MASK, MASK, [])
+    table.append_objects(RGBDFrame(8, 0.8, image, torch.ones(1, 2, 2)), longest, UP)
+    names = [text for text in draw(table) if text]
+    assert names == [*(f"person {number}" for number in range(1, 49)), "person 150", "person 200"]
+
+
 def test_outline_encloses_the_cube_from_above() -> None:
     """Level frame: x is forward (world z), y is left (minus world x)."""
     outline = box_outline(table_of((2, MotionState.STATIC))["box"][0], level_frame(UP)[:3, :3])

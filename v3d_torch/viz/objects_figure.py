@@ -29,14 +29,20 @@ _MAX_POINTS = 60_000
 _MIN_FRAMES = 5
 """Objects of fewer frames are not drawn: most are false detections."""
 
+_MAX_NAMES = 50
+"""Number of objects with a name: more names hide the figure, and the time to separate them increases with the square of
+their number."""
+
 _STATES = tuple(MotionState)
+_MOVING = torch.tensor([_STATES.index(state) for state in (MotionState.DYNAMIC, MotionState.DEFORMING)])
 
 
 def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, up: Tensor, title: str = "") -> Figure:
     """Draw the objects of a run from above, in the level frame.
 
     A line is the path of an object, in the colour of its motion state in each frame. Its last box is outlined, with its
-    name, and an arrow to where it would be a second later if it is dynamic. Static points of the map are grey.
+    name, and an arrow to where it would be a second later if it is dynamic. Static points of the map are grey. If there
+    are many objects, only some have a name: those that were dynamic or deforming, then those with the most frames.
 
     Args:
         objects: Objects of all frames.
@@ -54,9 +60,10 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     axes.scatter(x, y, s=0.3, color="#c8c8c8", linewidths=0, rasterized=True)
     x, y, _ = (trajectory.T_wc[:, :3, 3] @ R_lw.T).T.numpy()
     axes.plot(x, y, color="tab:blue", linewidth=1.2, label="camera path")
-    ids, counts = np.unique(objects["id"].numpy(), return_counts=True)
-    for number in ids[counts >= _MIN_FRAMES].tolist():
-        _draw_object(axes, objects, objects["id"].numpy() == number, R_lw)
+    rows = _rows_of_objects(objects)
+    named = set(_select_names(objects, rows))
+    for number in rows:
+        _draw_object(axes, objects, rows[number], R_lw, with_name=number in named)
     for state, colour in MOTION_STATE_COLOURS.items():
         axes.plot([], [], color=colour, label=state)
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
@@ -65,6 +72,21 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     axes.set_title(title, parse_math=False)  # the name of a folder may contain dollar signs
     _separate_names(figure, axes)
     return figure
+
+
+def _rows_of_objects(objects: ObjectTable) -> dict[int, Tensor]:
+    """Return the rows of each object that is drawn, in the order of the frames, by id."""
+    order = objects["id"].argsort(stable=True)
+    ids, counts = objects["id"][order].unique_consecutive(return_counts=True)
+    rows = dict(zip(ids.tolist(), order.split(counts.tolist()), strict=True))
+    return {number: own for number, own in rows.items() if len(own) >= _MIN_FRAMES}
+
+
+def _select_names(objects: ObjectTable, rows: dict[int, Tensor]) -> list[int]:
+    """Return the ids of the objects with a name."""
+    is_moving = torch.isin(objects["motion_state"], _MOVING)
+    rank = {number: (not is_moving[own].any(), -len(own), number) for number, own in rows.items()}
+    return sorted(rows, key=rank.__getitem__)[:_MAX_NAMES]
 
 
 def _separate_names(figure: Figure, axes: Axes) -> None:
@@ -81,8 +103,8 @@ def _separate_names(figure: Figure, axes: Axes) -> None:
         name.set_position((x, y))
 
 
-def _draw_object(axes: Axes, objects: ObjectTable, rows: NDArray[np.bool_], R_lw: Tensor) -> None:
-    """Draw path, last box and velocity of one object."""
+def _draw_object(axes: Axes, objects: ObjectTable, rows: Tensor, R_lw: Tensor, *, with_name: bool) -> None:
+    """Draw path, last box and velocity of the object of some rows."""
     centroid = (objects["centroid"][rows] @ R_lw.T)[:, :2].numpy()
     colours = [MOTION_STATE_COLOURS[_STATES[code].value] for code in objects["motion_state"][rows].tolist()]
     segments = np.stack([centroid[:-1], centroid[1:]], axis=1)
@@ -92,10 +114,11 @@ def _draw_object(axes: Axes, objects: ObjectTable, rows: NDArray[np.bool_], R_lw
     if not len(known):
         return
     last = int(known[-1])
-    name = f"{class_name(int(objects['label'][rows][last]))} {int(objects['id'][rows][last])}"
     outline = box_outline(box[last], R_lw)
     axes.plot(*outline.T, color=colours[last], linewidth=1.0)
-    axes.annotate(name, outline.max(axis=0), fontsize=6, color=colours[last])
+    if with_name:
+        name = f"{class_name(int(objects['label'][rows][last]))} {int(objects['id'][rows][last])}"
+        axes.annotate(name, outline.max(axis=0), fontsize=6, color=colours[last])
     if colours[last] == MOTION_STATE_COLOURS["dynamic"]:
         x, y = (R_lw @ objects["velocity"][rows][last])[:2].tolist()
         arrow = {"arrowstyle": "->", "color": colours[last]}
