@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
+from v3d_torch.io.image_file import read_image
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.viz.figure_output import embed_image, embed_svg
 from v3d_torch.viz.object_timelines import ObjectRow, draw_object_timelines
@@ -134,7 +135,7 @@ def _tracking_plots(run: StoredRun) -> dict[str, str]:
 
 
 def _masked_fraction(path: Path) -> float:
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    mask = read_image(path, cv2.IMREAD_GRAYSCALE)
     if mask is None:
         raise InputError(f"{path}: is truncated or not an image; delete it, or run the sequence again")
     return float((mask > 0).mean())

@@ -16,6 +16,7 @@ from v3d_torch.datasets.open_source import is_live
 from v3d_torch.errors import InputError
 from v3d_torch.export.posed_image import PosedImage
 from v3d_torch.io.download import Progress
+from v3d_torch.io.image_file import read_image
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
@@ -148,7 +149,7 @@ def _read_frames(source: RGBDStream, indices: Sequence[int]) -> Iterator[RGBDFra
 
 def _read_mask(path: Path, size: torch.Size) -> Tensor:
     """Read the static pixels of a frame, bool, shape (H, W)."""
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    mask = read_image(path, cv2.IMREAD_GRAYSCALE)
     if mask is None or mask.shape != size:
         raise InputError(f"{path}: is missing, damaged or of another size; run the sequence again with --save-masks")
     return torch.from_numpy(mask == 0)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import atomic_write
+from v3d_torch.io.image_file import read_image
 
 _WEBP_QUALITY = 88
 """Quality of embedded images, 0 to 100: high enough to keep small text sharp."""
@@ -74,7 +75,7 @@ def embed_image(path: Path) -> str:
     Raises:
         InputError: If the file is not an image.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = read_image(path, cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path}: is truncated or not an image; delete it, or run the sequence again")
     encoded = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])[1]

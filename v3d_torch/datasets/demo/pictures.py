@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from v3d_torch.datasets.demo.materials import Colour, Texture, fractal_noise, texels, tint
 from v3d_torch.errors import InputError
+from v3d_torch.io.image_file import read_image
 
 _ASSETS = Path(__file__).parents[1] / "assets"
 _COVER_COLOURS = np.asarray(
@@ -32,7 +33,7 @@ def load_photograph(name: str) -> NDArray[np.float32]:
     Raises:
         InputError: If the file is missing or damaged.
     """
-    image = cv2.imread(str(_ASSETS / name), cv2.IMREAD_UNCHANGED)
+    image = read_image(_ASSETS / name, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(f"{_ASSETS / name}: photograph of the demo cannot be read; install the package again")
     order = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
