@@ -501,7 +501,7 @@ def test_run_in_loaded_map_resumes_without_the_map_file(sequence: Path, whole_ru
 
 def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
     from v3d_torch.pipeline import Pipeline
-    from v3d_torch.runs.checkpoint import write_checkpoint
+    from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
     from v3d_torch.runs.request import RunRequest
     from v3d_torch.segmentation import NoSegmentation
     from v3d_torch.slam import V3DSLAM
@@ -516,7 +516,7 @@ def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
 
     pipeline = Pipeline(Live(), V3DSLAM(frames.camera, NoSegmentation()))  # type: ignore[arg-type]
     assert pipeline().failure is None
-    write_checkpoint(tmp_path, pipeline, RunRequest("realsense:", Config()))
+    write_checkpoint(tmp_path, pipeline, RunRequest("realsense:", Config()), FileSizes(pipeline.sequence))
     assert_error_line(
         call("--resume", tmp_path),
         f"{tmp_path}: the run of a live stream (realsense:) cannot be resumed; its results so far are in",

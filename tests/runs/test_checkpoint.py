@@ -11,7 +11,9 @@ from helpers.walk_run import CONFIG, Walk, interrupt_after, make_pipeline
 
 from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.runs.checkpoint import describe_change, read_checkpoint, write_checkpoint
+from v3d_torch.runs import checkpoint as checkpoint_module
+from v3d_torch.runs.autosave import Autosave
+from v3d_torch.runs.checkpoint import FileSizes, describe_change, read_checkpoint, write_checkpoint
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.segmentation.segmenter import segmenter_state_of
@@ -56,7 +58,7 @@ def test_run_resumed_many_times_equals_an_uninterrupted_run(uninterrupted: Pipel
         record = pipeline(interrupt_after(stop))
         assert record.failure == f"interrupted after {stop + 1} of {len(Walk())} frames"
         assert pipeline.between_frames
-        write_checkpoint(tmp_path, pipeline, request)
+        write_checkpoint(tmp_path, pipeline, request, FileSizes(pipeline.sequence))
         checkpoint = read_checkpoint(tmp_path)
         assert (checkpoint.frames, checkpoint.request.config) == (stop + 1, pipeline.slam.config)
         assert checkpoint.request == request.absolute() and checkpoint.request.save_masks
@@ -72,3 +74,22 @@ def test_run_resumed_many_times_equals_an_uninterrupted_run(uninterrupted: Pipel
     # The database of loop closing is rebuilt and gives the same candidates.
     query = expected.map.keyframes[3].features.descriptors
     assert slam.loop_closer._database.query(query, 9) == expected.loop_closer._database.query(query, 9)
+
+
+def test_next_checkpoint_reads_the_sizes_of_new_files_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[int]()
+    there, missing = tmp_path / "there.png", tmp_path / "missing.png"
+    there.write_bytes(b"123")
+
+    def files(_: object, index: int) -> tuple[Path, ...]:
+        asked.append(index)
+        return there, missing
+
+    monkeypatch.setattr(checkpoint_module, "_files", files)
+    pipeline = make_pipeline(prefetch=False)
+    autosave = Autosave(tmp_path, pipeline, RunRequest("walk", CONFIG))
+    for stop in (2, 4):
+        pipeline(interrupt_after(stop))
+        autosave.end()
+        assert asked == list(range(stop + 1))
+    assert read_checkpoint(tmp_path).sequence["sizes"] == [[3, None]] * 5

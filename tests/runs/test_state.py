@@ -13,7 +13,7 @@ from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.io.state_file import write_state
-from v3d_torch.runs.checkpoint import CHECKPOINT, write_checkpoint
+from v3d_torch.runs.checkpoint import CHECKPOINT, FileSizes, write_checkpoint
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
 
@@ -59,7 +59,7 @@ def test_system_with_a_replaced_stage_without_state_is_not_saved(stage: str, tmp
 def test_checkpoint_is_not_loaded_as_the_state_of_a_system(tmp_path: Path) -> None:
     pipeline = make_pipeline(prefetch=False)
     pipeline(interrupt_after(1))
-    write_checkpoint(tmp_path, pipeline, RunRequest("walk", CONFIG))
+    write_checkpoint(tmp_path, pipeline, RunRequest("walk", CONFIG), FileSizes(pipeline.sequence))
     with pytest.raises(InputError, match=rf"{CHECKPOINT}: is "):
         load_state(tmp_path / CHECKPOINT)
 

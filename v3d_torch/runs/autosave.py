@@ -9,7 +9,7 @@ from pathlib import Path
 
 from v3d_torch.errors import OutputError
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.runs.checkpoint import CHECKPOINT, write_checkpoint
+from v3d_torch.runs.checkpoint import CHECKPOINT, FileSizes, write_checkpoint
 from v3d_torch.runs.request import RunRequest
 
 _LOG = logging.getLogger(__name__)
@@ -30,6 +30,7 @@ class Autosave:
         self._folder = folder
         self._pipeline = pipeline
         self._request = request
+        self._sizes = FileSizes(pipeline.sequence)
         self._config = pipeline.slam.config.checkpoint
         self._due = time.perf_counter() + self._config.interval
 
@@ -75,7 +76,7 @@ class Autosave:
         if self._request is None:
             return
         start, path = time.perf_counter(), self._folder / CHECKPOINT
-        write_checkpoint(self._folder, self._pipeline, self._request)
+        write_checkpoint(self._folder, self._pipeline, self._request, self._sizes)
         seconds, size = time.perf_counter() - start, path.stat().st_size / (1 << 20)
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)
 

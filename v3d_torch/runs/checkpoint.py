@@ -71,7 +71,34 @@ class Checkpoint:
     state: Mapping[str, Any]
 
 
-def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> None:
+class FileSizes:
+    """Sizes of the image files of a sequence, each read once: runs can have 100,000 frames on a network drive.
+
+    Args:
+        sequence: Sequence; only an `RGBDSequence` can have image files.
+    """
+
+    def __init__(self, sequence: RGBDStream) -> None:
+        self._sequence = sequence
+        self._sizes: list[list[int | None]] = []
+
+    def of_frames(self, frames: int) -> list[list[int | None]]:
+        """Return the sizes of the files of each of the first frames, bytes; None for a file that cannot be read."""
+        if not isinstance(self._sequence, RGBDSequence):
+            return []
+        for index in range(len(self._sizes), min(frames, len(self._sequence))):
+            self._sizes.append([_file_size(file) for file in _files(self._sequence, index)])
+        return self._sizes[:frames]
+
+
+def _file_size(file: Path) -> int | None:
+    try:
+        return file.stat().st_size
+    except (OSError, ValueError):  # ValueError if the name has a null character
+        return None
+
+
+def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest, sizes: FileSizes) -> None:
     """Write the state of a run to its folder.
 
     A live stream cannot be resumed, because its frames are gone; its checkpoint contains only the request.
@@ -80,6 +107,7 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> N
         folder: Folder of the results.
         pipeline: Pipeline between two frames, after at least one frame.
         request: Request of the run.
+        sizes: Sizes of the image files of the sequence of the pipeline.
 
     Raises:
         OutputError: If the file cannot be written; the previous checkpoint stays.
@@ -89,7 +117,7 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest) -> N
     state: dict[str, Any] = {}
     if isinstance(sequence, RGBDSequence):
         done = int(pipeline.record.times.indices[-1]) + 1
-        metadata |= {"sequence": _fingerprint(sequence, done), "frames": len(pipeline.slam.poses)}
+        metadata |= {"sequence": _fingerprint(sequence, done, sizes), "frames": len(pipeline.slam.poses)}
         state = pipeline.state_dict()
     write_state(folder / CHECKPOINT, metadata, state)
 
@@ -143,7 +171,7 @@ def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
     if not isinstance(sequence, RGBDSequence):
         return "it is a live stream"
     last = checkpoint.state["slam"]["previous"].frame
-    stored, current = checkpoint.sequence, _fingerprint(sequence, last.index + 1)
+    stored, current = checkpoint.sequence, _fingerprint(sequence, last.index + 1, FileSizes(sequence))
     if stored["camera"] != current["camera"]:
         return "another camera"
     for before, now in zip_longest(stored["stamps"], current["stamps"]):
@@ -160,14 +188,10 @@ def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
     return None if same else f"frame {last.index} shows another image"
 
 
-def _fingerprint(sequence: RGBDSequence, frames: int) -> dict[str, Any]:
+def _fingerprint(sequence: RGBDSequence, frames: int, sizes: FileSizes) -> dict[str, Any]:
     """Return plain values that distinguish the first frames of a sequence from others without reading its images."""
-    sizes = [
-        [file.stat().st_size if file.is_file() else None for file in _files(sequence, index)]
-        for index in range(min(frames, len(sequence)))
-    ]
     camera = json.loads(json.dumps(asdict(sequence.camera)))
-    return {"camera": camera, "stamps": sequence.stamps[:frames].tolist(), "sizes": sizes}
+    return {"camera": camera, "stamps": sequence.stamps[:frames].tolist(), "sizes": sizes.of_frames(frames)}
 
 
 def _files(sequence: RGBDSequence, index: int) -> tuple[Path, ...]:
