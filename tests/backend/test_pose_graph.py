@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.backend.pose_graph import edge_errors, optimise_pose_graph
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.kernels import compiler
 
@@ -243,6 +244,17 @@ def test_padding_between_edges_has_no_effect(present: list[bool]) -> None:
     expected = optimise_pose_graph(**alone | {"valid": None})
     torch.testing.assert_close(found.T_wc, expected.T_wc, rtol=0, atol=1e-6)
     torch.testing.assert_close(found.cost_after, expected.cost_after, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("index", [-1, 6])
+def test_index_out_of_range_is_rejected(index: int) -> None:
+    graph = Graph(poses=6, loops=2)
+    edges = graph.edges.clone()
+    edges[3, 1] = index
+    with pytest.raises(InputError, match=f"edges contains the index {index}; .* at least 0 and below 6"):
+        optimise_pose_graph(graph.start, edges, graph.T_ij)
+    with pytest.raises(InputError, match=r"edges has the type torch\.int32; give .* torch\.int64"):
+        optimise_pose_graph(graph.start, graph.edges.to(torch.int32), graph.T_ij)
 
 
 # ---------------------------------------------------------------- gradients

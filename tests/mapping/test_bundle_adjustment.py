@@ -10,6 +10,7 @@ import torch
 from helpers.observed_scenes import CAMERA, DEPTH_SIGMA, Scene
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.bundle_problem import prepare_bundle
 from v3d_torch.optim.levenberg_marquardt import huber
@@ -149,6 +150,21 @@ def test_inputs_are_not_modified() -> None:
     scene.adjust()
     assert torch.equal(scene.start, before[0])
     assert torch.equal(scene.start_points, before[1])
+
+
+@pytest.mark.parametrize("index", [-1, 99])
+@pytest.mark.parametrize(("name", "count"), [("pose", 3), ("point", 20)])
+def test_index_out_of_range_is_rejected_unless_it_is_padding(name: str, count: int, index: int) -> None:
+    scene = Scene(poses=3, points=20, observers=3)
+    indices = getattr(scene, name).clone()
+    indices[5] = index
+    with pytest.raises(InputError, match=f"{name} contains the index {index}; .* at least 0 and below {count}"):
+        scene.adjust(**{name: indices})
+    valid = torch.arange(len(indices)) != 5
+    padded, expected = scene.adjust(**{name: indices}, valid=valid), scene.adjust(valid=valid)
+    assert torch.equal(padded.T_cw, expected.T_cw)
+    with pytest.raises(InputError, match=f"{name} has the type torch.int32; give .* torch.int64"):
+        scene.adjust(**{name: getattr(scene, name).to(torch.int32)})
 
 
 def test_degenerate_points_stay_finite() -> None:

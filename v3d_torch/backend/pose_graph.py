@@ -22,7 +22,7 @@ from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
-from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
+from v3d_torch.runtime.batches import common_batch, fill_indices, fill_padding, from_rows, to_rows
 
 if TYPE_CHECKING:
     import pypose as pp
@@ -81,8 +81,8 @@ def optimise_pose_graph(
     Args:
         T_wc: Initial camera-to-world poses, shape :math:`(*, N, 4, 4)`, or PyPose's SE3 of shape :math:`(*, N)`. All
             inputs are floating point except edges and masks, and converted to float64.
-        edges: Indices (i, j) of the poses joined by each measurement, i and j different, int64, shape
-            :math:`(*, E, 2)`.
+        edges: Indices (i, j) of the poses joined by each measurement, from 0 to N - 1, i and j different, int64, shape
+            :math:`(*, E, 2)`; any indices for padding.
         T_ij: Measured pose of camera j in camera i, ``T_wi^-1 T_wj``, shape :math:`(*, E, 4, 4)`, or PyPose's SE3 of
             shape :math:`(*, E)`.
         information: Inverse covariances of the errors, shape :math:`(*, E, 6, 6)`; None for the identity.
@@ -97,6 +97,9 @@ def optimise_pose_graph(
     Returns:
         The poses of minimal cost, with the dtype of ``T_wc``; costs at least in float32. Poses without a path
         of edges to a fixed pose are determined only relative to each other.
+
+    Raises:
+        InputError: If ``edges`` is not int64, or has an index out of range.
     """
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
@@ -231,8 +234,8 @@ def _prepare(
     if weights is None:
         weights = torch.ones(count, dtype=torch.float64, device=device)
     T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
+    edges = fill_indices("edges", edges, T_wc.shape[-3], None if valid is None else valid[..., None])
     if valid is not None:
-        edges = torch.where(valid[..., None], edges, 0)
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
     graph = _Graph(

@@ -96,8 +96,9 @@ def bundle_adjust(
         points: Initial positions of the landmarks, world frame, metres, shape :math:`(*, L, 3)`. Poses and landmarks
             that are padding have no observations; they must be finite, and are returned unchanged.
         uv: Observed pixels, undistorted, shape :math:`(*, M, 2)`.
-        pose: Index of the pose from which each observation was made, int64, shape :math:`(*, M)`.
-        point: Index of the observed landmark, int64, shape :math:`(*, M)`.
+        pose: Index of the pose from which each observation was made, from 0 to P - 1, int64, shape :math:`(*, M)`;
+            any index for padding.
+        point: Index of the observed landmark, from 0 to L - 1, int64, shape :math:`(*, M)`; any index for padding.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured. None if no depth was
             measured.
@@ -113,6 +114,9 @@ def bundle_adjust(
     Returns:
         Poses and landmarks with the lowest robust cost found, with the dtypes of ``T_cw`` and of ``points``; chi2 and
         costs at least in float32.
+
+    Raises:
+        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range.
     """
     problem, initial = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid

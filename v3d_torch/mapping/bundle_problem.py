@@ -24,7 +24,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import common_batch, fill_padding
+from v3d_torch.runtime.batches import common_batch, fill_indices, fill_padding
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -218,8 +218,8 @@ def prepare_bundle(
     each = (*batch, pose.shape[-1])  # observation
     if fixed is None:
         fixed = torch.arange(T_cw.shape[-3], device=T_cw.device) == 0
-    if valid is not None:
-        pose, point = torch.where(valid, pose, 0), torch.where(valid, point, 0)
+    pose = fill_indices("pose", pose, T_cw.shape[-3], valid)
+    point = fill_indices("point", point, points.shape[-2], valid)
     if weights is None:
         weights = torch.ones(each, dtype=torch.float64, device=uv.device)
     problem = BundleProblem(

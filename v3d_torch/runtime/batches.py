@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.kernels.compiler import to_array
+from v3d_torch.errors import InputError
+from v3d_torch.kernels.compiler import can_read, to_array
 
 
 def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
@@ -24,6 +25,31 @@ def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
     if values.dtype != torch.float64:  # converting nothing takes time, too
         values = values.to(torch.float64)
     return values if valid is None else torch.where(valid, values, filler)
+
+
+def fill_indices(name: str, indices: Tensor, count: int, valid: Tensor | None) -> Tensor:
+    """Replace the padding of indices by 0, after a check of the others: kernels do not check what they read.
+
+    Args:
+        name: Name of the indices in error messages.
+        indices: Indices from 0 to ``count`` - 1, int64, any shape.
+        count: Number of things that the indices refer to.
+        valid: Mask of the indices that are not padding, a shape that broadcasts; None = all.
+
+    Raises:
+        InputError: If the indices are not int64, or one of them is out of range. The range is checked only if the
+            values can be read at once.
+    """
+    if indices.dtype != torch.int64:
+        raise InputError(f"{name} has the type {indices.dtype}; give indices of type torch.int64")
+    if can_read(indices) and (valid is None or can_read(valid)):
+        outside = (indices < 0) | (indices >= count)
+        if valid is not None:
+            outside = outside & valid
+        if bool(outside.any()):
+            first = int(indices.expand(outside.shape)[outside][0])
+            raise InputError(f"{name} contains the index {first}; give indices of at least 0 and below {count}")
+    return indices if valid is None else torch.where(valid, indices, 0)
 
 
 def common_batch(*batches: torch.Size) -> torch.Size:
