@@ -146,6 +146,15 @@ def test_empty_cloud_gives_nan_and_finite_gradients_elsewhere() -> None:
     assert chamfer_distance(torch.zeros(0, 3, 3), torch.zeros(0, 4, 3)).shape == (0,)
 
 
+@pytest.mark.parametrize("sizes", [(1, 2), (2, 1), (3, 3)])
+def test_empty_cloud_at_the_end_of_a_batch_gives_nan(sizes: tuple[int, int]) -> None:
+    p, q = (torch.ones(2, size, 3) for size in sizes)
+    empty = torch.tensor([True, False])
+    p_valid, q_valid = (empty[:, None].expand(2, size) for size in sizes)
+    for masks in ((p_valid, None), (None, q_valid), (p_valid, q_valid)):
+        assert chamfer_distance(p, q, *masks).isnan().tolist() == [False, True]
+
+
 def test_gradcheck() -> None:
     p, q = (cloud.requires_grad_() for cloud in random_pair(2, 7, 5))
     p_valid = torch.ones(2, 7, dtype=torch.bool)

@@ -87,7 +87,8 @@ def _mean_square(points: Tensor, others: Tensor, nearest: Tensor, valid: Tensor,
     if 0 in (count, others.shape[1]):
         return points.new_full((batch,), torch.nan, dtype=torch.float64)
     cloud = torch.arange(batch, device=points.device)[:, None]
-    row = (nearest + others.shape[1] * cloud).flatten()
+    # Without a nearest point, as the other cloud is empty, the index is that of the point, which can be too large.
+    row = (nearest.clamp(max=others.shape[1] - 1) + others.shape[1] * cloud).flatten()
     partner = others.reshape(-1, 3).index_select(0, row).reshape(points.shape)
     x, y, z = (points - partner).square().unbind(dim=2)
     squared = torch.where(valid & others_valid.any(dim=1, keepdim=True), x + y + z, 0.0).to(torch.float64)
