@@ -16,6 +16,7 @@ from helpers.gradients import check_gradients, count_graph_nodes
 from helpers.measured_landmarks import CAMERA, INVERSE_DEPTH_SIGMA, measure_landmarks
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
@@ -166,6 +167,15 @@ def test_convention_a_weight_counts_a_measurement_so_many_times() -> None:
     expected = refine_pose(**repeated, iterations=20, tolerance=1e-12)
     torch.testing.assert_close(found.T_cw, expected.T_cw, rtol=0, atol=1e-8)
     torch.testing.assert_close(found.information, expected.information, rtol=1e-4, atol=1.0)
+
+
+@pytest.mark.parametrize("name", ["inverse_depth", "weights", "valid"])
+@pytest.mark.parametrize("size", [1, 5, 9])
+def test_wrong_number_of_values_is_rejected(name: str, size: int) -> None:
+    points = torch.ones(8, 3)
+    wrong = torch.ones(size, dtype=torch.bool if name == "valid" else torch.float64)
+    with pytest.raises(ShapeError):
+        refine_pose(torch.eye(4), points, points[:, :2], CAMERA.K, **{name: wrong})
 
 
 def test_leading_dimensions_are_those_of_the_batch() -> None:

@@ -202,6 +202,9 @@ def refine_pose(
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    for each in (inverse_depth, weights, valid):
+        if each is not None:
+            KORNIA_CHECK_SHAPE(each, ["*", str(points.shape[-2])])
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     scale, offset = whiten(measured, K.to(torch.float64))
     thresholds = measured.chi2_threshold
