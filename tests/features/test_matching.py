@@ -9,6 +9,7 @@ import torch
 from helpers.random_descriptors import invert_bits, random_descriptors
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 
 from v3d_torch.features.matching import hamming_distance, match_descriptors
 from v3d_torch.kernels.compiler import ENABLED, TWINS
@@ -46,6 +47,12 @@ def test_matches_with_ratio_test_equal_kornia_rs(max_ratio: float) -> None:
     assert 60 < len(expected) <= 120
     pairs = _pairs(match_descriptors(a, b, max_hamming=64, max_ratio=max_ratio))
     assert torch.equal(pairs, torch.from_numpy(expected))
+
+
+@pytest.mark.parametrize(("a", "b"), [((4, 32), (4, 16)), ((4, 16), (4, 32)), ((32,), (32,)), ((4, 32), (32,))])
+def test_wrong_shapes_are_rejected(a: tuple[int, ...], b: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError):
+        match_descriptors(*(torch.zeros(shape, dtype=torch.uint8) for shape in (a, b)))
 
 
 def test_too_few_descriptors_have_no_matches() -> None:

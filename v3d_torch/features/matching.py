@@ -51,7 +51,9 @@ def _match_descriptors_compiled(
     max_hamming: int = MAX_HAMMING,
     max_ratio: float = MAX_RATIO,
 ) -> Tensor:
-    if a.dtype != torch.uint8 or b.dtype != torch.uint8 or a.shape[-1] != _BYTES or a.shape[:-2] != b.shape[:-2]:
+    if any(each.dtype != torch.uint8 or each.ndim < 2 or each.shape[-1] != _BYTES for each in (a, b)):
+        return NotImplemented
+    if a.shape[:-2] != b.shape[:-2]:
         return NotImplemented
     matches = torch.full(a.shape[:-1], -1)
     for index in np.ndindex(a.shape[:-2]):
