@@ -122,6 +122,18 @@ def test_module_on_a_batch_equals_the_function_on_each_image() -> None:
     assert torch.equal(smoothed, each)
 
 
+def test_default_dtype_does_not_change_the_result() -> None:
+    given = stepped_depth(30, 40, torch.float32)
+    expected = smooth_depth(given)
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = smooth_depth(given)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, expected)
+
+
 @pytest.mark.parametrize("kernel_size", [0, 4])
 def test_even_window_is_rejected(kernel_size: int) -> None:
     with pytest.raises(ConfigError, match="odd"):

@@ -42,6 +42,18 @@ def test_normals_of_a_batch_equal_normals_of_each_image() -> None:
         assert torch.equal(surface_normals(points[None])[0], expected)
 
 
+def test_default_dtype_does_not_change_the_result() -> None:
+    given = slanted([0.5, 0.1, -1], 2.0)[0].to(torch.float32)
+    expected = surface_normals(given)
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = surface_normals(given)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert found.dtype == torch.float32
+    assert torch.equal(found, expected)
+
+
 def test_edges_and_holes_have_no_normals() -> None:
     depth = torch.full((1, 240, 320), 2.0)
     depth[0, :, 160:] = 3.0

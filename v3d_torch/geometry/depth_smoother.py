@@ -27,7 +27,7 @@ def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1
         return NotImplemented
     taps = np.array(_gaussian(kernel_size, sigma), np.float32)
     limits = np.float32(edge_ratio), np.float32(_MAX_VALID_DEPTH)
-    smoothed = torch.empty(depth.shape)
+    smoothed = torch.empty(depth.shape, dtype=depth.dtype)
     for image, result in zip(depth[:, 0], smoothed[:, 0], strict=True):
         kernels.smooth_depth(to_array(image), taps, *limits, result.numpy())
     return smoothed

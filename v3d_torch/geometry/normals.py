@@ -22,7 +22,7 @@ _EDGE_RATIO = 0.05
 def _surface_normals_compiled(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _EDGE_RATIO) -> Tensor:
     if points.dtype != torch.float32 or points.ndim != 4 or points.shape[3] != 3:
         return NotImplemented
-    normals = torch.zeros(points.shape)  # contiguous, even if the points are not
+    normals = torch.zeros(points.shape, dtype=points.dtype)  # contiguous, even if the points are not
     for image, result in zip(to_array(points), normals.numpy(), strict=True):
         kernels.surface_normals(image, radius, np.float32(edge_ratio), np.float32(_EPS), result)
     return normals
