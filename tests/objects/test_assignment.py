@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import permutations
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,3 +23,10 @@ def test_assignment_has_the_largest_sum_of_all_permutations(values: list[float])
 def test_pair_without_positive_ratio_is_not_matched() -> None:
     ratio = torch.tensor([[[0.0, -1.0, -torch.inf], [-torch.inf, -2.0, 0.5]]])
     assert match_instances(ratio).tolist() == [[-1, -1, 1]]
+
+
+@pytest.mark.parametrize("padding", [torch.nan, torch.inf, -torch.inf])
+def test_values_of_padding_have_no_effect(padding: float) -> None:
+    ratio = torch.tensor([[[2.0, padding, 1.0], [padding, padding, padding], [3.0, padding, 2.5]]])
+    tracked, present = torch.tensor([[True, False, True]]), torch.tensor([[True, False, True]])
+    assert match_instances(ratio, tracked, present).tolist() == [[0, -1, 2]]

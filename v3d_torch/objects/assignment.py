@@ -18,7 +18,7 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
 
     Args:
         log_ratio: Log-likelihood ratio that instance n continues object t, floating point, shape :math:`(B, T, N)`;
-            -inf for impossible pairs.
+            -inf for impossible pairs, any value for padding.
         tracked: Mask of the objects that are not padding, bool, shape :math:`(B, T)`; None for all.
         present: Mask of the instances that are not padding, bool, shape :math:`(B, N)`; None for all.
 
@@ -28,9 +28,9 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
     KORNIA_CHECK_SHAPE(log_ratio, ["B", "T", "N"])
     gain = log_ratio.detach().to(torch.float64).clamp(min=0)
     if tracked is not None:
-        gain = gain * tracked[..., :, None]
+        gain = torch.where(tracked[..., :, None], gain, 0.0)
     if present is not None:
-        gain = gain * present[..., None, :]
+        gain = torch.where(present[..., None, :], gain, 0.0)
     return _assign(gain) if can_read(gain) else _assign_on_host(gain)
 
 
