@@ -58,6 +58,23 @@ def test_without_points_the_transform_is_the_identity() -> None:
     assert torch.equal(umeyama(p, p, valid=torch.zeros(2, 5, dtype=torch.bool)), eye.expand(2, 4, 4))
 
 
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_scale_of_points_at_one_place_is_one(count: int, weighted: bool) -> None:
+    p = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).repeat(count, 1).requires_grad_()
+    weights = torch.ones(count, dtype=torch.float64) if weighted else None
+    T = umeyama(p, p.detach() + 1.0, weights, with_scale=True)
+    torch.testing.assert_close(torch.linalg.det(T), torch.tensor(1.0, dtype=torch.float64))
+    T.sum().backward()
+    assert p.grad is not None and p.grad.isfinite().all()
+
+
+def test_fully_padded_row_with_scale_is_the_identity() -> None:
+    p, valid = normal(2, 4, 3), torch.tensor([[True] * 4, [False] * 4])
+    T = umeyama(p, 2 * p, valid=valid, with_scale=True)
+    torch.testing.assert_close(T, torch.diag_embed(torch.tensor([[2.0, 2, 2, 1], [1, 1, 1, 1]], dtype=T.dtype)))
+
+
 def test_nearest_rotation_equals_scipy() -> None:
     M = normal(20, 3, 3)
     for one, other in zip(nearest_rotation(M), M, strict=True):

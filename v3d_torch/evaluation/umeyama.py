@@ -39,7 +39,7 @@ def umeyama(
     Returns:
         Transform ``T_qp``, with the scaled rotation :math:`s R` in its upper left block, dtype of ``p``, shape
         :math:`(*, 4, 4)`. Points on a line do not determine the rotation; one of the solutions is returned. Without
-        points the result is the identity.
+        points the result is the identity; points at one place do not determine the scale, which is then 1.
     """
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
@@ -55,7 +55,8 @@ def umeyama(
     R = nearest_rotation(M)
     if with_scale:
         spread = (a.square() if w is None else a.square() * w).sum(dim=(-2, -1))
-        R = R * ((R * M).sum(dim=(-2, -1)) / spread)[..., None, None]
+        scale = (R * M).sum(dim=(-2, -1)) / torch.where(spread > 0, spread, 1.0)
+        R = R * torch.where(spread > 0, scale, 1.0)[..., None, None]
     top = torch.cat([R, (mean_b - (R @ mean_a[..., None])[..., 0])[..., None]], dim=-1)
     last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, last], dim=-2).to(p.dtype)
