@@ -167,5 +167,6 @@ def test_points_that_cannot_be_numbered_are_rejected() -> None:
     for bad in (torch.nan, torch.inf, 1e30):
         with pytest.raises(InputError, match="not finite or lie too far apart"):
             voxel_pool(torch.tensor([[[0.0, 0.0, 0.0], [bad, bad, bad]]]), valid, 0.02)
-    with pytest.raises(ConfigError, match="positive"):
-        voxel_pool(torch.zeros(1, 2, 3), valid, 0.0)
+    for size in (0.0, torch.nan):
+        with pytest.raises(ConfigError, match="positive"):
+            voxel_pool(torch.zeros(1, 2, 3), valid, size)

@@ -181,7 +181,7 @@ def test_empty_clouds_have_no_labels(batch: int, count: int) -> None:
 
 def test_invalid_settings_and_non_finite_points_are_rejected() -> None:
     points, valid = torch.zeros(1, 2, 3), torch.ones(1, 2, dtype=torch.bool)
-    for eps, min_samples in [(0.0, 3), (0.1, 0)]:
+    for eps, min_samples in [(0.0, 3), (float("nan"), 3), (0.1, 0)]:
         with pytest.raises(ConfigError, match="give eps above 0 and min_samples of at least 1"):
             dbscan(points, valid, eps, min_samples)
     points[0, 1, 2] = torch.nan

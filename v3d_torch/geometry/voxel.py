@@ -36,7 +36,7 @@ class Voxels(NamedTuple):
 
 def _voxel_pool_compiled(points: Tensor, valid: Tensor, size: float) -> Voxels:
     is_cloud = points.dtype == torch.float32 and points.ndim == 3 and points.shape[2] == 3
-    if not is_cloud or points.shape[:2] != valid.shape or size <= 0:
+    if not is_cloud or points.shape[:2] != valid.shape or not size > 0:
         return NotImplemented
     mask, coordinates = valid.numpy(), to_array(points)
     limits = np.float32(size), float(_MAX_VOXELS)
@@ -73,7 +73,7 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     """
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
-    if size <= 0:
+    if not size > 0:  # also if it is NaN
         raise ConfigError(f"the voxel size is {size} m; give a positive number")
     wide = points.to(working_dtype(points.dtype))
     voxel_index, occupied = _number_voxels(wide.detach(), valid, size)

@@ -36,7 +36,7 @@ Pairs = tuple[Ints, Ints]
 
 
 def _dbscan_compiled(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
-    if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape or eps <= 0 or min_samples < 1:
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape or not eps > 0 or min_samples < 1:
         return NotImplemented
     if points.dtype not in (torch.float32, torch.float64):
         return NotImplemented
@@ -79,7 +79,7 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     """
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
-    if eps <= 0 or min_samples < 1:
+    if not eps > 0 or min_samples < 1:  # also if eps is NaN
         raise ConfigError(
             f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"
         )
