@@ -12,6 +12,7 @@ from torch import Tensor
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.kernels import compiler
 from v3d_torch.mapping.bundle_problem import prepare_bundle
 from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.schur import solve_normal_equations
@@ -150,6 +151,17 @@ def test_inputs_are_not_modified() -> None:
     scene.adjust()
     assert torch.equal(scene.start, before[0])
     assert torch.equal(scene.start_points, before[1])
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_unchanged_result_does_not_share_memory_with_the_input(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiler, "ENABLED", compiled and compiler.ENABLED)
+    scene = Scene(poses=3, points=20, observers=3)
+    result = scene.adjust(iterations=0)
+    assert torch.equal(result.T_cw, scene.start)
+    assert torch.equal(result.points, scene.start_points)
+    assert result.T_cw.data_ptr() != scene.start.data_ptr()
+    assert result.points.data_ptr() != scene.start_points.data_ptr()
 
 
 @pytest.mark.parametrize("index", [-1, 99])

@@ -132,8 +132,8 @@ def bundle_adjust(
     chi2 = found.chi2 if valid is None else torch.where(valid, found.chi2, torch.inf)
     wide = working_dtype(T_cw.dtype)  # costs can exceed the range of half precision
     return BundleAdjustment(
-        T_cw=found.T_cw.to(T_cw.dtype),
-        points=found.points.to(points.dtype),
+        T_cw=found.T_cw.to(T_cw.dtype, copy=True),  # without a successful step, these are the tensors of the caller
+        points=found.points.to(points.dtype, copy=True),
         inliers=chi2 <= problem.thresholds,
         chi2=chi2.to(wide),
         cost_before=found.cost_before.to(wide),
