@@ -63,6 +63,13 @@ def test_distort_inverts_undistort() -> None:
     assert torch.allclose(FR1.distort(FR1.undistort(uv)), uv, atol=1e-5)
 
 
+def test_change_of_the_camera_matrix_does_not_change_the_camera() -> None:
+    camera = replace(FR3)
+    K = camera.K
+    K[:2] *= 0.5
+    assert torch.equal(camera.K, FR3.K)
+
+
 @pytest.mark.parametrize("camera", [FR1, FR3])
 def test_back_projected_image_equals_back_projected_pixels(camera: PinholeCamera) -> None:
     depth = torch.rand(2, 1, 480, 640) * 4

@@ -103,7 +103,7 @@ class SequenceDataset(Dataset[Sample], ABC):
             "stamp": torch.tensor(frame.stamp, dtype=torch.float64),
             "image": frame.image,
             "depth": frame.depth,
-            "K": self.sequence.camera.K.clone(),
+            "K": self.sequence.camera.K,
         }
         if self._T_wc is not None:
             sample["T_wc"] = self._T_wc[index].clone()

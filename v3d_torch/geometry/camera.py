@@ -117,9 +117,14 @@ class PinholeCamera:
         """Return the fields without the cached tensors, which take megabytes and can be computed again."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    @cached_property
+    @property
     def K(self) -> Tensor:
-        """Camera matrix, float64, shape :math:`(3, 3)`."""
+        """Camera matrix, float64, shape :math:`(3, 3)`; a new tensor, which the caller may change."""
+        return self._K.clone()
+
+    @cached_property
+    def _K(self) -> Tensor:
+        """Camera matrix, float64, shape (3, 3)."""
         return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     @cached_property
