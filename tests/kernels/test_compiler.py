@@ -18,7 +18,7 @@ from rich.console import Console
 from torch import Tensor
 
 from v3d_torch.kernels import compiler
-from v3d_torch.kernels.compiler import TWINS, Twin, compiled_by
+from v3d_torch.kernels.compiler import TWINS, Twin, can_read, compiled_by
 from v3d_torch.runs import kernel_compilation
 
 needs_numba = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
@@ -179,3 +179,9 @@ def test_code_is_shared_by_copies_of_a_file_and_not_by_other_files(
         compiled += [count for count, _ in compiler.compile_kernels()]
         assert scale(5.0) == factor * 5
     assert compiled == [1, 0, 1]
+
+
+def test_parameter_of_a_module_can_be_read() -> None:
+    plain = torch.zeros(2, requires_grad=True)
+    assert can_read(plain) and can_read(torch.nn.Parameter(plain.detach()))
+    assert not can_read(torch.zeros(2, device="meta"))

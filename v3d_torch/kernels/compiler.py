@@ -186,7 +186,8 @@ def can_read(tensor: Tensor) -> bool:
     Values on another device require waiting for the device. Meta tensors, and tensors that `torch.func` transforms or a
     compiler traces, have no values.
     """
-    return not _is_traced() and type(tensor) is Tensor and tensor.device.type == "cpu"
+    is_plain = type(tensor) in (Tensor, torch.nn.Parameter)
+    return not _is_traced() and is_plain and tensor.device.type == "cpu"
 
 
 def is_all_true(mask: Tensor) -> bool:
