@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from v3d_torch.batch.plan import load_configs
+import pytest
+from helpers.walker_folder import write_walker
+
+from v3d_torch.batch.plan import load_configs, plan_jobs
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets import load_sequence
 
 
 def test_load_configs_drops_repetitions_and_limits_threads(tmp_path: Path) -> None:
@@ -15,3 +19,13 @@ def test_load_configs_drops_repetitions_and_limits_threads(tmp_path: Path) -> No
     assert list(configs) == ["full", "mine"] and configs["full"] == load_config()
     one, two = load_configs([mine], one_thread=True)["mine"], configs["mine"]
     assert [(config.threads, config.segmentation.threads) for config in (one, two)] == [(1, 1), (2, 2)]
+
+
+def test_jobs_store_the_folder_of_the_variable_for_other_machines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sequences = {"own": ("own", load_sequence(str(write_walker(tmp_path / "own", 2))))}
+    configs = load_configs(["baseline"], one_thread=True)
+    monkeypatch.setenv("V3D_DATA", str(tmp_path))
+    [job] = plan_jobs(sequences, configs, seeds=1, data_root=None, folder=tmp_path / "out")
+    assert (job.source, job.data_root) == ("own", tmp_path)

@@ -33,6 +33,7 @@ from v3d_torch.io.state_file import VERSION
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.request import read_request
 from v3d_torch.runs.stored_run import read_run
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -446,6 +447,18 @@ def test_resumed_run_ignores_data_folder_of_the_environment(
     with at_frame(3, lambda: os.kill(os.getpid(), signal.SIGINT)):
         call(*named, "--out", tmp_path / "named")
     monkeypatch.setenv("V3D_DATA", str(tmp_path / "elsewhere"))
+    done = call("--resume", tmp_path / "named")
+    assert done.exit_code == 0, done.stderr
+
+
+def test_run_of_sequence_found_by_the_variable_resumes_without_it(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("V3D_DATA", str(sequence.parent))
+    with at_frame(3, lambda: os.kill(os.getpid(), signal.SIGINT)):
+        call("--seq", "seq", "--segmenter", "none", "--serial", "--out", tmp_path / "named")
+    monkeypatch.delenv("V3D_DATA")
+    assert read_request(tmp_path / "named").data_root == str(sequence.parent)
     done = call("--resume", tmp_path / "named")
     assert done.exit_code == 0, done.stderr
 

@@ -267,6 +267,23 @@ def test_sequence_is_found_by_name_in_root_environment_and_cache(
     assert len(load_sequence("fr3/walking_xyz", download=False)) == 3
 
 
+def test_data_root_is_the_variable_only_if_the_sequence_is_found_there(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert locate.data_root_of("sequence", None) is None
+    monkeypatch.chdir(tmp_path.parent)
+    monkeypatch.setenv("V3D_DATA", tmp_path.name)
+    assert locate.data_root_of("sequence", None) == tmp_path
+    assert locate.data_root_of("sequence", Path("elsewhere")) == tmp_path.parent / "elsewhere"
+    (tmp_path / "fr3_w_xyz").mkdir()
+    assert locate.data_root_of("fr3/w/xyz", None) == tmp_path
+    for name in ("demo", "realsense:", "cache"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "cache" / "fr1_rpy").mkdir()
+    for name in ("demo", "realsense:", "", "fr1/rpy", "unknown", "x" * 5000, str(folder)):
+        assert locate.data_root_of(name, None) is None, name
+
+
 @pytest.mark.parametrize("name", ["sequence", "room", "walking_xyz"])
 def test_any_folder_in_data_root_is_found_and_keeps_its_name(name: str, folder: Path) -> None:
     folder.rename(folder.with_name(name))

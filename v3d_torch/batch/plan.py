@@ -9,6 +9,7 @@ from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
+from v3d_torch.datasets.locate import data_root_of
 from v3d_torch.errors import ConfigError
 from v3d_torch.io.paths import expand_user, folder_name
 from v3d_torch.runtime.stage_import import import_stage
@@ -69,7 +70,7 @@ def plan_jobs(
         sequences: Source (path or name) and opened sequence, by the name in tables.
         configs: Configurations by the name in tables.
         seeds: Number of runs for each sequence and configuration; their seeds count from 0.
-        data_root: Folder of named sequences.
+        data_root: Folder of named sequences; None for ``$V3D_DATA``, which is stored in the jobs of sequences in it.
         folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
         skip_broken: True if runs skip broken frames.
     """
@@ -78,7 +79,7 @@ def plan_jobs(
             sequence=name,
             source=str(path.absolute()) if (path := expand_user(source)).exists() else source,
             frames=len(sequence),
-            data_root=data_root.absolute() if data_root is not None else None,
+            data_root=data_root_of(source, data_root),  # other machines may lack the variable
             config_name=label,
             config=config.model_copy(update={"seed": seed}),
             folder=folder.absolute() / folder_name(name) / label / f"seed{seed}",

@@ -77,8 +77,7 @@ def check_name(name: str, data_root: Path | None) -> None:
         InputError: If there is no such path and no such sequence.
     """
     with suppress(OSError):  # such as a name that is too long; `open_source` reports the error
-        is_special = name in ("", *BUILT_IN_SEQUENCES) or name.partition(":")[0] == "realsense"
-        if not is_special and canonical_name(name) is None and find_stored(name, data_root) is None:
+        if not _is_special(name) and canonical_name(name) is None and find_stored(name, data_root) is None:
             raise unknown_name_error(name)
 
 
@@ -94,6 +93,29 @@ def data_folder(data_root: Path | None) -> Path:
     """Folder with the user's sequences: ``data_root`` if given, or else ``$V3D_DATA``, or else the cache."""
     shared = os.environ.get("V3D_DATA")
     return data_root or (expand_user(shared) if shared else cache_dir())
+
+
+def data_root_of(name: str, data_root: Path | None) -> Path | None:
+    """Folder of named sequences that opens the same sequence again, without the environment of this process.
+
+    Args:
+        name: Name of the source as in `open_source`.
+        data_root: Folder with the user's sequences; None for ``$V3D_DATA``.
+
+    Returns:
+        ``data_root`` if given, or else ``$V3D_DATA`` if the sequence is found there, absolute; None otherwise.
+    """
+    if data_root is None and os.environ.get("V3D_DATA") and not _is_special(name):
+        with suppress(OSError):  # such as a name that is too long; `open_source` reports the error
+            shared = data_folder(None)
+            if not expand_user(name).exists() and _find(shared, name, canonical_name(name)) is not None:
+                data_root = shared
+    return None if data_root is None else data_root.absolute()
+
+
+def _is_special(name: str) -> bool:
+    """Check whether a name is empty or that of a source that is not on disk."""
+    return name in ("", *BUILT_IN_SEQUENCES) or name.partition(":")[0] == "realsense"
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:

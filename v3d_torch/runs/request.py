@@ -15,6 +15,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.validation import first_error
 from v3d_torch.datasets import SourceOptions
 from v3d_torch.datasets.cameras import PRESETS
+from v3d_torch.datasets.locate import data_root_of
 from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
@@ -74,11 +75,13 @@ class RunRequest:
         return SourceOptions(self.rgb_topic, self.depth_topic, self.info_topic, self.fps)
 
     def absolute(self) -> RunRequest:
-        """Return the same request with absolute paths, independent of the working directory."""
+        """Return the same request with absolute paths, independent of the working directory and of ``$V3D_DATA``."""
         values = self._options()
         for name in _PATHS:
             if values[name] is not None:
                 values[name] = str(expand_user(values[name]).absolute())
+        if values["data_root"] is None and (root := data_root_of(self.seq, None)) is not None:
+            values["data_root"] = str(root)
         for name, not_a_path in (("seq", BUILT_IN_SEQUENCES), ("camera", (None, *PRESETS))):
             if values[name] not in not_a_path:
                 values[name] = _absolute_if_exists(values[name])
