@@ -26,6 +26,12 @@ def test_shift_and_delay_are_found(shift: tuple[int, int], delay: float) -> None
     assert bool(((found.values - expected).abs() < torch.tensor([1.5, 1.5, 0.004])).all()), found.values
 
 
+def test_shift_of_frames_with_more_columns_can_be_larger() -> None:
+    views, trajectory = make_views(shift=(60, 0), zoom=4)  # 1280 columns
+    found = EdgeAlignment(views, trajectory, depth_delay=0.0).search((0, 1))
+    assert found.tolist() == pytest.approx([-60, 0, 0], abs=4)
+
+
 def test_stated_delay_is_not_found_again() -> None:
     _, found = align(delay=0.05, stated_delay=0.05)
     assert float(found.values[2]) == pytest.approx(0.0, abs=0.003)

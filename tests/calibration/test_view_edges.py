@@ -52,3 +52,9 @@ def test_gradients_follow_the_edges_of_the_image_and_have_no_mean() -> None:
     assert gradients.mean(dim=(1, 2)).abs().max() < 1e-5
     assert (gradients[0].argmax(dim=1) - 29.5).abs().max() <= 0.5
     assert gradients[1].abs().max() < 1e-5
+
+
+def test_gap_of_a_shadow_can_be_wider_in_frames_with_more_columns() -> None:
+    depth = torch.full((20, 640), 2.0)
+    depth[:, 300:318], depth[:, 318:] = 0.0, 1.0  # 36 of 1280 columns, as 18 of 640
+    assert set(edges_of(depth, torch.full((3, 20, 640), 128, dtype=torch.uint8)).pixel[:, 0].tolist()) == {317.5}

@@ -63,6 +63,7 @@ def make_views(
     stated_delay: float = 0.0,
     scale: float = 1.0,
     moving: bool = True,
+    zoom: int = 1,
 ) -> tuple[StaticViews, Trajectory]:
     """Make the views of a camera that moves in front of the boards, and its trajectory.
 
@@ -73,16 +74,23 @@ def make_views(
         stated_delay: The same by the timestamps.
         scale: Factor of the depth.
         moving: False for a camera that stands still.
+        zoom: Number of columns and of rows of the frames for each rendered one; with 2 or more, it is also the stride
+            of the views.
     """
     speed = RATE if moving else torch.inf
     stamps = torch.arange(10 * count + 10, dtype=torch.float64)
     T_cw = torch.stack([pose_at(float(stamp) / speed) for stamp in stamps])
-    views = StaticViews(CAMERA, 2)
+    fx, fy, cx, cy = (zoom * value for value in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy))
+    camera = PinholeCamera(fx, fy, cx, cy, width=zoom * CAMERA.width, height=zoom * CAMERA.height, depth_scale=5000.0)
+    views = StaticViews(camera, max(zoom, 2))
     for index in range(count):
         frame = 5 + 10 * index
         time = frame / speed
-        colour, _ = render_at(time)
-        depth = render_at(time + delay * RATE / speed)[1].roll(shift, (2, 1)) * scale
+        colour, depth = (
+            image.repeat_interleave(zoom, 1).repeat_interleave(zoom, 2)
+            for image in (render_at(time)[0], render_at(time + delay * RATE / speed)[1])
+        )
+        depth = depth.roll(shift, (2, 1)) * scale
         keyframe = Keyframe(index, frame, frame / RATE, T_cw[frame], no_features(), torch.zeros(0).long())
-        views.add(keyframe, colour, depth, torch.ones(240, 320, dtype=torch.bool), stated_delay)
+        views.add(keyframe, colour, depth, torch.ones(depth.shape[1:], dtype=torch.bool), stated_delay)
     return views, Trajectory(stamps / RATE, invert(T_cw))

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from v3d_torch.calibration.view_edges import ViewEdges, find_edges
+from v3d_torch.calibration.view_edges import ViewEdges, find_edges, pixel_scale
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.optim.jackknife import jackknife_covariance
@@ -28,14 +28,14 @@ _MIN_BOUNDARIES = 100
 """Minimum number of boundaries of a view; fewer can fit somewhere by chance."""
 
 _SHIFTS = 48
-"""Maximum shift of the coarse search along both axes, frame pixels."""
+"""Maximum shift of the coarse search along both axes, frame pixels of 640 columns."""
 
 _DELAYS = torch.arange(-12, 13, dtype=torch.float64) / 100
 """Delays of the coarse search, seconds."""
 
 _REACH = 64
-"""Maximum displacement by shift and delay together, frame pixels; boundaries with a larger displacement do not count in
-the coarse search."""
+"""Maximum displacement by shift and delay together, frame pixels of 640 columns; boundaries with a larger displacement
+do not count in the coarse search."""
 
 _STEP = 2.0
 """Step of the finite differences by the shift, frame pixels: the width of the blurred edges."""
@@ -143,20 +143,25 @@ class EdgeAlignment:
     @property
     def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
         """Delays, shifts along v and shifts along u of the coarse search; seconds and view pixels."""
-        shifts = torch.arange(-(_SHIFTS // self._stride), _SHIFTS // self._stride + 1)
+        longest = self._view_pixels(_SHIFTS)
+        shifts = torch.arange(-longest, longest + 1)
         return _DELAYS, shifts, shifts
+
+    def _view_pixels(self, length: int) -> int:
+        """Length in view pixels, rounded down, of a length in frame pixels of 640 columns."""
+        return int(length * pixel_scale(self._camera.width * self._stride)) // self._stride
 
     @cached_property
     def _grid_scores(self) -> Tensor:
         """Approximate total score at each delay, shift along v and shift along u, (T, S, S)."""
-        reach, shifts = _REACH // self._stride, self._grid[1]
+        reach, shifts = self._view_pixels(_REACH), self._grid[1]
         maps = torch.stack([_correlation(edges, reach) for edges in self._edges])
         maps = pad(maps, (1, 1, 1, 1))  # beyond the maximum displacement, use the mean, 0
         motion = torch.stack([self._mean_motion(float(delay)) for delay in _DELAYS])  # (T, K, 2)
         index = (motion[..., None] + shifts).round().long().clamp(-reach - 1, reach + 1) + reach + 1
-        column, row = index[:, :, 0, None, :], index[:, :, 1, :, None]
-        view = torch.arange(len(maps))[None, :, None, None]
-        return maps[view, row, column].sum(dim=1)
+        view = torch.arange(len(maps))[:, None, None]
+        # One delay at a time, because all together need gigabytes for large frames.
+        return torch.stack([maps[view, v[..., None], u[:, None]].sum(dim=0) for u, v in index.transpose(1, 2)])
 
     def refine(self, start: Tensor, free: Sequence[int] = (0, 1, 2)) -> Misalignment:
         """Find the local maximum of the scores by Newton steps.

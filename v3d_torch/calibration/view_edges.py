@@ -10,12 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+_WIDTH = 640
+"""Number of columns of the frames for which lengths are given."""
+
 _EDGE_RATIO = 0.1
 """Minimum relative step of depth at an occlusion boundary: larger than the steps of a slanted surface."""
 
 _MAX_GAP = 24
-"""Maximum gap without depth between the two sides of a boundary, frame pixels: the shadow of a projector. Wider gaps
-are masked objects."""
+"""Maximum gap without depth between the two sides of a boundary, frame pixels of 640 columns: the shadow of a
+projector. Wider gaps are masked objects."""
 
 _BLUR = 2.0
 """Standard deviation of the blur of the colour image, frame pixels: the error of depth edges."""
@@ -51,6 +54,15 @@ class ViewEdges:
     gradients: Tensor
 
 
+def pixel_scale(width: int) -> float:
+    """Factor of lengths in pixels of 640 columns, for frames with more columns; 1 for frames with fewer.
+
+    Args:
+        width: Number of columns of the frames.
+    """
+    return max(width / _WIDTH, 1.0)
+
+
 def find_edges(colour: Tensor, depth: Tensor, stride: int) -> ViewEdges:
     """Find the occlusion boundaries of a depth image and the gradients of a colour image.
 
@@ -59,7 +71,7 @@ def find_edges(colour: Tensor, depth: Tensor, stride: int) -> ViewEdges:
         depth: Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement or not static.
         stride: Every n-th pixel of the frame's rows and columns is a pixel of the images.
     """
-    z, gap = depth.numpy(), max(_MAX_GAP // stride, 1)
+    z, gap = depth.numpy(), max(int(_MAX_GAP * pixel_scale(depth.shape[1] * stride)) // stride, 1)
     pixels, depths, axes = [], [], []
     for axis, image in enumerate((z, z.T)):
         for side, facing in ((-1, image), (1, image[:, ::-1])):
