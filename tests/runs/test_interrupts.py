@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -23,6 +24,7 @@ class WaitingCamera:
         self.stopped = threading.Event()
 
     def __iter__(self) -> Iterator[RGBDFrame]:
+        self.stopped.clear()
         self.stopped.wait(20)
         yield from ()
 
@@ -45,6 +47,32 @@ def test_first_ctrl_c_ends_a_camera_that_sends_nothing() -> None:
         assert interrupted.is_set() and camera.stopped.is_set()
 
 
+def test_ctrl_c_before_the_first_frame_is_read_ends_the_camera() -> None:
+    camera = WaitingCamera()
+    with interrupts_between_frames(camera):
+        press_ctrl_c()
+        assert camera.stopped.wait(5)
+        start = time.monotonic()
+        assert list(camera) == []
+        assert time.monotonic() - start < 5
+
+
+def test_no_thread_is_left_outside_of_the_main_thread() -> None:
+    camera, errors, before = WaitingCamera(), list[ValueError](), set(threading.enumerate())
+
+    def enter() -> None:
+        try:
+            with interrupts_between_frames(camera):
+                pass
+        except ValueError as error:
+            errors.append(error)
+
+    outside = threading.Thread(target=enter)
+    outside.start()
+    outside.join()
+    assert len(errors) == 1 and set(threading.enumerate()) <= before
+
+
 def test_second_ctrl_c_interrupts_at_once() -> None:
     with interrupts_between_frames() as interrupted:
         press_ctrl_c()
@@ -55,10 +83,10 @@ def test_second_ctrl_c_interrupts_at_once() -> None:
 
 def test_camera_is_not_stopped_without_ctrl_c() -> None:
     camera, before = WaitingCamera(), signal.getsignal(signal.SIGINT)
-    threads = threading.active_count()
+    threads = set(threading.enumerate())
     with interrupts_between_frames(camera) as interrupted:
-        watching = threading.enumerate()
-    for thread in watching[threads:]:
+        watching = set(threading.enumerate()) - threads
+    for thread in watching:
         thread.join(5)
     assert not interrupted.is_set() and not camera.stopped.is_set()
-    assert signal.getsignal(signal.SIGINT) == before and threading.active_count() == threads
+    assert signal.getsignal(signal.SIGINT) == before and set(threading.enumerate()) <= threads
