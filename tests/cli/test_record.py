@@ -22,7 +22,8 @@ from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.record import app
 from v3d_torch.cli.record_command import record_all
-from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.datasets import RGBDSequence, load_sequence, tum_writer
+from v3d_torch.io.files import write_png
 from v3d_torch.types import RGBDFrame
 
 K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
@@ -125,6 +126,20 @@ def test_interrupt_while_waiting_for_a_frame_returns_the_number_of_frames(tmp_pa
     wall = Slide(0, 12, step=6)
     assert record_all(Waiting(), tmp_path / "out", threading.Event(), Console(quiet=True)) == 2
     assert len(load_sequence(str(tmp_path / "out"))) == 2
+
+
+def test_interrupt_while_a_frame_is_written_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its images can be incomplete, so that the recording does not end as if all was saved."""
+
+    def write(path: Path, image: object) -> None:
+        if path.parent.name == "depth" and (tmp_path / "out" / "depth").exists():
+            raise KeyboardInterrupt
+        write_png(path, image)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tum_writer, "write_png", write)
+    with pytest.raises(KeyboardInterrupt):
+        record_all(Slide(0, 18, step=6), tmp_path / "out", threading.Event(), Console(quiet=True))
+    assert len(load_sequence(str(tmp_path / "out"))) == 1
 
 
 def test_nonempty_folder_and_missing_camera_are_errors(tmp_path: Path) -> None:

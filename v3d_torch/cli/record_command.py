@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Sized
 from pathlib import Path
 from threading import Event
 
@@ -26,7 +25,7 @@ from v3d_torch.types import RGBDFrame
 
 
 def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Console) -> int:
-    """Write all frames of a source. A KeyboardInterrupt while it waits for a frame ends the recording, too.
+    """Write all frames of a source. A KeyboardInterrupt while it waits for the next frame ends the recording, too.
 
     Args:
         source: Frames.
@@ -40,13 +39,26 @@ def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Conso
     Raises:
         InputError: If a frame cannot be read.
         OutputError: If the folder is not empty, or a file cannot be written.
+        KeyboardInterrupt: If a frame is being written, whose images can be incomplete; the lists contain those before.
     """
-    with TUMWriter(out, source.camera, source.groundtruth) as writer, suppress(KeyboardInterrupt):
-        for frame in track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal):
+    with TUMWriter(out, source.camera, source.groundtruth) as writer:
+        frames = track(source, "saving (Ctrl-C to stop)", console=console, disable=not console.is_terminal)
+        for frame in _until_interrupted(frames):
             writer.add(frame)
             if interrupted.is_set():
                 break
     return len(writer)
+
+
+def _until_interrupted(frames: Iterable[RGBDFrame]) -> Iterator[RGBDFrame]:
+    """Yield frames until a KeyboardInterrupt ends the wait for the next one."""
+    source = iter(frames)
+    while True:
+        try:
+            frame = next(source)
+        except (StopIteration, KeyboardInterrupt):
+            return
+        yield frame
 
 
 def record_static(
