@@ -17,6 +17,8 @@ from torch import Tensor
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, OutputError
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.kernels.voxel_blocks import VOLUME
+from v3d_torch.occupancy import voxel_blocks
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.map_server import write_map_server_files
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
@@ -107,6 +109,29 @@ def test_grid_of_a_room_shows_its_walls_also_in_a_tilted_world(twist: tuple[floa
     near_walls = [{state(x + i * SIZE, z + j * SIZE) for i in (-1, 0, 1) for j in (-1, 0, 1)} for x, z in walls]
     assert all(VoxelState.OCCUPIED in states for states in near_walls)
     assert state(right + 0.3, 0.0) == VoxelState.UNKNOWN
+
+
+def test_grid_does_not_depend_on_the_size_of_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    occupancy = map_of(box_of_voxels((30, -5, 3), (33, -3, 40)), box_of_voxels((-20, -12, -20), (30, -1, 50)))
+    whole = occupancy_grid(occupancy, FLOOR, HEIGHTS)
+    monkeypatch.setattr(voxel_blocks, "_PART", 1)
+    parts = occupancy_grid(occupancy, FLOOR, HEIGHTS)
+    assert torch.equal(parts.states, whole.states) and parts.origin == whole.origin
+    assert len(whole.states.unique()) == 3
+
+
+def test_grid_needs_no_points_of_the_whole_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    occupancy, sizes = map_of(torch.zeros(0, 3, dtype=torch.int64), box_of_voxels((-20, -12, -20), (30, -1, 50))), []
+    voxels_where = voxel_blocks.VoxelBlocks.voxels_where
+
+    def measured(blocks: voxel_blocks.VoxelBlocks, mask: Tensor) -> Tensor:
+        sizes.append(mask.numel())
+        return voxels_where(blocks, mask)
+
+    monkeypatch.setattr(voxel_blocks, "_PART", 2)
+    monkeypatch.setattr(voxel_blocks.VoxelBlocks, "voxels_where", measured)
+    occupancy_grid(occupancy, FLOOR, HEIGHTS)
+    assert len(occupancy.blocks) > 4 and max(sizes) == 2 * VOLUME
 
 
 @pytest.mark.parametrize("heights", [(0.5, 0.5), (1.0, 0.2), (0.1, math.nan)])

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.errors import OutputError
+from v3d_torch.occupancy import voxel_blocks
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.occupancy.octomap_file import write_octomap
 
@@ -124,3 +125,12 @@ def test_map_larger_than_an_octree_is_rejected(tmp_path: Path) -> None:
             write_octomap(tmp_path / "map.bt", occupancy)
     write_octomap(tmp_path / "map.bt", map_of(torch.tensor([[(1 << 15) - 1, 0, -(1 << 15)]]), NONE))
     assert len(read(tmp_path / "map.bt")[1]) == 1
+
+
+def test_file_does_not_depend_on_the_size_of_the_parts(
+    room: OccupancyMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_octomap(tmp_path / "whole.bt", room)
+    monkeypatch.setattr(voxel_blocks, "_PART", 1)
+    write_octomap(tmp_path / "parts.bt", room)
+    assert (tmp_path / "parts.bt").read_bytes() == (tmp_path / "whole.bt").read_bytes()

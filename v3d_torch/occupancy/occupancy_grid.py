@@ -71,8 +71,11 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
     if not low < high:
         raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest")
     T_lw, low, high = level_frame(floor.up), low + floor.offset, high + floor.offset
-    occupied = _between(occupancy.occupied_points, T_lw, low, high)
-    known = torch.cat([occupied, _between(occupancy.free_points, T_lw, low, high)])
+    occupied = torch.cat(
+        [_between(points, T_lw, low, high) for points in occupancy.points_by_part(VoxelState.OCCUPIED)]
+    )
+    free = [_extent(_between(points, T_lw, low, high)) for points in occupancy.points_by_part(VoxelState.FREE)]
+    known = torch.cat([occupied, *free])
     if len(known) == 0:
         return OccupancyGrid(torch.zeros(0, 0, dtype=torch.int8), size, (0.0, 0.0), T_lw, floor.offset)
     first = (known.amin(dim=0) / size).floor().to(torch.int64)
@@ -95,3 +98,8 @@ def _between(points: Tensor, T_lw: Tensor, low: float, high: float) -> Tensor:
     """Coordinates x and y of the world points (N, 3) between two coordinates z, level frame, (M, 2)."""
     level = points @ T_lw[:3, :3].T
     return level[(level[:, 2] >= low) & (level[:, 2] <= high), :2]
+
+
+def _extent(points: Tensor) -> Tensor:
+    """Smallest and largest coordinates of points (N, 2), (2, 2); (0, 2) if there are no points."""
+    return torch.stack(points.aminmax(dim=0)) if len(points) else points

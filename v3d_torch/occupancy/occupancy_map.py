@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from typing import Any
 
@@ -60,13 +60,26 @@ class OccupancyMap:
     @property
     def occupied_points(self) -> Tensor:
         """Centres of the occupied voxels, metres, float64, shape :math:`(N, 3)`."""
-        return self._centres(self.blocks.log_odds >= 0)
+        return torch.cat(list(self.points_by_part(VoxelState.OCCUPIED)))
 
     @property
     def free_points(self) -> Tensor:
         """Centres of the free voxels, metres, float64, shape :math:`(N, 3)`."""
-        log_odds = self.blocks.log_odds
-        return self._centres((log_odds < 0) & (log_odds != UNKNOWN))
+        return torch.cat(list(self.points_by_part(VoxelState.FREE)))
+
+    def points_by_part(self, state: VoxelState) -> Iterator[Tensor]:
+        """Yield the centres of the occupied or free voxels, one part of the map at a time, to save memory.
+
+        Args:
+            state: State of the voxels, not unknown.
+
+        Returns:
+            Centres, metres, float64, shape :math:`(N, 3)`, of each part; at least one tensor.
+        """
+        for part in self.blocks.parts():
+            known, is_occupied = part.log_odds != UNKNOWN, part.log_odds >= 0
+            voxels = part.voxels_where(is_occupied if state == VoxelState.OCCUPIED else known & ~is_occupied)
+            yield (voxels.to(torch.float64) + 0.5) * self.config.voxel_size
 
     def integrate(self, depth: Tensor, static: Tensor, rays: Tensor, T_wc: Tensor) -> None:
         """Add the observations of a depth image.
@@ -175,10 +188,6 @@ class OccupancyMap:
     def _voxels(self, points: Tensor) -> Tensor:
         """Coordinates of the voxels around points (..., 3), int64, (N, 3)."""
         return (points.detach().to(torch.float64).reshape(-1, 3) / self.config.voxel_size).floor().to(torch.int64)
-
-    def _centres(self, mask: Tensor) -> Tensor:
-        """Centres of the voxels in a mask (N, 4096), float64, (M, 3)."""
-        return (self.blocks.voxels_where(mask).to(torch.float64) + 0.5) * self.config.voxel_size
 
     def _remove_farthest(self, camera: Tensor) -> None:
         """Remove the blocks farthest from the camera, but no block within the window around the camera."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from v3d_torch.errors import OutputError
 from v3d_torch.io.files import atomic_write
 from v3d_torch.io.paths import StrPath
-from v3d_torch.kernels.voxel_blocks import UNKNOWN
+from v3d_torch.kernels.voxel_blocks import BITS, UNKNOWN
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 
 _DEPTH = 16
@@ -29,7 +29,7 @@ _FREE, _OCCUPIED, _INNER = 1, 2, 3
 """States of a child; 0 is unknown."""
 
 Codes = NDArray[np.uint64]
-Levels = list[tuple[Codes, NDArray[np.uint64]]]
+States = NDArray[np.uint64]
 
 
 def write_octomap(path: StrPath, occupancy: OccupancyMap) -> None:
@@ -42,22 +42,25 @@ def write_octomap(path: StrPath, occupancy: OccupancyMap) -> None:
     Raises:
         OutputError: If the file cannot be written, or the map is larger than OctoMap's trees.
     """
-    path, log_odds = Path(path), occupancy.blocks.log_odds
-    known = log_odds != UNKNOWN
-    voxels = occupancy.blocks.voxels_where(known)
-    states = torch.where(log_odds[known] >= 0, _OCCUPIED, _FREE).numpy().astype(np.uint64)
-    if len(voxels) and int(torch.maximum(voxels, -voxels - 1).max()) >= _HALF:
-        extent = _HALF * occupancy.config.voxel_size
-        raise OutputError(
-            f"{path}: the map is larger than an OctoMap of {extent:.0f} m in each direction; use larger voxels"
-        )
-    words, count = _encode(_morton_codes(voxels.numpy()), states)
+    path, tree, blocks = Path(path), _InnerNodes(), []
+    for part in occupancy.blocks.parts():
+        known = part.log_odds != UNKNOWN
+        voxels = part.voxels_where(known)
+        if len(voxels) and int(torch.maximum(voxels, -voxels - 1).max()) >= _HALF:
+            extent = _HALF * occupancy.config.voxel_size
+            raise OutputError(
+                f"{path}: the map is larger than an OctoMap of {extent:.0f} m in each direction; use larger voxels"
+            )
+        states = torch.where(part.log_odds[known] >= 0, _OCCUPIED, _FREE).numpy().astype(np.uint64)
+        blocks.append(tree.add_leaves(_morton_codes(voxels.numpy()), states))
+    codes, states = (np.concatenate(values) for values in zip(*blocks, strict=True))
+    tree.add_parents(codes, states, range(BITS + 1, _DEPTH + 1))
     header = (
         "# Octomap OcTree binary file\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
-        f"id OcTree\nsize {count}\nres {occupancy.config.voxel_size:g}\ndata\n"
+        f"id OcTree\nsize {tree.count}\nres {occupancy.config.voxel_size:g}\ndata\n"
     )
     with atomic_write(path) as temporary:
-        temporary.write_bytes(header.encode("ascii") + words.astype("<u2").tobytes())
+        temporary.write_bytes(header.encode("ascii") + tree.words().astype("<u2").tobytes())
 
 
 def _morton_codes(voxels: NDArray[np.int64]) -> Codes:
@@ -70,29 +73,58 @@ def _morton_codes(voxels: NDArray[np.int64]) -> Codes:
     return codes
 
 
-def _encode(codes: Codes, states: NDArray[np.uint64]) -> tuple[NDArray[np.uint64], int]:
-    """Encode an octree from its known leaves.
+class _InnerNodes:
+    """Inner nodes of an octree, added from the leaves to the root.
 
-    Args:
-        codes: Morton codes of the leaves, (N,).
-        states: State of each leaf, (N,).
-
-    Returns:
-        Word of each inner node in the order of the file, and the number of nodes.
+    Attributes:
+        count: Number of nodes so far, with leaves and without those that were merged.
     """
-    order = codes.argsort()
-    codes, states = codes[order], states[order]
-    firsts, depths, words, count = [], [], [], len(codes)
-    for height in range(1, _DEPTH + 1):  # from the leaves to the root
-        parents, begin = np.unique(codes >> np.uint64(3), return_index=True)
-        bits = states << (codes & np.uint64(7)) * np.uint64(2)
-        word = np.bitwise_or.reduceat(bits, begin) if len(codes) else bits
-        merged = (word == 0x5555 * _FREE) | (word == 0x5555 * _OCCUPIED)
-        count += len(parents) - 8 * int(merged.sum())
-        firsts.append(parents[~merged] << np.uint64(3 * height))
-        depths.append(np.full(len(parents) - int(merged.sum()), _DEPTH - height))
-        words.append(word[~merged])
-        codes, states = parents, np.where(merged, word & np.uint64(3), np.uint64(_INNER))
-    # Depth-first order: a node precedes its descendants, which precede the next child.
-    order = np.lexsort([np.concatenate(depths), np.concatenate(firsts)])
-    return np.concatenate(words)[order], count
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._firsts: list[Codes] = []
+        self._depths: list[NDArray[np.int64]] = []
+        self._words: list[NDArray[np.uint64]] = []
+
+    def add_leaves(self, codes: Codes, states: States) -> tuple[Codes, States]:
+        """Add known voxels and the nodes up to the blocks of the map, which contain all voxels of these nodes.
+
+        Args:
+            codes: Morton codes of the voxels, (N,).
+            states: State of each voxel, (N,).
+
+        Returns:
+            Codes and states of the blocks.
+        """
+        self.count += len(codes)
+        return self.add_parents(codes, states, range(1, BITS + 1))
+
+    def add_parents(self, codes: Codes, states: States, heights: range) -> tuple[Codes, States]:
+        """Add the parents of nodes, the parents of these, and so on. Children of the same state are merged.
+
+        Args:
+            codes: Morton codes of the nodes, (N,).
+            states: State of each node, (N,).
+            heights: Heights of the parents above the voxels, ascending.
+
+        Returns:
+            Codes and states of the highest parents.
+        """
+        order = codes.argsort()
+        codes, states = codes[order], states[order]
+        for height in heights:
+            parents, begin = np.unique(codes >> np.uint64(3), return_index=True)
+            bits = states << (codes & np.uint64(7)) * np.uint64(2)
+            word = np.bitwise_or.reduceat(bits, begin) if len(codes) else bits
+            merged = (word == 0x5555 * _FREE) | (word == 0x5555 * _OCCUPIED)
+            self.count += len(parents) - 8 * int(merged.sum())
+            self._firsts.append(parents[~merged] << np.uint64(3 * height))
+            self._depths.append(np.full(len(parents) - int(merged.sum()), _DEPTH - height))
+            self._words.append(word[~merged])
+            codes, states = parents, np.where(merged, word & np.uint64(3), np.uint64(_INNER))
+        return codes, states
+
+    def words(self) -> NDArray[np.uint64]:
+        """Words of the nodes in depth-first order: a node precedes its descendants, which precede the next child."""
+        order = np.lexsort([np.concatenate(self._depths), np.concatenate(self._firsts)])
+        return np.concatenate(self._words)[order]

@@ -6,7 +6,7 @@ that one tensor operation looks up many voxels.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -18,6 +18,9 @@ from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.kernels.voxel_blocks import BITS, HIT, SIDE, UNKNOWN, VOLUME
 from v3d_torch.occupancy.ray_casting import Observations, index_in_block
 from v3d_torch.occupancy.sensor_model import SensorModel
+
+_PART = 256
+"""Maximum number of blocks of a part: a million voxels, whose coordinates need 100 MB with intermediate results."""
 
 
 class VoxelBlocks:
@@ -101,6 +104,16 @@ class VoxelBlocks:
             first = len(self)
             self._append(other.coordinates[missing])
             self._log_odds[first : len(self)] = other.log_odds[missing]
+
+    def parts(self) -> Iterator[VoxelBlocks]:
+        """Yield parts with some of the blocks each, in their order, so that work on all voxels needs little memory.
+
+        There is at least one part. Parts share the memory of the blocks and are only read.
+        """
+        for first in range(0, max(len(self), 1), _PART):
+            rows, part = slice(first, first + _PART), VoxelBlocks()
+            part.load_state_dict({"coordinates": self.coordinates[rows], "log_odds": self.log_odds[rows]})
+            yield part
 
     def voxels_where(self, mask: Tensor) -> Tensor:
         """Coordinates of voxels.
