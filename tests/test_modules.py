@@ -16,6 +16,7 @@ from helpers.module_cases import (
     CAMERA,
     CAMERA_CASES,
     CASES,
+    FUNCTION_CASES,
     Case,
     Inputs,
     centroids,
@@ -170,6 +171,22 @@ def test_clouds_can_be_mapped_over_a_batch(case: Case) -> None:
     mapped = torch.func.vmap(apply)(*(each.unflatten(0, (3, 1)) for each in inputs.values()))
     for one, other in zip(mapped, tensors(case.module(**inputs)), strict=True):
         torch.testing.assert_close(without_padding(one.flatten(0, 1), other), other, equal_nan=True)
+
+
+INTEGERS = {
+    **{name: case for name, case in CAMERA_CASES.items() if name != "DescriptorMatcher"},
+    **{name: FUNCTION_CASES[name] for name in ("umeyama", "ate")},
+}
+
+
+@pytest.mark.parametrize("case", INTEGERS.values(), ids=INTEGERS)
+def test_integers_give_the_results_of_equal_floating_point_numbers(case: Case) -> None:
+    inputs = {
+        name: each.round() if each.is_floating_point() else each
+        for name, each in case.inputs(1, 30, torch.float32).items()
+    }
+    as_integers = {name: each.to(torch.int64) if each.is_floating_point() else each for name, each in inputs.items()}
+    assert_same(case.function(**as_integers), case.function(**inputs))
 
 
 # ---------------------------------------------------------------- gradients

@@ -15,7 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
 from v3d_torch.kernels.compiler import compiled_by
@@ -95,8 +95,8 @@ def optimise_pose_graph(
         robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
 
     Returns:
-        The poses of minimal cost, with the dtype of ``T_wc``; costs at least in float32. Poses without a path
-        of edges to a fixed pose are determined only relative to each other.
+        The poses of minimal cost, with the dtype of ``T_wc``, float32 for integers; costs at least in float32.
+        Poses without a path of edges to a fixed pose are determined only relative to each other.
 
     Raises:
         InputError: If ``edges`` is not int64, or has an index out of range.
@@ -263,7 +263,8 @@ def _move(initial: Tensor, optimum: Tensor, steps: Tensor | None, is_fixed: Tens
         T = T if steps is None else T @ pp.se3(steps).Exp()
         return pp.SE3(torch.where(is_fixed[..., 0], initial.tensor(), T.tensor().to(initial.dtype)))
     T = optimum if steps is None else optimum @ se3_exp(steps)
-    return torch.where(is_fixed, initial, T.to(initial.dtype))
+    dtype = result_dtype(initial.dtype)
+    return torch.where(is_fixed, initial.to(dtype), T.to(dtype))
 
 
 class PoseGraphOptimiser(torch.nn.Module):

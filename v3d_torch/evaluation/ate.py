@@ -11,6 +11,7 @@ from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
 from v3d_torch.geometry.long_products import sum_products
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.runtime.batches import fill_padding
 
 _MIN_PLANE_SPREAD = 1e-3
@@ -69,14 +70,14 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
         valid: Mask of the poses that are not padding, bool, shape :math:`(*, N)`; None for all.
 
     Returns:
-        ATE, metres, dtype of ``T_ec``, shape :math:`(*)`; NaN without poses.
+        ATE, metres, dtype of ``T_ec``, float32 for integers, shape :math:`(*)`; NaN without poses.
     """
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     each = None if valid is None else valid[..., None, None]
     truth, estimate = fill_padding(T_gc, each, 0.0), fill_padding(T_ec, each, 0.0)
     errors = absolute_errors(truth, estimate, align(truth, estimate, valid))
-    return root_mean_square(errors, valid).to(T_ec.dtype)
+    return root_mean_square(errors, valid).to(result_dtype(T_ec.dtype))
 
 
 def root_mean_square(errors: Tensor, valid: Tensor | None) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.evaluation.association import Matches
 from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.runtime.batches import common_batch
 from v3d_torch.types import Trajectory
@@ -70,8 +71,8 @@ def rpe(
         delta: Time between the poses of a pair, seconds.
 
     Returns:
-        Translation error, metres per ``delta``, and rotation error, degrees per ``delta``, dtype of ``T_ec``, shape
-        :math:`(*)` each; NaN if there is no pair.
+        Translation error, metres per ``delta``, and rotation error, degrees per ``delta``, dtype of ``T_ec``, float32
+        for integers, shape :math:`(*)` each; NaN if there is no pair.
     """
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
@@ -86,7 +87,7 @@ def rpe(
         _take_poses(torch.where(exists[..., None, None], T.to(torch.float64), identity), order) for T in (T_gc, T_ec)
     )
     errors = relative_errors(truth, _take_poses(truth, second), estimate, _take_poses(estimate, second))
-    trans, rot = (root_mean_square(each, is_pair).to(T_ec.dtype) for each in errors)
+    trans, rot = (root_mean_square(each, is_pair).to(result_dtype(T_ec.dtype)) for each in errors)
     return trans, rot
 
 

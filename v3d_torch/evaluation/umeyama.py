@@ -7,6 +7,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.long_products import sum_products
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
 from v3d_torch.runtime.batches import fill_padding
@@ -37,9 +38,10 @@ def umeyama(
         with_scale: True to estimate the scale, false for a scale of 1.
 
     Returns:
-        Transform ``T_qp``, with the scaled rotation :math:`s R` in its upper left block, dtype of ``p``, shape
-        :math:`(*, 4, 4)`. Points on a line do not determine the rotation; one of the solutions is returned. Without
-        points the result is the identity; points at one place do not determine the scale, which is then 1.
+        Transform ``T_qp``, with the scaled rotation :math:`s R` in its upper left block, dtype of ``p``,
+        float32 for integers, shape :math:`(*, 4, 4)`. Points on a line do not determine the rotation; one of the
+        solutions is returned. Without points the result is the identity;
+        points at one place do not determine the scale, which is then 1.
     """
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
@@ -59,7 +61,7 @@ def umeyama(
         R = R * torch.where(spread > 0, scale, 1.0)[..., None, None]
     top = torch.cat([R, (mean_b - (R @ mean_a[..., None])[..., 0])[..., None]], dim=-1)
     last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, last], dim=-2).to(p.dtype)
+    return torch.cat([top, last], dim=-2).to(result_dtype(p.dtype))
 
 
 def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:

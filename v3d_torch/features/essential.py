@@ -17,6 +17,7 @@ from torch import Tensor
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
 from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
 from v3d_torch.features.usac import usac_options
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
 from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.runtime.batches import common_batch, fill_padding
@@ -73,7 +74,8 @@ def essential_ransac(
         seed: Seed of the sampling.
 
     Returns:
-        Matrices with the dtype of ``uv_a``; their sign is arbitrary. No matrix is found from fewer than 6 pairs.
+        Matrices with the dtype of ``uv_a``, float32 for integers; their sign is arbitrary. No matrix is found from
+        fewer than 6 pairs.
     """
     KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
@@ -97,7 +99,7 @@ def essential_ransac(
     if needs_gradient(*problem):
         state = problem.differentiate(state, active)
     E = torch.where(found[..., None, None], compose(*state), 0.0)
-    return EssentialMatrix(E.to(uv_a.dtype), inliers, found)
+    return EssentialMatrix(E.to(result_dtype(uv_a.dtype)), inliers, found)
 
 
 def _sample_five_points(

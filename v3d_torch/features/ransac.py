@@ -15,6 +15,7 @@ from torch import Tensor
 from v3d_torch.features.p3p import solve_p3p
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
 from v3d_torch.features.usac import usac_options
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
 from v3d_torch.optim.levenberg_marquardt import select
@@ -100,7 +101,7 @@ def pnp_ransac(
         seed: Seed of the sampling.
 
     Returns:
-        Poses with the dtype of ``points``. No pose is found from fewer than 6 points.
+        Poses with the dtype of ``points``, float32 for integers. No pose is found from fewer than 6 points.
     """
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
@@ -114,8 +115,8 @@ def pnp_ransac(
         K.detach().to(torch.float64).expand(*batch, 3, 3),
     )
     settings = threshold, iterations, seed
-    sigma = uv.new_full(uv.shape[:-1], threshold / math.sqrt(CHI2_THRESHOLD_2D))
-    T_cw = torch.eye(4, dtype=points.dtype, device=points.device).expand(*batch, 4, 4)
+    sigma, dtype = threshold / math.sqrt(CHI2_THRESHOLD_2D), result_dtype(points.dtype)
+    T_cw = torch.eye(4, dtype=dtype, device=points.device).expand(*batch, 4, 4)
     inliers, found, done = torch.zeros_like(mask), torch.zeros_like(count, dtype=torch.bool), count < _MIN_PNP_POINTS
 
     def hypotheses() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
@@ -133,7 +134,7 @@ def pnp_ransac(
         weights = consensus.to(torch.float64)
         refined = refine_pose(hypothesis, points, uv, K, None, sigma, weights=weights, valid=valid, rounds=2)
         is_new = exists & ~done
-        T_cw, inliers = select(is_new, (refined.T_cw.to(points.dtype), refined.inliers), (T_cw, inliers))
+        T_cw, inliers = select(is_new, (refined.T_cw.to(dtype), refined.inliers), (T_cw, inliers))
         found = found | is_new
         done = done | (is_new & (2 * inliers.sum(dim=-1) > count))
         if is_all_true(done):

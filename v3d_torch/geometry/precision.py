@@ -1,4 +1,4 @@
-"""Dtype of intermediate results."""
+"""Dtypes of results and of intermediate results."""
 
 from __future__ import annotations
 
@@ -12,3 +12,12 @@ def working_dtype(dtype: torch.dtype) -> torch.dtype:
         dtype: Dtype of the inputs, floating point.
     """
     return torch.promote_types(dtype, torch.float32)
+
+
+def result_dtype(dtype: torch.dtype) -> torch.dtype:
+    """Return the dtype of a function's results: that of its inputs, or float32 for integers, which cannot hold them.
+
+    Args:
+        dtype: Dtype of the inputs.
+    """
+    return dtype if dtype.is_floating_point else torch.float32

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
@@ -112,8 +112,8 @@ def bundle_adjust(
         tolerance: Relative change of the cost that ends the optimisation.
 
     Returns:
-        Poses and landmarks with the lowest robust cost found, with the dtypes of ``T_cw`` and of ``points``; chi2 and
-        costs at least in float32.
+        Poses and landmarks with the lowest robust cost found, with the dtypes of ``T_cw`` and of ``points``, float32
+        for integers; chi2 and costs at least in float32.
 
     Raises:
         InputError: If ``pose`` or ``point`` is not int64, or has an index out of range.
@@ -132,8 +132,9 @@ def bundle_adjust(
     chi2 = found.chi2 if valid is None else torch.where(valid, found.chi2, torch.inf)
     wide = working_dtype(T_cw.dtype)  # costs can exceed the range of half precision
     return BundleAdjustment(
-        T_cw=found.T_cw.to(T_cw.dtype, copy=True),  # without a successful step, these are the tensors of the caller
-        points=found.points.to(points.dtype, copy=True),
+        # Without a successful step, poses and landmarks are the tensors of the caller.
+        T_cw=found.T_cw.to(result_dtype(T_cw.dtype), copy=True),
+        points=found.points.to(result_dtype(points.dtype), copy=True),
         inliers=chi2 <= problem.thresholds,
         chi2=chi2.to(wide),
         cost_before=found.cost_before.to(wide),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import MAX_READOUT
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_adjustment import sort_by_point
@@ -79,9 +79,9 @@ def estimate_readout(
         valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all.
 
     Returns:
-        The new ``seconds``, with the dtype of ``T_cw``, and ``information``, at least in float32, shape :math:`(*)`
-        each. They equal the inputs if the readout is known, or if the cost has no minimum because the camera stood
-        still or moved uniformly.
+        The new ``seconds``, with the dtype of ``T_cw``, float32 for integers, and ``information``, at least in float32,
+        shape :math:`(*)` each. They equal the inputs if the readout is known, or if the cost has no minimum because the
+        camera stood still or moved uniformly.
     """
     problem, state = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
@@ -93,7 +93,7 @@ def estimate_readout(
     old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
     old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
     new_seconds, new_information = combine_readouts(old_seconds, old_information, slope, curvature)
-    return new_seconds.to(T_cw.dtype), new_information.to(working_dtype(T_cw.dtype))
+    return new_seconds.to(result_dtype(T_cw.dtype)), new_information.to(working_dtype(T_cw.dtype))
 
 
 def combine_readouts(seconds: Tensor, information: Tensor, slope: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:

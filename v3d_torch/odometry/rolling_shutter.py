@@ -19,6 +19,7 @@ from v3d_torch.config import RollingShutterConfig
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.runtime.batches import fill_padding
@@ -147,8 +148,8 @@ def compensate_rolling_shutter(
         valid: Mask of the pixels that are not padding, bool, shape :math:`(*, N)`; None for all.
 
     Returns:
-        Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv`` and of shape
-        :math:`(*, N, 2)`; 0 for padding.
+        Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv``, float32 for
+        integers, and of shape :math:`(*, N, 2)`; 0 for padding.
     """
     seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]
     each = None if valid is None else valid[..., None]
@@ -159,7 +160,8 @@ def compensate_rolling_shutter(
     pixel_velocity, _ = motion_field(observed, inverse_depth, velocity.to(torch.float64), K.to(torch.float64))
     jacobian = -(row / (height - 1) - 0.5)[..., None] * pixel_velocity  # rows from -0.5 to 0.5
     compensated = observed + seconds * jacobian
-    return fill_padding(compensated, each, 0.0).to(uv.dtype), fill_padding(jacobian, each, 0.0).to(uv.dtype)
+    dtype = result_dtype(uv.dtype)
+    return fill_padding(compensated, each, 0.0).to(dtype), fill_padding(jacobian, each, 0.0).to(dtype)
 
 
 def compensate_features(features: Features, velocity: Tensor, readout: Readout, camera: PinholeCamera) -> Features:

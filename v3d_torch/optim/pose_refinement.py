@@ -15,7 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
@@ -177,8 +177,8 @@ def refine_pose(
         tolerance: Relative change of the cost that ends a round.
 
     Returns:
-        The refined poses and their inliers, with the dtype of ``T_cw``; chi2 and information at least in float32. A
-        pose without measurements is the prediction.
+        The refined poses and their inliers, with the dtype of ``T_cw``, float32 for integers; chi2 and information at
+        least in float32. A pose without measurements is the prediction.
 
     Example:
         Learn the weights of features through the poses of 32 frames:
@@ -216,18 +216,18 @@ def refine_pose(
         weights=fill_padding(torch.ones_like(thresholds) if weights is None else weights, valid, 0.0),
         valid=torch.ones_like(thresholds, dtype=torch.bool) if valid is None else valid,
     )
-    initial = T_cw.detach().to(torch.float64)
+    initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)
     batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2])
     if batch:
         initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
     minimise = partial(_minimise, initial, rounds=rounds, iterations=iterations, tolerance=tolerance)
     if not needs_gradient(*problem):
-        return _cast(minimise(*problem)[0], T_cw.dtype)
+        return _cast(minimise(*problem)[0], dtype)
     found, active = minimise(*problem.detach())
     robust = _is_robust(rounds - 1, rounds)
     at = problem.residuals_at(problem.differentiate(found.T_cw, active, robust=robust))
     information, _ = problem.normal_equations(at, problem.robust_cost(at, active, robust=robust)[1])
-    return _cast(PoseRefinement(at.T_cw, found.inliers, problem.chi2(at), information), T_cw.dtype)
+    return _cast(PoseRefinement(at.T_cw, found.inliers, problem.chi2(at), information), dtype)
 
 
 def _is_robust(index: int, rounds: int) -> bool:
