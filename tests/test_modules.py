@@ -173,13 +173,13 @@ def test_clouds_can_be_mapped_over_a_batch(case: Case) -> None:
         torch.testing.assert_close(without_padding(one.flatten(0, 1), other), other, equal_nan=True)
 
 
-INTEGERS = {
+GEOMETRIC = {
     **{name: case for name, case in CAMERA_CASES.items() if name != "DescriptorMatcher"},
     **{name: FUNCTION_CASES[name] for name in ("umeyama", "ate")},
 }
 
 
-@pytest.mark.parametrize("case", INTEGERS.values(), ids=INTEGERS)
+@pytest.mark.parametrize("case", GEOMETRIC.values(), ids=GEOMETRIC)
 def test_integers_give_the_results_of_equal_floating_point_numbers(case: Case) -> None:
     inputs = {
         name: each.round() if each.is_floating_point() else each
@@ -187,6 +187,35 @@ def test_integers_give_the_results_of_equal_floating_point_numbers(case: Case) -
     }
     as_integers = {name: each.to(torch.int64) if each.is_floating_point() else each for name, each in inputs.items()}
     assert_same(case.function(**as_integers), case.function(**inputs))
+
+
+def assert_any_input_can_have_the_batch_dimension(case: Case, inputs: Inputs, name: str) -> None:
+    """Compare a problem without batch dimension with two in which only one input has a batch dimension."""
+    found = case.function(**inputs | {name: torch.stack([inputs[name]] * 2)})
+    for one, other in zip(tensors(found), tensors(case.function(**inputs)), strict=True):
+        assert one.shape == (2, *other.shape)
+        torch.testing.assert_close(one, other.expand_as(one), equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("case", "name"),
+    [(case, name) for case in GEOMETRIC.values() for name in case.inputs(1, 1, torch.float64)],
+    ids=[f"{title} {name}" for title, case in GEOMETRIC.items() for name in case.inputs(1, 1, torch.float64)],
+)
+def test_any_input_can_have_the_batch_dimension(case: Case, name: str) -> None:
+    inputs = {key: each[0] for key, each in case.inputs(1, 30, torch.float64).items()}
+    assert_any_input_can_have_the_batch_dimension(case, inputs, name)
+
+
+@pytest.mark.parametrize("title", ["BundleAdjuster", "ReadoutEstimator", "PoseGraphOptimiser", "PnPRANSAC"])
+def test_optional_input_can_have_the_batch_dimension(title: str) -> None:
+    case = CASES[title]
+    inputs = {key: each[0] for key, each in case.inputs(1, 30, torch.float64).items()}
+    if title == "PnPRANSAC":
+        name, value = "initial_guess", torch.eye(4, dtype=torch.float64)
+    else:
+        name, value = "fixed", torch.arange(5 if title == "PoseGraphOptimiser" else 3) == 0
+    assert_any_input_can_have_the_batch_dimension(case, inputs | {name: value}, name)
 
 
 # ---------------------------------------------------------------- gradients

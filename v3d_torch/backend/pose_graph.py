@@ -224,7 +224,6 @@ def _prepare(
     robust: float | None,
 ) -> tuple[_Graph, Tensor]:
     """Graph and initial poses in float64, with the batch dimensions of all inputs."""
-    batch = common_batch(T_wc.shape[:-3], edges.shape[:-2], T_ij.shape[:-3])
     count, device = edges.shape[-2], T_wc.device
     identity = torch.eye(6, dtype=torch.float64, device=device)
     if fixed is None:
@@ -238,11 +237,16 @@ def _prepare(
     if valid is not None:
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
+    weights = fill_padding(weights, valid, 0.0)
+    batch = common_batch(
+        *(T_wc.shape[:-3], edges.shape[:-2], T_ij.shape[:-3], information.shape[:-3]),
+        *(weights.shape[:-1], fixed.shape[:-1]),
+    )
     graph = _Graph(
         edges=edges.expand(*batch, count, 2),
         T_ji=invert(T_ij).expand(*batch, count, 4, 4),
         information=information.expand(*batch, count, 6, 6),
-        weights=fill_padding(weights, valid, 0.0).expand(*batch, count),
+        weights=weights.expand(*batch, count),
         fixed=fixed.expand(*batch, T_wc.shape[-3]),
         limit=torch.tensor(torch.inf if robust is None else robust**2, dtype=torch.float64, device=device),
     )

@@ -77,8 +77,9 @@ def rpe(
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
-    batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1])
-    exists = stamps.new_ones(*batch, stamps.shape[-1], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
+    exists = torch.ones_like(stamps, dtype=torch.bool) if valid is None else valid
+    batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1], exists.shape[:-1])
+    exists = exists.expand(*batch, -1)
     order = torch.argsort(~exists, dim=-1, stable=True)  # padding last
     times = torch.where(exists, stamps.to(torch.float64), torch.inf).gather(-1, order)
     second, is_pair = find_later(times, exists.sum(dim=-1), delta)

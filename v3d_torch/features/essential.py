@@ -80,9 +80,11 @@ def essential_ransac(
     KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2])
-    mask = uv_a.new_ones(*batch, uv_a.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
     weights = torch.ones_like(uv_a[..., 0]) if weights is None else weights
+    present = torch.ones_like(uv_a[..., 0], dtype=torch.bool) if valid is None else valid
+    pairs = weights.shape[:-1], present.shape[:-1]
+    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], *pairs)
+    mask = present.expand(*batch, -1)
     row = None if valid is None else valid[..., None]
     problem = EpipolarProblem(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),

@@ -106,8 +106,10 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2])
-    mask = uv.new_ones(*batch, uv.shape[-2], dtype=torch.bool) if valid is None else valid.expand(*batch, -1)
+    present = torch.ones_like(uv[..., 0], dtype=torch.bool) if valid is None else valid
+    guess = torch.Size() if initial_guess is None else initial_guess.shape[:-2]
+    batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2], present.shape[:-1], guess)
+    mask = present.expand(*batch, -1)
     count = mask.sum(dim=-1)
     data = (
         points.detach().to(torch.float64).expand(*batch, -1, 3),

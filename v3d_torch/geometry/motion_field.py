@@ -38,7 +38,8 @@ def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, K: Tensor)
     focal_lengths, principal_point = K.diagonal(dim1=-2, dim2=-1)[..., None, :2], K[..., None, :2, 2]
     xy = ((uv - principal_point) / focal_lengths).mT
     # Velocity of the points divided by their depth; in these units the points are (x / z, y / z, 1, 1 / z).
-    w = inverse_depth[..., None, :]
-    relative = hat(velocity)[..., :3, :] @ torch.cat([xy, torch.ones_like(w).expand_as(xy[..., :1, :]), w], dim=-2)
+    x, y = xy.unbind(dim=-2)
+    points = torch.stack(torch.broadcast_tensors(x, y, torch.ones_like(x), inverse_depth), dim=-2)
+    relative = hat(velocity)[..., :3, :] @ points
     rate = relative[..., 2:, :]
     return (relative[..., :2, :] - rate * xy).mT * focal_lengths, -rate[..., 0, :] * inverse_depth

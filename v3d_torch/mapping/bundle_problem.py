@@ -214,14 +214,17 @@ def prepare_bundle(
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     target = whiten(measured, K.to(torch.float64))
-    batch = common_batch(T_cw.shape[:-3], points.shape[:-2], target.scale.shape[:-2], pose.shape[:-1])
-    each = (*batch, pose.shape[-1])  # observation
     if fixed is None:
         fixed = torch.arange(T_cw.shape[-3], device=T_cw.device) == 0
     pose = fill_indices("pose", pose, T_cw.shape[-3], valid)
     point = fill_indices("point", point, points.shape[-2], valid)
     if weights is None:
-        weights = torch.ones(each, dtype=torch.float64, device=uv.device)
+        weights = torch.ones(pose.shape, dtype=torch.float64, device=uv.device)
+    batch = common_batch(
+        *(T_cw.shape[:-3], points.shape[:-2], target.scale.shape[:-2], pose.shape[:-1], point.shape[:-1]),
+        *(fixed.shape[:-1], weights.shape[:-1]),
+    )
+    each = (*batch, pose.shape[-1])  # observation
     problem = BundleProblem(
         scale=target.scale.expand(*batch, 3, -1),
         offset=target.offset.expand(*batch, 3, -1),

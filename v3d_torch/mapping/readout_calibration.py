@@ -19,7 +19,7 @@ from v3d_torch.mapping.bundle_adjustment import sort_by_point
 from v3d_torch.mapping.bundle_problem import NEGLIGIBLE_DAMPING, BundleProblem, prepare_bundle
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import REGULARISATION
-from v3d_torch.runtime.batches import fill_padding, from_rows, to_rows
+from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
 _PRIOR_WEIGHT = 0.8
 """Weight of the earlier information. Successive local bundle adjustments share most of their observations, and the
@@ -83,6 +83,8 @@ def estimate_readout(
         shape :math:`(*)` each. They equal the inputs if the readout is known, or if the cost has no minimum because the
         camera stood still or moved uniformly.
     """
+    batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
+    T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
     problem, state = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
     )
@@ -92,7 +94,8 @@ def estimate_readout(
     slope, curvature = reduced_cost_derivatives(*state, *problem, by_readout)
     old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
     old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
-    new_seconds, new_information = combine_readouts(old_seconds, old_information, slope, curvature)
+    estimates = torch.broadcast_tensors(old_seconds, old_information, slope, curvature)
+    new_seconds, new_information = combine_readouts(*estimates)
     return new_seconds.to(result_dtype(T_cw.dtype)), new_information.to(working_dtype(T_cw.dtype))
 
 

@@ -217,7 +217,7 @@ def refine_pose(
         valid=torch.ones_like(thresholds, dtype=torch.bool) if valid is None else valid,
     )
     initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)
-    batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2])
+    batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2], problem.weights.shape[:-1])
     if batch:
         initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
     minimise = partial(_minimise, initial, rounds=rounds, iterations=iterations, tolerance=tolerance)
