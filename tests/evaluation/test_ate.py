@@ -161,3 +161,12 @@ def test_ate_has_gradients_that_are_finite_for_a_perfect_estimate() -> None:
     perfect = truth.clone().requires_grad_()
     ate(truth, perfect).sum().backward()
     assert perfect.grad is not None and perfect.grad.isfinite().all()
+
+
+def test_trajectory_that_is_not_finite_does_not_affect_the_others_of_a_batch() -> None:
+    truth = random_walk(20, seed=50)
+    T_gc, T_ec = truth.T_wc, noisy(truth, seed=51).T_wc
+    expected = torch.stack([ate(T_gc, T_ec), T_ec.new_tensor(torch.nan)])
+    lost = torch.full_like(T_ec, torch.nan)
+    torch.testing.assert_close(ate(torch.stack([T_gc, T_gc]), torch.stack([T_ec, lost])), expected, equal_nan=True)
+    torch.testing.assert_close(ate(torch.stack([T_gc, lost]), torch.stack([T_ec, T_ec])), expected, equal_nan=True)

@@ -103,3 +103,16 @@ def test_gradients_of_points_on_a_line_or_at_one_place_are_finite() -> None:
         p = (normal(6, 3) * scale).requires_grad_()
         umeyama(p, p.detach() + 1.0).sum().backward()
         assert p.grad is not None and p.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_points_that_are_not_finite_do_not_affect_the_others_of_a_batch(bad: float) -> None:
+    p, q = normal(3, 7, 3), normal(3, 7, 3, seed=1)
+    p[1, 2, 0] = bad
+    p.requires_grad_()
+    found = umeyama(p, q)
+    assert found[1, :3].isnan().all()
+    torch.testing.assert_close(found[::2], torch.stack([umeyama(p[0], q[0]), umeyama(p[2], q[2])]))
+    found[::2].sum().backward()
+    assert p.grad is not None and p.grad[::2].isfinite().all() and p.grad[::2].any()
+    torch.testing.assert_close(umeyama(p.detach(), q), found.detach(), equal_nan=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import pytest
 import torch
+from helpers import camera_inputs
 from helpers.two_views import CAMERA, two_views
 
 from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
@@ -147,3 +148,16 @@ def test_pose_has_gradients() -> None:
     refined = refine_pose(found.T_cw.detach(), points, uv, CAMERA.K, pixel_sigma=sigma, rounds=2)
     for one, other in zip((by_points, by_uv), torch.autograd.grad(refined.T_cw.sum(), (points, uv)), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-2, atol=1e-5)
+
+
+def test_prediction_that_is_not_finite_counts_as_none() -> None:
+    inputs = camera_inputs.points_in_view(1, 30, torch.float64)
+    inputs = {name: each[0] for name, each in inputs.items()}
+    guess = torch.full((4, 4), torch.nan, dtype=torch.float64)
+    found, expected = pnp_ransac(**inputs, initial_guess=guess), pnp_ransac(**inputs)
+    assert found.found and torch.equal(found.inliers, expected.inliers)
+    torch.testing.assert_close(found.T_cw, expected.T_cw)
+    two = pnp_ransac(**inputs, initial_guess=torch.stack([expected.T_cw, guess]))
+    assert two.found.all() and two.T_cw.isfinite().all()
+    few = {name: each[:2] if name != "K" else each for name, each in inputs.items()}
+    assert not pnp_ransac(**few, initial_guess=guess).found

@@ -153,3 +153,13 @@ def test_exp_and_log_gradcheck(angle: float) -> None:
     xi = tangents(angle, 2).requires_grad_()
     assert torch.autograd.gradcheck(se3_exp, xi)
     assert torch.autograd.gradcheck(lambda x: se3_log(se3_exp(x)), xi)
+
+
+def test_rotations_that_are_not_finite_do_not_affect_the_others_of_a_batch() -> None:
+    T = se3_exp(tangents(1.0, 3))
+    T[1, 0, 0] = torch.nan
+    T.requires_grad_()
+    found = orthonormalise(T)
+    assert found[1, :3, :3].isnan().all()
+    torch.testing.assert_close(found[::2], T[::2])
+    torch.testing.assert_close(orthonormalise(T.detach()), found.detach(), equal_nan=True)

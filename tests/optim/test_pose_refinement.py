@@ -328,3 +328,13 @@ def test_example_of_the_documentation_runs() -> None:
     for example in finder.find(refine_pose, "refine_pose", globs={}):
         runner.run(example)
     assert runner.summarize(verbose=False) == (0, 9)
+
+
+def test_prediction_that_is_not_finite_does_not_affect_the_others_of_a_batch() -> None:
+    inputs = camera_inputs.view(3, 30, torch.float64)
+    del inputs["valid"]
+    expected = refine_pose(**inputs).T_cw
+    inputs["T_cw"][1] = torch.nan
+    found = refine_pose(**inputs)
+    torch.testing.assert_close(found.T_cw[::2], expected[::2])
+    assert found.T_cw[1, :3].isnan().all() and not found.inliers[1].any()

@@ -10,6 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
+from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.runtime.batches import fill_padding
@@ -70,7 +71,8 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
         valid: Mask of the poses that are not padding, bool, shape :math:`(*, N)`; None for all.
 
     Returns:
-        ATE, metres, dtype of ``T_ec``, float32 for integers, shape :math:`(*)`; NaN without poses.
+        ATE, metres, dtype of ``T_ec``, float32 for integers, shape :math:`(*)`; NaN without poses, or if a
+        pose is not finite.
     """
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
@@ -98,7 +100,7 @@ def spans_plane(positions: Tensor, valid: Tensor | None = None) -> Tensor:
         valid: Mask of the positions that are not padding, bool, shape :math:`(..., N)`; None for all.
 
     Returns:
-        Bool, shape :math:`(...)`.
+        Bool, shape :math:`(...)`; false if a position is not finite.
     """
     each = None if valid is None else valid[..., None]
     centred = positions - weighted_mean(positions, None if each is None else each.to(positions.dtype))[..., None, :]
@@ -106,7 +108,8 @@ def spans_plane(positions: Tensor, valid: Tensor | None = None) -> Tensor:
         count: Tensor | int = max(positions.shape[-2], 1)
     else:
         centred, count = torch.where(each, centred, 0.0), each.sum(dim=-2, keepdim=True).clamp(min=1)
-    spread = torch.linalg.eigvalsh(sum_products(centred, centred) / count).clamp(min=0).sqrt()  # increasing
+    covariance, _ = zero_if_not_finite(sum_products(centred, centred) / count)
+    spread = torch.linalg.eigvalsh(covariance).clamp(min=0).sqrt()  # increasing
     return spread[..., 1] > _MIN_PLANE_SPREAD
 
 

@@ -6,6 +6,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import se3_exp
@@ -40,8 +41,8 @@ def umeyama(
     Returns:
         Transform ``T_qp``, with the scaled rotation :math:`s R` in its upper left block, dtype of ``p``,
         float32 for integers, shape :math:`(*, 4, 4)`. Points on a line do not determine the rotation; one of the
-        solutions is returned. Without points the result is the identity;
-        points at one place do not determine the scale, which is then 1.
+        solutions is returned. Without points the result is the identity; points at one place do not determine the
+        scale, which is then 1. It is NaN if a point is not finite.
     """
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
@@ -81,14 +82,16 @@ def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def nearest_rotation(M: Tensor) -> Tensor:
-    """Rotation R that maximises trace(R^T M), for matrices of shape (..., 3, 3).
+    """Rotation R that maximises trace(R^T M), for matrices of shape (..., 3, 3); NaN if they are not finite.
 
     The gradient is computed from the maximum, so that it is finite even where singular vectors have no gradient.
     """
     with torch.no_grad():
-        U, _, Vh = torch.linalg.svd(M)
+        finite, is_unknown = zero_if_not_finite(M)
+        U, _, Vh = torch.linalg.svd(finite)
         signs = torch.stack([*torch.ones_like(M[..., :2, 0]).unbind(-1), torch.linalg.det(U @ Vh).sign()], dim=-1)
         R = (U * signs[..., None, :]) @ Vh  # the last sign excludes reflections
+        R = torch.where(is_unknown, torch.nan, R)
     if not needs_gradient(M):
         return R
     # Gradient and negated Hessian of trace(exp(phi)^T A) by phi, with A = M R^T.
@@ -96,6 +99,6 @@ def nearest_rotation(M: Tensor) -> Tensor:
     gradient = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
     fixed = ((A + A.mT) / 2).detach()
     H = fixed.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] * torch.eye(3, dtype=A.dtype, device=A.device)
-    phi = (torch.linalg.pinv(H - fixed, hermitian=True) @ gradient[..., None])[..., 0]
+    phi = (torch.linalg.pinv(zero_if_not_finite(H - fixed)[0], hermitian=True) @ gradient[..., None])[..., 0]
     turn = torch.cat([torch.zeros_like(phi), zero_with_gradient(phi)], dim=-1)
     return se3_exp(turn)[..., :3, :3] @ R

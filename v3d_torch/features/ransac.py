@@ -93,8 +93,8 @@ def pnp_ransac(
         points: Points in a frame "w", metres, floating point, shape :math:`(*, N, 3)`.
         uv: Undistorted pixels of the points, shape :math:`(*, N, 2)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`; None if there is no prediction. If the refined
-            prediction explains more than half of the points, RANSAC is skipped.
+        initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`; None, or NaN in a batch, if there is no prediction.
+            If the refined prediction explains more than half of the points, RANSAC is skipped.
         valid: Mask of the points that are not padding, bool, shape :math:`(*, N)`; None for all.
         threshold: Maximum reprojection error of an inlier, pixels.
         iterations: Maximum number of hypotheses.
@@ -124,7 +124,8 @@ def pnp_ransac(
     def hypotheses() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Poses, a mask of the problems with a pose, and a mask of the points that refine it, (..., N)."""
         if initial_guess is not None:
-            yield initial_guess.detach().expand(*batch, 4, 4), torch.ones_like(done), mask
+            predicted = initial_guess.detach().expand(*batch, 4, 4)
+            yield predicted, predicted.isfinite().all(dim=-1).all(dim=-1), mask
         if can_read(data[1]):
             best, exists = _sample_opencv(*data, mask & ~done[..., None], *settings)
         else:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import se3 as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -84,10 +85,11 @@ def orthonormalise(T: Tensor) -> Tensor:
         T: Rigid motions with rounding errors, shape :math:`(..., 4, 4)`.
 
     Returns:
-        Rigid motions, shape :math:`(..., 4, 4)`, with (0, 0, 0, 1) as last row.
+        Rigid motions, shape :math:`(..., 4, 4)`, with (0, 0, 0, 1) as last row; NaN for rotations that are not finite.
     """
-    U, _, Vh = torch.linalg.svd(T[..., :3, :3])
-    return _assemble(U @ Vh, T[..., :3, 3:])
+    M, is_unknown = zero_if_not_finite(T[..., :3, :3])
+    U, _, Vh = torch.linalg.svd(M)
+    return _assemble(torch.where(is_unknown, torch.nan, U @ Vh), T[..., :3, 3:])
 
 
 def _assemble(R: Tensor, t: Tensor) -> Tensor:
