@@ -277,3 +277,18 @@ def test_window_around_the_camera_is_never_forgotten(caplog: pytest.LogCaptureFi
         " occupancy.max_blocks is 1; set larger voxels (occupancy.voxel_size is 0.05 m), or a larger"
         " occupancy.max_blocks"
     )
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf, 1e30])
+@pytest.mark.parametrize("radius", [0.0, 0.1])
+def test_points_that_are_not_finite_or_very_far_away_are_unknown(
+    bad: float, radius: float, room: OccupancyMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = room.free_points[:3].clone()
+    points[1, 0] = bad
+    assert not room.is_free(points, radius)[1]
+    monkeypatch.setattr(compiler, "ENABLED", False)
+    assert not room.is_free(points, radius)[1]
+    assert room.distance(points).isnan().tolist() == [False, True, False]
+    assert room.gradient(points).isnan().any(dim=1).tolist() == [False, True, False]
+    assert room.states(points)[1] == VoxelState.UNKNOWN and room.probability(points)[1].isnan()

@@ -36,15 +36,18 @@ class NearestVoxels:
         """Find the nearest voxel of each point.
 
         Args:
-            points: Finite points, metres, float64, shape :math:`(P, 3)`.
+            points: Points, metres, float64, shape :math:`(P, 3)`.
 
         Returns:
             Centre of the nearest voxel, shape :math:`(P, 3)`, and mask of the points with a voxel within the distance,
-            bool, shape :math:`(P,)`; for other points, the centre is the point itself.
+            bool, shape :math:`(P,)`; for other points, and for those that are not finite, the centre is the point
+            itself.
         """
-        _, row = self._tree.query(points.numpy(), distance_upper_bound=self._max_distance)
+        is_finite = points.isfinite().all(dim=1)  # SciPy rejects other points
+        finite = points.where(is_finite[:, None], 0.0)
+        _, row = self._tree.query(finite.numpy(), distance_upper_bound=self._max_distance)
         index = torch.from_numpy(np.asarray(row))
-        near = index < len(self._centres)
+        near = is_finite & (index < len(self._centres))
         nearest = points.clone()
         nearest[near] = self._centres[index[near]]
         return nearest, near

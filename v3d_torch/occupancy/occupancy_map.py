@@ -132,10 +132,13 @@ class OccupancyMap:
             radius: Radius of the balls, metres.
 
         Returns:
-            True if every voxel that a ball touches is free, bool, shape :math:`(...)`.
+            True if every voxel that a ball touches is free, bool, shape :math:`(...)`; false for centres that are not
+            finite.
         """
         rows = points.reshape(-1, 3).to(torch.float64)
-        return are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
+        free = are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
+        # Centres that are not finite, or too far away for integers, touch no voxel.
+        return free & (self.states(points) == VoxelState.FREE)
 
     def distance(self, points: Tensor) -> Tensor:
         """Distance to the centre of the nearest occupied voxel.
@@ -145,7 +148,7 @@ class OccupancyMap:
 
         Returns:
             Euclidean distances, metres, truncated to ``max_distance``, float64, shape :math:`(...)`; NaN where space is
-            unknown. Differentiable in ``points``.
+            unknown, and for points that are not finite. Differentiable in ``points``.
         """
         offset, near = self._offsets(points)
         distance = torch.where(near, torch.where(near[..., None], offset, 1.0).norm(dim=-1), self.config.max_distance)
