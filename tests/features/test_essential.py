@@ -101,3 +101,10 @@ def test_matrix_of_a_camera_that_only_turns_is_finite() -> None:
     points = CAMERA.back_project(a.uv, a.depth) @ T_ba[:3, :3].T
     found = essential_ransac(a.uv, CAMERA.project(points), CAMERA.K)
     assert found.E.isfinite().all() and (found.inliers.double().mean() > 0.9 or not found.found)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 7])
+def test_too_few_pairs_of_a_mapped_batch_give_no_matrix(count: int) -> None:
+    inputs = camera_inputs.two_views(2, count, torch.float64)
+    found = torch.func.vmap(essential_ransac)(inputs["uv_a"], inputs["uv_b"], inputs["K"])
+    assert found.found.tolist() == [False, False] and not found.inliers.any() and not found.E.any()

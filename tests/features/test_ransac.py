@@ -161,3 +161,11 @@ def test_prediction_that_is_not_finite_counts_as_none() -> None:
     assert two.found.all() and two.T_cw.isfinite().all()
     few = {name: each[:2] if name != "K" else each for name, each in inputs.items()}
     assert not pnp_ransac(**few, initial_guess=guess).found
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 5])
+def test_too_few_points_of_a_mapped_batch_give_no_pose(count: int) -> None:
+    inputs = camera_inputs.points_in_view(2, count, torch.float64)
+    found = torch.func.vmap(pnp_ransac)(inputs["points"], inputs["uv"], inputs["K"])
+    assert found.found.tolist() == [False, False] and not found.inliers.any()
+    torch.testing.assert_close(found.T_cw, torch.eye(4, dtype=torch.float64).expand(2, 4, 4))

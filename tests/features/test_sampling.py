@@ -50,6 +50,8 @@ def test_line_through_most_points_is_found() -> None:
         slope, offset = lines[..., 0, :, None].unbind(-2)
         return (points[..., None, :, 1] - slope * points[..., None, :, 0] - offset).square()
 
-    best, found = find_best_hypothesis(solve, squared_errors, valid, size=2, threshold=0.1, iterations=100, seed=0)
+    default = torch.full((1, 2), 7.0, dtype=torch.float64)
+    sampling = {"size": 2, "threshold": 0.1, "iterations": 100, "seed": 0}
+    best, found = find_best_hypothesis(solve, squared_errors, valid, default, **sampling)
     torch.testing.assert_close(best[0], torch.tensor([[2.0, 1.0]], dtype=torch.float64))
-    assert found.tolist() == [True, False]
+    assert found.tolist() == [True, False] and torch.equal(best[1], default)

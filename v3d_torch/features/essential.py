@@ -138,8 +138,9 @@ def _sample_eight_points(
         return problem._replace(**by_hypothesis).sampson(E).square()
 
     return find_best_hypothesis(
-        solve, squared_errors, valid, size=8, threshold=threshold, iterations=iterations, seed=seed
-    )
+        *(solve, squared_errors, valid, torch.eye(3, dtype=a.dtype, device=a.device)),
+        size=8, threshold=threshold, iterations=iterations, seed=seed,
+    )  # fmt: skip
 
 
 def _homogeneous(uv: Tensor) -> Tensor:

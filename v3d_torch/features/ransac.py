@@ -187,8 +187,9 @@ def _sample_torch(
     def solve(samples: Tensor) -> Tensor:
         return solve_p3p(gather_samples(points, samples), gather_samples(rays, samples))
 
+    identity = torch.eye(4, dtype=points.dtype, device=points.device)
     return find_best_hypothesis(
-        *(solve, lambda T_cw: _squared_errors(T_cw, *by_hypothesis), valid),
+        *(solve, lambda T_cw: _squared_errors(T_cw, *by_hypothesis), valid, identity),
         size=3, threshold=threshold, iterations=iterations, seed=seed,
     )  # fmt: skip
 

@@ -24,6 +24,7 @@ def find_best_hypothesis(
     solve: Callable[[Tensor], Tensor],
     squared_errors: Callable[[Tensor], Tensor],
     valid: Tensor,
+    default: Tensor,
     *,
     size: int,
     threshold: float,
@@ -38,6 +39,7 @@ def find_best_hypothesis(
         squared_errors: Function from hypotheses of shape :math:`(..., T, r, c)` to the squared error of each element,
             :math:`(..., T, N)`; infinite or NaN for elements that exclude the hypothesis.
         valid: Mask of the elements that are not padding, bool, shape :math:`(..., N)`.
+        default: Result of problems without a hypothesis, shape :math:`(r, c)`.
         size: Number n of elements in a sample.
         threshold: Error at which errors are truncated, in the unit of the square root of the squared errors.
         iterations: Number of samples.
@@ -46,6 +48,9 @@ def find_best_hypothesis(
     Returns:
         The best hypothesis, shape :math:`(..., r, c)`, and a mask of the problems with one, bool, shape :math:`(...)`.
     """
+    has_sample = valid.sum(dim=-1) >= size
+    if valid.shape[-1] < size:
+        return default.expand(*valid.shape[:-1], *default.shape), has_sample
     best, lowest = None, None
     for samples in draw_samples(valid, size, iterations, seed).split(_CHUNK, dim=-2):
         hypotheses = solve(samples).flatten(-4, -3)
@@ -61,7 +66,8 @@ def find_best_hypothesis(
             best, lowest = torch.where(is_better[..., None, None], chosen, best), torch.where(is_better, cost, lowest)
     if best is None or lowest is None:
         raise ValueError("RANSAC needs at least one iteration")
-    return best, lowest.isfinite() & (valid.sum(dim=-1) >= size)
+    found = lowest.isfinite() & has_sample
+    return torch.where(found[..., None, None], best, default), found
 
 
 def draw_samples(valid: Tensor, size: int, count: int, seed: int) -> Tensor:
