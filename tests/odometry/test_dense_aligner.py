@@ -31,6 +31,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.odometry.dense_aligner import DenseAligner, DenseAlignment, align_depth
 from v3d_torch.odometry.dense_view import DenseView
@@ -235,3 +236,10 @@ def test_images_without_a_batch_dimension_are_aligned() -> None:
     found = align_depth(*A, *B, LENS)
     assert found.T_ba.shape == (4, 4) and bool(found.reliable)
     assert motion_error(found, MOTION)[0] < 1.0
+
+
+@pytest.mark.parametrize("size", [(1280, 960), (320, 240)])
+def test_images_of_another_size_than_the_camera_are_rejected(size: tuple[int, int]) -> None:
+    camera = replace(LENS, width=size[0], height=size[1])
+    with pytest.raises(InputError, match=f"the camera {size[0]} x {size[1]}; give a camera"):
+        align_depth(*A, *B, camera)

@@ -15,6 +15,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
@@ -105,6 +106,9 @@ def align_depth(
 
     Returns:
         The motion and its quality; all NaN and not reliable if an image has no contrast or no depth.
+
+    Raises:
+        InputError: If the images do not have the size of the camera.
     """
     align = DenseAligner(config or DenseOdometryConfig(), camera)
     alignment: DenseAlignment = align(grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b)
@@ -129,7 +133,7 @@ class DenseAligner(torch.nn.Module):
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
         super().__init__()
         size = min(camera.width, camera.height)
-        self._config = config
+        self._config, self._size = config, (camera.height, camera.width)
         self._halvings = tuple(halvings for halvings in config.halvings if size >= 2 << halvings) or (0,)
         self._cameras = {halvings: LevelCamera.from_camera(camera, halvings) for halvings in self._halvings}
 
@@ -153,6 +157,11 @@ class DenseAligner(torch.nn.Module):
         for image in images:
             KORNIA_CHECK_SHAPE(image, ["*", "1", str(grey_a.shape[-2]), str(grey_a.shape[-1])])
         batch, size = common_batch(*(image.shape[:-3] for image in images)), grey_a.shape[-2:]
+        if size != self._size:
+            raise InputError(
+                f"the images have {size[1]} x {size[0]} pixels, the camera {self._size[1]} x {self._size[0]}; give a"
+                " camera of the size of the images"
+            )
         pixels = grey_a.new_ones(size, dtype=torch.bool)
         motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
         columns = (
