@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
@@ -172,3 +173,21 @@ def test_view_without_depth_observes_nothing() -> None:
     for implementation in (TWIN.torch, observe_voxels):
         found = implementation(depth, depth == 0, CAMERA.rays, torch.eye(4).double(), VOXEL, MAX_DEPTH, TOLERANCE)
         assert found.blocks.shape == (0, 3) and found.marks.shape == (0, SIDE**3)
+
+
+@pytest.mark.parametrize("function", IMPLEMENTATIONS)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf, -1.0])
+def test_invalid_depth_counts_as_missing(function: Callable[..., Observations], bad: float) -> None:
+    depth, static = random_view(3)
+    T_wc = se3_exp(torch.tensor([0.1, -0.2, 0.3, 0.2, 0.1, -0.3], dtype=torch.float64))
+    expected = observe(depth, static, T_wc, function)
+    assert observe(torch.where(depth > 0, depth, bad), static, T_wc, function) == expected
+
+
+@pytest.mark.parametrize("name", ["depth", "static", "rays", "T_wc"])
+def test_inputs_of_other_shapes_are_rejected(name: str) -> None:
+    depth, static = random_view(3)
+    inputs = {"depth": depth, "static": static, "rays": CAMERA.rays, "T_wc": torch.eye(4, dtype=torch.float64)}
+    inputs[name] = inputs[name][:-1]
+    with pytest.raises(ShapeError):
+        observe_voxels(**inputs, voxel_size=VOXEL, max_depth=MAX_DEPTH, tolerance=TOLERANCE)

@@ -93,7 +93,7 @@ def observe_voxels(
     """Find the voxels that a view observes as free or hits.
 
     Args:
-        depth: Depth of the samples, metres, (h, w); 0 without depth.
+        depth: Depth of the samples, metres, (h, w); 0, NaN or infinite without depth.
         static: Mask of the samples on static surfaces, (h, w); the others hit nothing.
         rays: Ray of each sample at unit depth, camera frame, (h, w, 3).
         T_wc: Camera-to-world pose, (4, 4).
@@ -116,7 +116,7 @@ def observe_voxels(
     for row in range(height):
         for column in range(width):
             z = float(depth[row, column])
-            if z <= 0:
+            if not 0 < z < math.inf:
                 continue
             a, b, c = float(rays[row, column, 0]), float(rays[row, column, 1]), float(rays[row, column, 2])
             for axis in range(3):

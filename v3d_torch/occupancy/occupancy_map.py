@@ -85,7 +85,8 @@ class OccupancyMap:
         """Add the observations of a depth image.
 
         Args:
-            depth: Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement. Pixels can be subsampled.
+            depth: Depth, metres, float32, shape :math:`(h, w)`; 0, NaN or infinite = no measurement. Pixels can be
+                subsampled.
             static: Mask of static pixels, bool, shape :math:`(h, w)`. Other pixels are not obstacles; they only show
                 that the space in front of them is free.
             rays: Viewing ray of each pixel at unit depth, float32, shape :math:`(h, w, 3)`; see `PinholeCamera.rays`.

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -33,6 +34,8 @@ def _observe_compiled(
 ) -> Observations:
     if depth.dtype != torch.float32 or rays.dtype != torch.float32 or T_wc.dtype != torch.float64:
         return NotImplemented
+    if static.shape != depth.shape or rays.shape != (*depth.shape, 3) or T_wc.shape != (4, 4):
+        return NotImplemented
     reach = math.ceil(max_depth * float(rays.square().sum(dim=-1).max().sqrt()) / (SIDE * voxel_size)) + 1
     samples = to_array(depth), to_array(static), to_array(rays)
     blocks, marks = kernels.observe_voxels(*samples, to_array(T_wc), voxel_size, max_depth, tolerance, reach)
@@ -53,7 +56,8 @@ def observe_voxels(
     sample is hit, even if other rays pass through it.
 
     Args:
-        depth: Depth of samples, metres, float32, shape :math:`(h, w)`; 0 = no measurement.
+        depth: Depth of samples, metres, float32, shape :math:`(h, w)`; 0, NaN or infinite = no
+            measurement.
         static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`. Other samples hit no voxel; they only
             show that the space in front of them is free.
         rays: Viewing ray of each sample at unit depth, float32, shape :math:`(h, w, 3)`.
@@ -62,9 +66,12 @@ def observe_voxels(
         max_depth: Depth beyond which nothing is observed, metres.
         tolerance: Depth error divided by the squared depth, 1/m.
     """
-    far = depth.new_tensor(torch.inf)
-    nearest = -max_pool2d(-torch.where(depth > 0, depth, far)[None], 3, 1, 1)[0]
-    valid = depth > 0
+    KORNIA_CHECK_SHAPE(depth, ["h", "w"])
+    KORNIA_CHECK_SHAPE(static, [str(side) for side in depth.shape])
+    KORNIA_CHECK_SHAPE(rays, [*(str(side) for side in depth.shape), "3"])
+    KORNIA_CHECK_SHAPE(T_wc, ["4", "4"])
+    valid = (depth > 0) & depth.isfinite()
+    nearest = -max_pool2d(-torch.where(valid, depth, torch.inf)[None], 3, 1, 1)[0]
     nearest, z, hits = nearest[valid].to(torch.float64), depth[valid].to(torch.float64), static[valid]
     a, b, c = rays[valid].to(torch.float64).unbind(dim=1)
     direction = torch.stack([(r[0] * a + r[1] * b + r[2] * c) / voxel_size for r in T_wc[:3, :3].tolist()], dim=1)
