@@ -65,6 +65,8 @@ def test_support_equals_counting_one_by_one(seed: int, objects: int, min_ratio: 
     supported_objects = FeatureSupport(pixel, inlier).supports(masks, min_ratio, min_inliers)
     outside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if not masks[:, v, u].any()]
     outside_ratio = sum(outside) / max(len(outside), 1)
+    if len(outside) < 20:  # too few to know the ratio
+        outside_ratio = max(outside_ratio, 0.5)
     for mask, supported in zip(masks, supported_objects.tolist(), strict=True):
         inside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if mask[v, u]]
         margin = sum(inside) - min_ratio * outside_ratio * len(inside)
