@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.default_dtype import default_dtype
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
@@ -125,11 +126,8 @@ def test_module_on_a_batch_equals_the_function_on_each_image() -> None:
 def test_default_dtype_does_not_change_the_result() -> None:
     given = stepped_depth(30, 40, torch.float32)
     expected = smooth_depth(given)
-    torch.set_default_dtype(torch.float64)
-    try:
+    with default_dtype(torch.float64):
         found = smooth_depth(given)
-    finally:
-        torch.set_default_dtype(torch.float32)
     assert found.dtype == torch.float32
     assert torch.equal(found, expected)
 

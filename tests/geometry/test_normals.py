@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.default_dtype import default_dtype
 from helpers.rooms import CAMERA
 from torch import Tensor
 
@@ -45,11 +46,8 @@ def test_normals_of_a_batch_equal_normals_of_each_image() -> None:
 def test_default_dtype_does_not_change_the_result() -> None:
     given = slanted([0.5, 0.1, -1], 2.0)[0].to(torch.float32)
     expected = surface_normals(given)
-    torch.set_default_dtype(torch.float64)
-    try:
+    with default_dtype(torch.float64):
         found = surface_normals(given)
-    finally:
-        torch.set_default_dtype(torch.float32)
     assert found.dtype == torch.float32
     assert torch.equal(found, expected)
 

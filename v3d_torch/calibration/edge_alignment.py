@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from v3d_torch.calibration.view_edges import ViewEdges, find_edges, pixel_scale
+from v3d_torch.calibration.view_edges import ViewEdges, find_edges, view_pixels
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.optim.jackknife import jackknife_covariance
@@ -143,18 +143,14 @@ class EdgeAlignment:
     @property
     def _grid(self) -> tuple[Tensor, Tensor, Tensor]:
         """Delays, shifts along v and shifts along u of the coarse search; seconds and view pixels."""
-        longest = self._view_pixels(_SHIFTS)
+        longest = view_pixels(_SHIFTS, self._camera.width, self._stride)
         shifts = torch.arange(-longest, longest + 1)
         return _DELAYS, shifts, shifts
-
-    def _view_pixels(self, length: int) -> int:
-        """Length in view pixels, rounded down, of a length in frame pixels of 640 columns."""
-        return int(length * pixel_scale(self._camera.width * self._stride)) // self._stride
 
     @cached_property
     def _grid_scores(self) -> Tensor:
         """Approximate total score at each delay, shift along v and shift along u, (T, S, S)."""
-        reach, shifts = self._view_pixels(_REACH), self._grid[1]
+        reach, shifts = view_pixels(_REACH, self._camera.width, self._stride), self._grid[1]
         maps = torch.stack([_correlation(edges, reach) for edges in self._edges])
         maps = pad(maps, (1, 1, 1, 1))  # beyond the maximum displacement, use the mean, 0
         motion = torch.stack([self._mean_motion(float(delay)) for delay in _DELAYS])  # (T, K, 2)

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-_WIDTH = 640
-"""Number of columns of the frames for which lengths are given."""
+from v3d_torch.geometry.pixel_scale import pixel_scale
 
 _EDGE_RATIO = 0.1
 """Minimum relative step of depth at an occlusion boundary: larger than the steps of a slanted surface."""
@@ -54,13 +53,15 @@ class ViewEdges:
     gradients: Tensor
 
 
-def pixel_scale(width: int) -> float:
-    """Factor of lengths in pixels of 640 columns, for frames with more columns; 1 for frames with fewer.
+def view_pixels(length: int, columns: int, stride: int) -> int:
+    """Return a length in pixels of a view, rounded down.
 
     Args:
-        width: Number of columns of the frames.
+        length: Length in frame pixels of 640 columns; frames with fewer columns have no shorter one.
+        columns: Number of columns of the view.
+        stride: Every n-th pixel of the frame's rows and columns is a pixel of the view.
     """
-    return max(width / _WIDTH, 1.0)
+    return int(length * max(pixel_scale(columns * stride), 1.0)) // stride
 
 
 def find_edges(colour: Tensor, depth: Tensor, stride: int) -> ViewEdges:
@@ -71,7 +72,7 @@ def find_edges(colour: Tensor, depth: Tensor, stride: int) -> ViewEdges:
         depth: Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement or not static.
         stride: Every n-th pixel of the frame's rows and columns is a pixel of the images.
     """
-    z, gap = depth.numpy(), max(int(_MAX_GAP * pixel_scale(depth.shape[1] * stride)) // stride, 1)
+    z, gap = depth.numpy(), max(view_pixels(_MAX_GAP, depth.shape[1], stride), 1)
     pixels, depths, axes = [], [], []
     for axis, image in enumerate((z, z.T)):
         for side, facing in ((-1, image), (1, image[:, ::-1])):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.pixel_scale import pixel_scale
 
-_COLUMNS, _FOCAL_LENGTH = 640, 525.0
+_FOCAL_LENGTH = 525.0
 
 
 def scale_to_image(config: ObjectsConfig, camera: PinholeCamera) -> ObjectsConfig:
@@ -22,10 +23,10 @@ def scale_to_image(config: ObjectsConfig, camera: PinholeCamera) -> ObjectsConfi
         config: Configuration for the images of a Kinect.
         camera: Camera of the images.
     """
-    columns, margins = camera.width / _COLUMNS, config.static_mask
+    scale, margins = pixel_scale(camera.width), config.static_mask
     names = ("dilation", "map_dilation", "depth_margin", "surface_margin")
-    scaled = {name: _scale(getattr(margins, name), columns) for name in names}
-    stride = _scale(config.clouds.stride, min(columns, camera.fx / _FOCAL_LENGTH))
+    scaled = {name: _scale(getattr(margins, name), scale) for name in names}
+    stride = _scale(config.clouds.stride, min(scale, camera.fx / _FOCAL_LENGTH))
     return config.model_copy(
         update={
             "clouds": config.clouds.model_copy(update={"stride": stride}),

@@ -45,10 +45,13 @@ def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: Pinhol
     ]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
     projected = silhouettes([track.predict_cloud(view.stamp) @ R.T + t for track in detected], camera, spacing)
-    masks = [each.mask(view.depth, 0, _DEPTH_TOLERANCE, include_missing=True) for each in projected]
+    masks = {
+        track: mask
+        for track, each in zip(detected, projected, strict=True)
+        # An object without a pixel has left the view or is hidden: it is missed.
+        if (mask := each.mask(view.depth, 0, _DEPTH_TOLERANCE, include_missing=True)).numpy().any()
+    }
     if not masks:
         return Instances.empty(*view.depth.shape[-2:])
-    labels = torch.tensor([track.label for track in detected])
-    instances = Instances(torch.stack(masks), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
-    # An object that has left the view or is hidden is missed.
-    return instances[torch.tensor([bool(mask.numpy().any()) for mask in masks])]
+    labels = torch.tensor([track.label for track in masks])
+    return Instances(torch.stack([*masks.values()]), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
