@@ -27,12 +27,12 @@ WINDOWS = [
 
 def assert_twins_agree(boxes: torch.Tensor, window: Window, seed: int, cut: int = 0) -> None:
     generator = torch.Generator().manual_seed(seed)
-    # Logits of cells are multiples of 1/64, and those of pixels of 1/6400 if a cell has 5x5 pixels. A smaller offset
-    # keeps them from 0, where the sign would depend on rounding.
-    prototypes = torch.randint(-16, 17, (32, 24 - cut, 32 - cut), generator=generator) / 8
-    coefficients = torch.randint(-8, 9, (len(boxes), 32), generator=generator) / 8
+    # Logits of cells are integers. The weights of two by two cells are multiples of 1/15500 in the third window, and of
+    # larger fractions in the others. Half of that keeps logits of pixels from 0, where the sign depends on rounding.
+    prototypes = torch.randint(-2, 3, (32, 24 - cut, 32 - cut), generator=generator).float()
+    coefficients = torch.randint(-1, 2, (len(boxes), 32), generator=generator).float()
     prototypes = torch.cat([prototypes, torch.ones_like(prototypes[:1])])
-    coefficients = torch.cat([coefficients, torch.full((len(boxes), 1), 2.0**-14)], dim=1)
+    coefficients = torch.cat([coefficients, torch.full((len(boxes), 1), 2.0**-15)], dim=1)
     arguments = (coefficients, prototypes, boxes, window)
     found = TWIN.compiled(*arguments, first=(cut, cut))
     assert found is not NotImplemented
