@@ -12,13 +12,9 @@ from torch import Tensor
 from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
-from v3d_torch.errors import ConfigError
 from v3d_torch.features.features import Features
-from v3d_torch.features.orb import ORB
-from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
+from v3d_torch.frame_result import FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.depth_smoother import DepthSmoother
-from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.mapper import Mapper
@@ -33,26 +29,25 @@ from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.unlabelled import unlabelled_instances
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
-from v3d_torch.occupancy.up_direction import estimate_up
+from v3d_torch.occupancy.up_estimator import UpEstimator
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
-from v3d_torch.runtime.input_checks import check_frame, check_instances, check_order, check_parameters
+from v3d_torch.runtime.input_checks import check_order
 from v3d_torch.runtime.stage_timer import StageTimer
-from v3d_torch.runtime.stateful import Stateful, is_stateful
-from v3d_torch.segmentation import NoSegmentation, make_segmenter
-from v3d_torch.segmentation.segmenter import restore_segmenter, segment_frame, segmenter_state_of
+from v3d_torch.runtime.stateful import Stateful
+from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.segmentation.segmenter import restore_segmenter
 from v3d_torch.segmentation.upright import up_votes
+from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES, FramePreprocessor
 from v3d_torch.stages.protocols import (
     AppearanceStage,
     BackProjectionStage,
     CompensationStage,
-    DepthStage,
-    FeatureStage,
     OdometryStage,
     ProposalStage,
 )
-from v3d_torch.stages.stage_checks import ReplaceableStages
+from v3d_torch.stages.stage_checks import require_state
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
@@ -63,19 +58,20 @@ from v3d_torch.tracking.state_estimator import StateEstimator
 from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import FramePose, Instances, RGBDFrame, Segmenter, TrackingStatus
 
-PREFETCHED_FRAMES = 4
-"""Number of frames that are preprocessed ahead: a frame that becomes a keyframe takes twice as long to track as others,
-and preprocessing continues meanwhile."""
+_STATEFUL = (
+    *("timer", "map", "poses", "estimate_state", "states", "motion_model", "free_space_check", "classify_motion"),
+    *("mapper", "loop_closer", "back_end", "occupancy", "up_estimator"),
+)
+"""Names of the attributes with state that changes from frame to frame."""
 
 
-class V3DSLAM(ReplaceableStages):
+class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
-    Every stage that `preprocess` and `track` call is an attribute and can be replaced by a callable with the same
-    signature; the results of the replacement are checked. `estimate_motion`, `track_map` and `loop_closer` are also
-    used inside other stages, which keep their own references to the original. `preprocess` runs the stages that depend
-    only on the frame, and can run ahead of `track`. Hooks see the arguments and results of stages, see
-    `register_stage_hook`.
+    `preprocess` runs the stages that depend only on the frame, see `FramePreprocessor`; `track` runs the others. Every
+    stage is an attribute and can be replaced by a callable with the same signature; the results of the replacement are
+    checked. `estimate_motion`, `track_map` and `loop_closer` are also used inside other stages, which keep their own
+    references to the original. Hooks see the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -89,8 +85,6 @@ class V3DSLAM(ReplaceableStages):
         map: Keyframes and landmarks.
         poses: Poses of all frames.
         states: States of the camera in the last 10 seconds.
-        gravity: Direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`; None until a frame
-            with measured gravity is tracked.
         occupancy: Occupancy mapping, with the map in ``occupancy.map``; None unless ``occupancy.enabled`` is set.
         predictions: Pose predictions with which the next `PREFETCHED_FRAMES` frames are preprocessed.
         timer: Time of each stage.
@@ -108,20 +102,12 @@ class V3DSLAM(ReplaceableStages):
         config: Config | None = None,
         known_map: SparseMap | None = None,
     ) -> None:
-        check_parameters(camera, segment, config)
-        super().__init__()
-        self.camera = camera
-        self.config = config = config or Config()
+        super().__init__(camera, segment, config)
+        config = self.config
         self.timer = StageTimer()
         self.map = SparseMap.empty(config, camera) if known_map is None else known_map
         self.poses = PoseHistory()
         self.motion_model = MotionModel()
-        # Preprocessing
-        self.segment = segment or make_segmenter(config, camera)
-        self.smooth_depth: DepthStage = DepthSmoother(
-            config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio
-        )
-        self.detect_features: FeatureStage = ORB(config.features, camera)
         # Motion of the camera since the previous frame
         self.compensate: CompensationStage = TimeCompensation(config, camera)
         self.estimate_motion = MotionEstimator(config.odometry, config.features, camera, config.seed)
@@ -151,11 +137,16 @@ class V3DSLAM(ReplaceableStages):
         self.loop_closer.rebuild_database(self.map.active_keyframes)
         # Free and occupied space
         self.occupancy = OccupancyMapper(config.occupancy, camera) if config.occupancy.enabled else None
-        self.gravity: Tensor | None = None
+        self.up_estimator = UpEstimator()
         self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
         self._segmenter_state: dict[str, Any] | None = None
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
+
+    @property
+    def gravity(self) -> Tensor | None:
+        """Measured direction of gravity, a unit vector, world frame, float64, shape :math:`(3,)`; None if unknown."""
+        return self.up_estimator.gravity
 
     @property
     def up(self) -> Tensor:
@@ -164,9 +155,7 @@ class V3DSLAM(ReplaceableStages):
         It comes from measured gravity, else from the floor in the occupancy map, else from the segmentation, else from
         the first image. Boxes of objects need it: ``result.boxes(slam.up)``.
         """
-        if self.gravity is None and self._floor is not None:
-            return self._floor.up
-        return estimate_up(self.gravity, up_votes(self._segmenter_state)).direction
+        return self.up_estimator.up(self._floor)
 
     @property
     def T_lw(self) -> Tensor | None:
@@ -175,7 +164,7 @@ class V3DSLAM(ReplaceableStages):
         Up is against the measured gravity; without a measurement it is the normal of the floor in the occupancy map,
         and follows it. None while neither is known.
         """
-        return None if self.gravity is None and self._floor is None else level_frame(self.up)
+        return self.up_estimator.T_lw(self._floor)
 
     @property
     def _proposes_objects(self) -> bool:
@@ -203,65 +192,6 @@ class V3DSLAM(ReplaceableStages):
         preprocessed = self.preprocess(frame, self.predictions[0])
         self.advance_predictions()
         return self.track(preprocessed)
-
-    def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
-        """Run the stages that depend only on the frame; the state of the tracking stages is neither read nor changed.
-
-        `segment_instances` and `extract_features` are independent of each other and can run in different threads.
-
-        Args:
-            frame: Next frame.
-            prediction: See `segment_instances`.
-
-        Raises:
-            InputError: If the frame is not valid or of another camera.
-            ConfigError: If the segmenter did not return valid `Instances`.
-        """
-        self.check(frame)
-        segmentation = self.segment_instances(frame, prediction)
-        return PreprocessedFrame(frame, self.extract_features(frame), lambda: segmentation)
-
-    def check(self, frame: RGBDFrame) -> None:
-        """Check that a frame is valid and of this camera; `preprocess` does this first.
-
-        Raises:
-            InputError: If the frame is not valid or of another camera.
-        """
-        check_frame(frame, self.camera)
-
-    def segment_instances(
-        self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
-    ) -> Segmentation:
-        """Find the instances of a frame (III-A); people are masked until they are classified.
-
-        Args:
-            frame: Frame; frames are segmented in their order, because a segmenter can have state.
-            prediction: Pose prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter computes the
-                roll of the camera; None if the pose is not known.
-            is_due: False to skip the frame; None to segment only every ``segmentation.interval``-th frame.
-
-        Raises:
-            ConfigError: If the segmenter did not return valid `Instances`.
-        """
-        if is_due is None:
-            is_due = frame.index % self.config.segmentation.interval == 0
-        timer = StageTimer()
-        with timer("segmentation"):
-            instances = None
-            if is_due:
-                T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
-                instances = segment_frame(self.segment, frame, T_cw)
-                check_instances(instances, frame)
-        return Segmentation(instances, segmenter_state_of(self.segment), timer.times)
-
-    def extract_features(self, frame: RGBDFrame) -> Extraction:
-        """Re-estimate the depth of a frame (III-B.1), and detect its ORB features (III-A)."""
-        timer = StageTimer()
-        with timer("depth"):
-            depth = self.smooth_depth(frame.depth[None])[0]
-        with timer("features"):
-            features = self.detect_features(frame.image, depth)
-        return Extraction(depth, features, timer.times)
 
     def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         """Track the camera and the objects in the next frame, and extend the map.
@@ -317,8 +247,7 @@ class V3DSLAM(ReplaceableStages):
             self.states.append(state)
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
-                up = estimate_up(self.gravity, up_votes(self._segmenter_state))
-                self.occupancy(depth, objects.static_mask, self.poses, up)
+                self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate())
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
@@ -363,40 +292,22 @@ class V3DSLAM(ReplaceableStages):
         Raises:
             ConfigError: If a stage was replaced by one without state_dict.
         """
-        state = {name: component.state_dict() for name, component in self._stateful_components().items()}
         own = {"previous": self._previous, "predictions": list(self.predictions), "segmenter": self._segmenter_state}
-        return {**state, **own, "gravity": self.gravity}
+        return {**{name: each.state_dict() for name, each in self._components_with_state().items()}, **own}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
-        components = self._stateful_components()
+        components = self._components_with_state()
         self.back_end.discard()  # it reads the map
         for name, component in components.items():
             component.load_state_dict(state[name])
-        self._previous, self.gravity = state["previous"], state["gravity"]
+        self._previous, self._segmenter_state = state["previous"], state["segmenter"]
         self.predictions = deque(state["predictions"])
-        self._segmenter_state = state["segmenter"]
         restore_segmenter(self.segment, self._segmenter_state)
 
-    def _stateful_components(self) -> dict[str, Stateful]:
-        components: dict[str, Stateful] = {
-            "timer": self.timer,
-            "map": self.map,
-            "poses": self.poses,
-            "estimate_state": self.estimate_state,
-            "states": self.states,
-            "motion_model": self.motion_model,
-            "free_space_check": self.free_space_check,
-            "classify_motion": self.classify_motion,
-            "mapper": self.mapper,
-            "loop_closer": self.loop_closer,
-            "back_end": self.back_end,
-            **({} if self.occupancy is None else {"occupancy": self.occupancy}),
-        }
-        for name, component in components.items():
-            if not is_stateful(component):
-                raise ConfigError(f"{name} was replaced by a stage without state_dict; its state cannot be saved")
-        return components
+    def _components_with_state(self) -> dict[str, Stateful]:
+        components = {name: getattr(self, name) for name in _STATEFUL}
+        return {name: require_state(name, each) for name, each in components.items() if each is not None}
 
     def _compensate(self, features: Features, preprocessed: PreprocessedFrame, velocity: Tensor) -> Features:
         """Move features to where they would be without rolling shutter and depth delay, see `TimeCompensation`."""
@@ -411,6 +322,7 @@ class V3DSLAM(ReplaceableStages):
         """Return the segmentation; the network can run beside the stages before."""
         segmentation = preprocessed.segmentation
         self._segmenter_state = segmentation.segmenter_state
+        self.up_estimator.votes = up_votes(segmentation.segmenter_state)
         self.timer.add(segmentation.times)
         return segmentation
 
@@ -435,7 +347,7 @@ class V3DSLAM(ReplaceableStages):
             self.free_space_check.drop_views()
         if pose.status is not TrackingStatus.LOST and T_new_old is None:
             self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ view.T_cw, all_tracks=is_elsewhere)
-        self._update_gravity(frame, T_new_old)
+        self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)
         return keyframe
@@ -445,17 +357,9 @@ class V3DSLAM(ReplaceableStages):
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_localised else None
 
-    def _update_gravity(self, frame: RGBDFrame, T_new_old: Tensor | None) -> None:
-        """Store the first measured gravity in the world frame; rotate it with later corrections of the world frame."""
-        if frame.gravity is not None and self.gravity is None:
-            self.gravity = self.poses.T_cw[:3, :3].T @ frame.gravity
-        elif T_new_old is not None and self.gravity is not None:
-            self.gravity = T_new_old[:3, :3] @ self.gravity
-
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
         """Apply a correction of the map to all other data that is stored in the world frame."""
         if T_new_old is not None:
-            self.classify_motion.tracker.apply_world_correction(T_new_old)
-            self.free_space_check.apply_world_correction(T_new_old)
-            self.estimate_state.apply_world_correction(T_new_old)
-            self.states.apply_world_correction(T_new_old)
+            tracker = self.classify_motion.tracker
+            for each in (tracker, self.free_space_check, self.estimate_state, self.states):
+                each.apply_world_correction(T_new_old)

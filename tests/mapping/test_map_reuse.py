@@ -18,7 +18,8 @@ from v3d_torch.mapping.map_io import StoredMap, load_map, save_map
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation.factory import NoSegmentation
-from v3d_torch.slam import PREFETCHED_FRAMES, V3DSLAM
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
 FAST = ["segmentation.source=none", "features.count=800"]  # enough features for a wall with a random texture

@@ -18,7 +18,7 @@ from v3d_torch.frame_result import PreprocessedFrame
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.slam import PREFETCHED_FRAMES
+from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES
 from v3d_torch.types import Instances
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))

@@ -24,7 +24,7 @@ from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
 _NOT_STAGES = frozenset(
-    {"camera", "config", "timer", "map", "poses", "states", "gravity", "motion_model", "predictions", "occupancy"}
+    {"camera", "config", "timer", "map", "poses", "states", "motion_model", "up_estimator", "predictions", "occupancy"}
 )
 """Public attributes of `V3DSLAM` that are not stages. The occupancy map consists of whole numbers, and NaN in its
 queries means unknown space."""

@@ -22,6 +22,7 @@ from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type,
 from v3d_torch.runtime.stage_hooks import HookedStage, StageHook
 from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
+from v3d_torch.runtime.stateful import Stateful, is_stateful
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
 
@@ -199,6 +200,21 @@ class ReplacedStage(StageProxy):
         _check_value(self._name, result, expected, sizes(*args))
         if isinstance(result, Features) and not ((result.sigma_ratio > 0) & result.sigma_ratio.isfinite()).all():
             raise ConfigError(f"{self._name}.sigma_ratio has values that are not positive and finite")
+
+
+def require_state(name: str, component: object) -> Stateful:
+    """Return a component, if its state can be saved.
+
+    Args:
+        name: Name of its attribute in `V3DSLAM`.
+        component: Component, perhaps a user-defined one.
+
+    Raises:
+        ConfigError: If it has no ``state_dict`` and ``load_state_dict``.
+    """
+    if not is_stateful(component):
+        raise ConfigError(f"{name} was replaced by a stage without state_dict; its state cannot be saved")
+    return cast("Stateful", component)
 
 
 def _check_value(name: str, value: object, expected: type | TensorSpec, sizes: dict[str, int]) -> None:
