@@ -77,7 +77,5 @@ class FrameResult(FrameObjects, CameraState):
 
     Later corrections of the pose are in `V3DSLAM.poses`.
 
-    Attributes: ``stamp``, ``T_wc``, ``status``, ``covariance``, ``twist``, ``twist_covariance`` and
-    ``cross_covariance`` of `CameraState`; ``objects``, ``static_mask``, ``static_without_people`` and ``vote_pairs`` of
-    `FrameObjects`.
+    It has the attributes of `CameraState` and those of `FrameObjects`.
     """

@@ -70,8 +70,8 @@ class V3DSLAM(FramePreprocessor):
 
     `preprocess` runs the stages that depend only on the frame, see `FramePreprocessor`; `track` runs the others. Every
     stage is an attribute and can be replaced by a callable with the same signature; the results of the replacement are
-    checked. `estimate_motion`, `track_map` and `loop_closer` are also used inside other stages, which keep their own
-    references to the original. Hooks see the arguments and results of stages, see `register_stage_hook`.
+    checked. `loop_closer` is also used inside other stages, which keep their own references to the original. Hooks see
+    the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.

@@ -51,6 +51,14 @@ LAYERS = (
 MAX_ROOT_FILES = 10
 
 
+def test_contributing_lists_the_layers_in_their_order() -> None:
+    text = (ROOT.parent / "CONTRIBUTING.md").read_text()
+    table = text[text.index("| folder of `v3d_torch` |") : text.index("[docs/design.md]")]
+    names = [f"`{name}/`" if (ROOT / name).is_dir() else f"`{name}.py`" for name in LAYERS]
+    places = [table.find(name) for name in names]
+    assert min(places) > 0 and places == sorted(places)
+
+
 def test_stub_lists_every_public_name() -> None:
     stub = ast.parse((ROOT / "__init__.pyi").read_text())
     (listed,) = (ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))

@@ -21,7 +21,7 @@ from v3d_torch.odometry.odometry import Odometry
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.stages.stage_checks import ReplacedStage
+from v3d_torch.stages.stage_checks import STAGES, ReplacedStage
 from v3d_torch.types import Instances, RGBDFrame
 
 CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -202,6 +202,18 @@ def test_replaced_stage_is_checked_with_numbers_too() -> None:
     slam.smooth_depth = lambda depth: depth[0]  # type: ignore[assignment]
     with pytest.raises(ConfigError, match=r"smooth_depth is torch.float32 of shape"):
         slam(FRAMES[0])
+
+
+@pytest.mark.parametrize("stage", ["estimate_motion", "track_map"])
+def test_stage_that_only_other_stages_call_cannot_be_replaced(stage: str) -> None:
+    slam = make_slam()
+    with pytest.raises(ConfigError, match=f"^{stage} cannot be replaced, because .* calls it; replace that stage$"):
+        setattr(slam, stage, getattr(slam, stage))
+
+
+def test_every_stage_with_hooks_is_documented() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "your_stage.md").read_text()
+    assert [name for name in STAGES if f"`{name}`" not in page] == []
 
 
 def test_segmenter_that_cannot_be_called_is_rejected() -> None:

@@ -37,15 +37,15 @@ from v3d_torch.segmentation import make_instance_source, make_segmenter, wrap_up
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 _NOTE = (
-    "The network ran once per sequence, and all runs shared one process: times and memory in their metrics.json are not"
-    " those of a single run."
+    "Variants with the same input of the network shared its results, and all runs shared one process: times and memory"
+    " in their metrics.json are not those of a single run."
 )
 
 
 class CachedSegmenter:
     """Segmenter that computes the instances of each frame once and then returns identical copies.
 
-    The variants of a study differ only after the network, and the network takes most of the time of a run.
+    Most variants of a study differ only after the network, and the network takes most of the time of a run.
 
     Args:
         segment: Segmenter to cache.

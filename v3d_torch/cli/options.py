@@ -13,15 +13,15 @@ from typer.models import OptionInfo
 DataRoot = Annotated[
     Path | None,
     typer.Option(
-        help="Folder of named sequences, to which missing ones are downloaded [$V3D_DATA is searched; downloads go to"
-        " the cache]."
+        help="Folder of named sequences, to which missing ones are downloaded [default: search $V3D_DATA and the cache,"
+        " download to the cache]."
     ),
 ]
 Camera = Annotated[
     str | None,
     typer.Option(
-        help="Camera, if the source does not describe it: a preset (tum_fr3), camera.yaml, K.txt, or a file of"
-        " ORB-SLAM, Kalibr or ROS."
+        help="Camera, in place of that of the source: a preset (tum_fr3), camera.yaml, K.txt, or a file of ORB-SLAM,"
+        " Kalibr or ROS."
     ),
 ]
 RgbTopic = Annotated[str | None, typer.Option(help="Topic of the colour images in a bag [detected].")]

@@ -18,7 +18,7 @@ class MotionState(StrEnum):
     STATIC = "static"
     """At rest: its pixels are tracked and, unless it is a person, mapped."""
     DYNAMIC = "dynamic"
-    """It moved, by the votes or by the surface that appeared and vacated."""
+    """It moved: the free-space check shows it and enough objects vote for it, or it is new, in space that was free."""
     DEFORMING = "deforming"
     """A person or animal that changes its shape in place, by the Chamfer distance."""
     UNKNOWN = "unknown"
@@ -37,7 +37,7 @@ class TrackedObject:
             pixels.
         state: Position and velocity with their covariance at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
-        votes: Number of votes in this frame, maximum over the baselines.
+        votes: Number of votes in this frame, maximum over the baselines; the free-space check has one vote.
         chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured,
             for example because the object is dynamic.
         motion_state: Static, dynamic, deforming or unknown.

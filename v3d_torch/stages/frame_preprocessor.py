@@ -78,7 +78,7 @@ class FramePreprocessor(ReplaceableStages):
     def segment_instances(
         self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
     ) -> Segmentation:
-        """Find the instances of a frame (III-A); people are masked until they are classified.
+        """Find the instances of a frame (III-A).
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.

@@ -90,6 +90,9 @@ _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] |
 result is not checked."""
 
 
+_INNER_STAGES = {"estimate_motion": "odometry", "track_map": "track_camera"}
+"""Stages that `V3DSLAM` does not call itself, and the stage that calls each."""
+
 STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end", "loop_closer")))
 """Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
 
@@ -107,8 +110,11 @@ class ReplaceableStages:
         """Set an attribute.
 
         Raises:
-            ConfigError: If a callable stage is replaced by a value that is not callable.
+            ConfigError: If a callable stage is replaced by a value that is not callable, or if the attribute is used
+                inside another stage only, so that its replacement would have no effect.
         """
+        if name in _INNER_STAGES and name in vars(self):
+            raise ConfigError(f"{name} cannot be replaced, because {_INNER_STAGES[name]} calls it; replace that stage")
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
         is_hooked = isinstance(vars(self).get(name), HookedStage)
