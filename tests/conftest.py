@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import typer.testing
@@ -14,6 +15,9 @@ from filelock import FileLock
 from rich.console import Console
 
 from v3d_torch.io.download import cache_dir
+
+if TYPE_CHECKING:
+    from v3d_torch.datasets.demo.scene import Scene
 
 # Threads that wait for each other would keep cores busy that other workers of the tests need. Read by torch's OpenMP.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -84,6 +88,15 @@ def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequences") / "moment"
     copy_frames(folder, range(52, 58))
     return folder
+
+
+@pytest.fixture(scope="session")
+def walking_scene() -> Scene:
+    """Scene of the demo, whose textures take seconds to build."""
+    from v3d_torch.datasets.demo.scenes.walking import build_walking_scene
+    from v3d_torch.datasets.demo.sequence import SEED
+
+    return build_walking_scene(SEED)
 
 
 def _draw_no_run(patch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,6 @@ from v3d_torch.datasets.demo.camera_trajectory import R_WC_LEVEL
 from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.room import ROOM_MAX, ROOM_MIN
 from v3d_torch.datasets.demo.scene import Body, Rectangle, Scene
-from v3d_torch.datasets.demo.scenes.walking import build_walking_scene
 from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
@@ -36,9 +35,8 @@ def true_pose(frame: int) -> np.ndarray:
     return T_wc
 
 
-def empty_room() -> Scene:
+def without_people(scene: Scene) -> Scene:
     """The demo room without moving people, and with the wall behind the demo's camera."""
-    scene = build_walking_scene(7)
     width, height = ROOM_MAX[0] - ROOM_MIN[0], ROOM_MAX[2] - ROOM_MIN[2]
     bricks = materials.bricks(np.random.default_rng(0), width, height, 330, (0.6, 0.5, 0.5))
     back_wall = Rectangle((ROOM_MAX[0], ROOM_MIN[1], ROOM_MAX[2]), (-width, 0, 0), (0, 0, -height), bricks)
@@ -47,9 +45,9 @@ def empty_room() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[RGBDFrame]:
+def frames(walking_scene: Scene) -> list[RGBDFrame]:
     """Frames of two laps, each with different sensor noise."""
-    renderer = Renderer(empty_room(), CAMERA)
+    renderer = Renderer(without_people(walking_scene), CAMERA)
     lap = [renderer(true_pose(index), 0.0) for index in range(FRAMES)]
     frames = []
     for index, rendering in enumerate([*lap, *lap]):

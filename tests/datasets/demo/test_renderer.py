@@ -14,13 +14,13 @@ from v3d_torch.datasets.demo.motions import make_pose
 from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.scene import Body, Box, Deformation, Figure, Rectangle, Scene
 from v3d_torch.datasets.demo.scenes import SCENES
-from v3d_torch.datasets.demo.scenes.walking import TRAJECTORY, build_walking_scene
+from v3d_torch.datasets.demo.scenes.walking import TRAJECTORY
 from v3d_torch.datasets.demo.sequence import SEED
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer(build_walking_scene(SEED), SMALL)
+def renderer(walking_scene: Scene) -> Renderer:
+    return Renderer(walking_scene, SMALL)
 
 
 def test_static_points_of_one_frame_lie_on_the_surfaces_of_another(renderer: Renderer) -> None:
