@@ -104,9 +104,9 @@ def terrazzo(rng: np.random.Generator, width: float, height: float, density: flo
     rows, columns = texels(height, density), texels(width, density)
     image = tint(colour, 1.0 + 0.12 * fractal_noise(rng, rows, columns, (6, 6), 6))
     for _ in range(int(width * height * 550)):
-        points = rng.normal(0.0, 0.011 * density, (5, 2)) + rng.uniform((0, 0), (columns, rows))
+        points = rng.normal(0.0, 0.011 * density, (5, 2)) + rng.random(2) * (columns, rows)
         shade = np.asarray(colour) * rng.uniform(0.35, 1.35) + rng.uniform(-0.08, 0.08, 3)
-        cv2.fillConvexPoly(image, cv2.convexHull(points.astype(np.int32)), tuple(np.clip(shade, 0, 1)), cv2.LINE_AA)
+        cv2.fillConvexPoly(image, cv2.convexHull(points.astype(np.int32)), tuple(shade.clip(0, 1)), cv2.LINE_AA)
     return add_seams(image, texels(0.4, density))
 
 
