@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 import typer.testing
 from filelock import FileLock
+from hypothesis import settings
 from rich.console import Console
 
 from v3d_torch.io.download import cache_dir
@@ -26,6 +27,10 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "kernels"))
 
 # A call of a command in a test would build the command from its signature, which takes longer than many a command.
 typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[attr-defined]
+
+# A busy machine can be ten times as slow as an idle one.
+settings.register_profile("no deadline", deadline=None)
+settings.load_profile("no deadline")
 
 SLOWEST = (
     *("batch/test_ray_executor.py", "test_corpus.py", "cli/test_run.py", "project/test_notebooks.py"),
