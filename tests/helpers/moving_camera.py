@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
@@ -16,12 +18,15 @@ from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
 TWIST = torch.tensor([0.3, -0.1, 0.2, 0.1, 0.4, -0.3], dtype=torch.float64)  # m/s and rad/s
 
+_INDICES = itertools.count()
+
 twists = st.lists(st.floats(-1, 1), min_size=6, max_size=6).map(lambda v: torch.tensor(v, dtype=torch.float64))
 
 
 def keyframe(T_cw: Tensor = EYE, stamp: float = 0.0, landmarks: int = 0, part: int = 0) -> Keyframe:
     """A keyframe at a pose that observes the first ``landmarks`` landmarks, without features."""
-    return Keyframe(0, 0, stamp, T_cw, no_features(), torch.arange(landmarks), part)
+    index = next(_INDICES)
+    return Keyframe(index, index, stamp, T_cw, no_features(), torch.arange(landmarks), part)
 
 
 def frame_pose(

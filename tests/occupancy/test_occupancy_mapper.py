@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -12,14 +13,13 @@ from torch import Tensor
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.io.state_file import read_state, write_state
-from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.occupancy.up_direction import estimate_up
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runs.state import STATE_CLASSES
-from v3d_torch.tracking.pose_history import PoseEntry, PoseHistory
+from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import FramePose, TrackingStatus
 
 CONFIG = OccupancyConfig(interval=1)
@@ -27,6 +27,7 @@ ALL = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
 POSES = looking_around(36)
 HERE = torch.eye(4, dtype=torch.float64)
 SHIFT = se3_exp(torch.tensor([0.2, 0.0, 0.1, 0.0, 0.1, 0.0], dtype=torch.float64))
+MOTION = CameraMotion(HERE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), False)
 
 
 class Drive:
@@ -34,25 +35,15 @@ class Drive:
 
     def __init__(self, mapper: OccupancyMapper) -> None:
         self.mapper = mapper
-        self.keyframes: list[Keyframe] = [keyframe(invert(POSES[0])), keyframe(invert(POSES[18]))]
-        self.entries: list[PoseEntry] = []
-
-    @property
-    def poses(self) -> PoseHistory:
-        history = PoseHistory()
-        last_localised = self.entries[-1].stamp if self.entries else -torch.inf
-        observed = torch.zeros(0, dtype=torch.int64)
-        history.load_state_dict(
-            {"entries": self.entries, "last_localised": last_localised, "observed_landmarks": observed, "place": None}
-        )
-        return history
+        self.keyframes = [keyframe(invert(POSES[0])), keyframe(invert(POSES[18]), frame=18)]
+        self.poses = PoseHistory()
 
     def add(self, first: int, last: int, status: TrackingStatus = TrackingStatus.TRACKED) -> None:
         """Add frames; what the camera sees does not depend on the corrections of the keyframes."""
         for index in range(first, last):
             own = self.keyframes[index // 18 % 2]
-            T_ck = invert(POSES[index % 36]) @ POSES[18 * (index // 18 % 2)]
-            self.entries.append(PoseEntry(index / 30, status, own, T_ck, has_motion=True))
+            T_cw = invert(POSES[index % 36]) @ POSES[18 * (index // 18 % 2)] @ own.T_cw
+            self.poses.append(index / 30, FramePose(status, T_cw, torch.zeros(0).long()), MOTION, own, None)
             self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses)
 
     def correct(self, row: int = 0, shift: Tensor = SHIFT) -> None:
@@ -133,11 +124,10 @@ def test_correction_during_a_rebuild_is_applied_afterwards() -> None:
 def test_places_of_removed_views_stay_in_the_map_after_a_correction() -> None:
     mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 20}), CAMERA)
     start, poses = keyframe(HERE), PoseHistory()
-    motion = CameraMotion(HERE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), True)
     for index in range(40):  # along a wall
         T_cw = HERE.clone()
         T_cw[0, 3] = -0.6 * index
-        poses.append(index / 30, FramePose(TrackingStatus.TRACKED, T_cw, torch.zeros(1).long()), motion, start, None)
+        poses.append(index / 30, FramePose(TrackingStatus.TRACKED, T_cw, torch.zeros(1).long()), MOTION, start, None)
         mapper(torch.full((1, CAMERA.height, CAMERA.width), 2.0), ALL, poses)
     assert len(mapper._store) <= 20
     before = mapper.map.occupied_points[:, 0]
@@ -170,7 +160,7 @@ def test_saved_state_continues_to_the_same_bytes(stop: int, tmp_path: Path) -> N
     assert drive.mapper.is_rebuilding == (stop == 32)
     write_state(tmp_path / "state", {}, drive.mapper.state_dict())
     resumed = Drive(OccupancyMapper(CONFIG, CAMERA))
-    resumed.keyframes, resumed.entries = drive.keyframes, list(drive.entries)
+    resumed.keyframes, resumed.poses = deepcopy((drive.keyframes, drive.poses))
     resumed.mapper.load_state_dict(read_state(tmp_path / "state", STATE_CLASSES)[1])
     for each in (drive, resumed):
         each.add(stop, 45)
@@ -201,7 +191,7 @@ def test_floor_is_searched_again_when_the_number_of_views_has_doubled(monkeypatc
     floors = iter([None, *(Floor(torch.eye(3, dtype=torch.float64)[k], 0.0, 1.0) for k in range(2)), None])
 
     def find_floor() -> Floor | None:
-        searched.append(len(drive.entries))
+        searched.append(len(drive.poses))
         return next(floors)
 
     monkeypatch.setattr(drive.mapper, "find_floor", find_floor)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from helpers.moving_camera import EYE, TWIST, Camera, frame_pose, keyframe, twis
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
@@ -265,3 +268,23 @@ def test_poses_of_chosen_frames_follow_their_keyframes() -> None:
     moved = invert(camera.trajectory().T_wc)[frames]
     torch.testing.assert_close(camera.poses.poses_of(frames), moved, rtol=0, atol=1e-9)
     torch.testing.assert_close(moved, expected @ STEP, rtol=0, atol=1e-9)
+
+
+class Calls(TorchFunctionMode):
+    """Counts calls of functions of torch."""
+
+    count = 0
+
+    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.count += 1
+        return function(*args, **(kwargs or {}))
+
+
+def test_trajectory_is_computed_without_a_loop_over_frames() -> None:
+    """A live camera waits while the trajectory of a long run is computed."""
+    short, long = walk([0.1 * k for k in range(10)]), walk([0.1 * k for k in range(100)])
+    calls = Calls(), Calls()
+    for each, camera in zip(calls, (short, long), strict=True):
+        with each:
+            assert len(camera.trajectory()) == len(camera.poses)
+    assert calls[0].count == calls[1].count > 0

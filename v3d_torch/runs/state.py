@@ -29,11 +29,10 @@ from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.motion_model import PosePrediction
-from v3d_torch.tracking.pose_history import PoseEntry
 from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, PoseEntry, TrackingStatus, CameraState),
+    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, TrackingStatus, CameraState),
     *(Keyframe, Loop, TensorTable, Readout, StageTime),
     *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig),
     *(RangeView, Floor, UpDirection),

@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import interpolate, invert, orthonormalise
-from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.mapping.keyframe import Keyframe, stack_poses
+from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
-
-@dataclass(frozen=True)
-class PoseEntry:
-    """Pose of one frame.
-
-    Attributes:
-        stamp: Timestamp, seconds.
-        status: Source of the pose.
-        keyframe: Keyframe to which the pose is relative; None for the world frame, before the first keyframe.
-        T_ck: Motion from the keyframe to the camera, float64, shape :math:`(4, 4)`.
-        has_motion: True if the motion since the previous frame was measured.
-    """
-
-    stamp: float
-    status: TrackingStatus
-    keyframe: Keyframe | None
-    T_ck: Tensor
-    has_motion: bool
-
-    @property
-    def T_cw(self) -> Tensor:
-        """World-to-camera pose in the current map, float64, shape :math:`(4, 4)`."""
-        return self.T_ck @ _pose(self.keyframe)
+_STATUSES = tuple(TrackingStatus)
 
 
 class PoseHistory:
@@ -48,39 +26,46 @@ class PoseHistory:
     """
 
     def __init__(self) -> None:
-        self._entries: list[PoseEntry] = []
+        self._frames = TensorTable(
+            stamp=((), torch.float64),
+            status=((), torch.int64),  # position in TrackingStatus
+            keyframe=((), torch.int64),  # index of the keyframe; -1 for the world frame, before the first keyframe
+            T_ck=((4, 4), torch.float64),  # motion from the keyframe to the camera
+            has_motion=((), torch.bool),  # true if the motion since the previous frame was measured
+        )
+        self._keyframes: dict[int, Keyframe] = {}  # to which poses are relative, by index
         self.last_localised = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
         self._place: Keyframe | None = None  # nearest to the last frame that was found
 
     def __len__(self) -> int:
         """Number of frames."""
-        return len(self._entries)
+        return len(self._frames)
 
     @property
     def statuses(self) -> list[TrackingStatus]:
         """Statuses of all frames."""
-        return [entry.status for entry in self._entries]
+        return [_STATUSES[code] for code in self._frames["status"].tolist()]
 
     @property
     def status(self) -> TrackingStatus | None:
         """Status of the last frame; None before the first."""
-        return self._entries[-1].status if self._entries else None
+        return _STATUSES[int(self._frames["status"][-1])] if len(self) else None
 
     @property
     def stamp(self) -> float:
         """Time of the last frame, seconds; minus infinity before the first."""
-        return self._entries[-1].stamp if self._entries else -torch.inf
+        return float(self._frames["stamp"][-1]) if len(self) else -torch.inf
 
     @property
     def T_cw(self) -> Tensor:
         """World-to-camera pose of the last frame, float64, shape :math:`(4, 4)`; the identity before the first."""
-        return self._entries[-1].T_cw if self._entries else torch.eye(4, dtype=torch.float64)
+        return self._pose_of(-1) if len(self) else torch.eye(4, dtype=torch.float64)
 
     @property
     def keyframe(self) -> Keyframe | None:
         """Keyframe to which the pose of the last frame is relative; None if there is none."""
-        return self._entries[-1].keyframe if self._entries else None
+        return self._keyframe_of(-1) if len(self) else None
 
     @property
     def part(self) -> int:
@@ -90,7 +75,7 @@ class PoseHistory:
     @property
     def has_motion(self) -> bool:
         """True if the motion between the last frame and the one before it was measured."""
-        return bool(self._entries) and self._entries[-1].has_motion
+        return bool(len(self) and self._frames["has_motion"][-1])
 
     @property
     def is_localised(self) -> bool:
@@ -126,7 +111,7 @@ class PoseHistory:
             self._correct_lost(correction, reference, motion.is_measured, move_all=first)
             T_new_old = correction if first else None
         if new is None:
-            entry = PoseEntry(stamp, status, reference, _relative(pose.T_cw, reference), motion.is_measured)
+            T_ck = _relative(pose.T_cw, reference)
             if pose.count:
                 self.observed_landmarks, self._place = pose.observed_landmarks, reference
         else:
@@ -134,17 +119,22 @@ class PoseHistory:
                 status = TrackingStatus.DISCONNECTED
             elif status is TrackingStatus.LOST:
                 status = TrackingStatus.TRACKED  # the first keyframe of the map
-            entry = PoseEntry(stamp, status, new, torch.eye(4, dtype=torch.float64), motion.is_measured)
+            reference, T_ck = new, torch.eye(4, dtype=torch.float64)
             self.observed_landmarks, self._place = new.observed_landmarks, new
-        self._entries.append(entry)
+        self._frames.append(
+            stamp=torch.tensor([stamp], dtype=torch.float64),
+            status=torch.tensor([_STATUSES.index(status)]),
+            keyframe=torch.tensor([self._add_keyframe(reference)]),
+            T_ck=T_ck[None],
+            has_motion=torch.tensor([motion.is_measured]),
+        )
         if status is not TrackingStatus.LOST:
             self.last_localised = stamp
         return T_new_old
 
     def replace_last(self, T_cw: Tensor) -> None:
         """Replace the pose of the last frame by a refined world-to-camera pose, float64, shape :math:`(4, 4)`."""
-        last = self._entries[-1]
-        self._entries[-1] = replace(last, T_ck=_relative(T_cw, last.keyframe))
+        self._frames["T_ck"][-1] = _relative(T_cw, self.keyframe)
 
     def poses_of(self, frames: Sequence[int]) -> Tensor:
         """World-to-camera poses of some frames in the current map.
@@ -155,22 +145,21 @@ class PoseHistory:
         Returns:
             Poses, float64, shape :math:`(N, 4, 4)`.
         """
-        entries = [self._entries[frame] for frame in frames]
-        none = torch.zeros(0, 4, 4, dtype=torch.float64)
-        T_ck, T_kw = [entry.T_ck[None] for entry in entries], [_pose(entry.keyframe)[None] for entry in entries]
-        return torch.cat([none, *T_ck]) @ torch.cat([none, *T_kw])
+        rows = torch.tensor(frames, dtype=torch.int64)
+        return self._frames["T_ck"][rows] @ self._keyframe_poses()[self._frames["keyframe"][rows]]
 
     def trajectory(self) -> Trajectory:
         """Poses of all frames in the current map; poses of lost frames are interpolated between found frames."""
-        stamps = torch.tensor([entry.stamp for entry in self._entries], dtype=torch.float64)
-        T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(entry.T_cw[None] for entry in self._entries)])
-        found = torch.tensor([entry.status is not TrackingStatus.LOST for entry in self._entries])
-        return Trajectory(stamps, invert(_interpolate(stamps, T_cw, found)))
+        frames = self._frames
+        T_cw = frames["T_ck"] @ self._keyframe_poses()[frames["keyframe"]]
+        found = frames["status"] != _STATUSES.index(TrackingStatus.LOST)
+        return Trajectory(frames["stamp"].clone(), invert(_interpolate(frames["stamp"], T_cw, found)))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the poses of all frames."""
         return {
-            "entries": self._entries,
+            "frames": self._frames,
+            "keyframes": self._keyframes,
             "last_localised": self.last_localised,
             "observed_landmarks": self.observed_landmarks,
             "place": self._place,
@@ -178,21 +167,44 @@ class PoseHistory:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
-        self._entries, self.last_localised = list(state["entries"]), state["last_localised"]
+        self._frames, self._keyframes = state["frames"], state["keyframes"]
+        self.last_localised = state["last_localised"]
         self.observed_landmarks, self._place = state["observed_landmarks"], state["place"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""
         disconnected = keyframe is not None and keyframe.disconnected
         found = TrackingStatus.DISCONNECTED if disconnected else TrackingStatus.ODOMETRY
-        for index in reversed(range(len(self._entries))):
-            entry = self._entries[index]
-            if entry.status is not TrackingStatus.LOST or not (linked or move_all):
+        frames = self._frames
+        for row in reversed(range(len(frames))):
+            if _STATUSES[int(frames["status"][row])] is not TrackingStatus.LOST or not (linked or move_all):
                 break
-            T_ck = _relative(entry.T_cw @ invert(T_new_old), keyframe)
-            status = found if linked else TrackingStatus.LOST
-            self._entries[index] = replace(entry, status=status, keyframe=keyframe, T_ck=T_ck)
-            linked = linked and entry.has_motion
+            frames["T_ck"][row] = _relative(self._pose_of(row) @ invert(T_new_old), keyframe)
+            frames["keyframe"][row] = self._add_keyframe(keyframe)
+            if linked:
+                frames["status"][row] = _STATUSES.index(found)
+            linked = linked and bool(frames["has_motion"][row])
+
+    def _add_keyframe(self, keyframe: Keyframe | None) -> int:
+        """Keep a keyframe to which a pose is relative, and return its index; -1 for None."""
+        if keyframe is None:
+            return -1
+        self._keyframes[keyframe.index] = keyframe
+        return keyframe.index
+
+    def _keyframe_of(self, row: int) -> Keyframe | None:
+        """Return the keyframe to which the pose of a frame is relative; None for the world frame."""
+        return self._keyframes.get(int(self._frames["keyframe"][row]))
+
+    def _pose_of(self, row: int) -> Tensor:
+        """Return the world-to-camera pose of a frame in the current map, float64, shape (4, 4)."""
+        return self._frames["T_ck"][row] @ _pose(self._keyframe_of(row))
+
+    def _keyframe_poses(self) -> Tensor:
+        """Return the poses of the keyframes by index, float64, shape (K + 1, 4, 4); the last one is the identity."""
+        T_kw = torch.eye(4, dtype=torch.float64).repeat(max(self._keyframes, default=-1) + 2, 1, 1)
+        T_kw[list(self._keyframes)] = stack_poses(list(self._keyframes.values()))
+        return T_kw
 
 
 def _pose(keyframe: Keyframe | None) -> Tensor:
